@@ -19,12 +19,10 @@ MAX_PIXELS = 2**27
 """Most pixels of an image. More are probably a typing error and would not fit into memory."""
 
 MAX_SIDE = 2**20
-"""Largest width and height of an image, pixels. Beyond it float32 does not resolve pixel centres,
-and the renderer's blocks of pixels would make long narrow images far larger than MAX_PIXELS."""
+"""Largest width and height of an image, pixels: float32 resolves no more pixel centres."""
 
 FURTHEST = 1e8
-"""Largest distance of a camera from the origin, in units of length, and largest entry of K, pixels.
-The centre of the Earth is 6.4e6 m away. Beyond this, float32 has no meaning."""
+"""Largest distance of a camera from the origin, and largest entry of K; float32 ends there."""
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera axes are x right, y up, z backward: two are the negatives of OpenCV's."""

@@ -20,6 +20,7 @@ EXTRAS = {
     "plotly": "page",
     "jinja2": "page",
     "viser": "view",
+    "tensorboardX": "tensorboard",
     "distributed": "study",
     "dask": "study",
 }

@@ -15,6 +15,8 @@ import shutil
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, TextIO
@@ -147,19 +149,79 @@ def read_json(path: str | Path) -> Any:
         ) from None
 
 
-def check_new_folder(path: str | Path) -> Path:
-    """Check that `new_folder(path)` would succeed, and return the path as a Path. Makes nothing.
+THERE = "is there already; choose another place, or replace it with --force"
+"""End of the message of every command whose output exists."""
 
-    Raises InputError if `path` is a file, is a folder that is not empty or in which another process
-    works, or could not be written.
+
+def check_new_file(path: str | Path, force: bool = False) -> Path:
+    """Check that a file may be written at `path`, and return it as a Path.
+
+    Raises InputError if it could not be written, or if it exists and is a folder or not to be
+    replaced (force).
+    """
+    path = check_writable(path)
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name a file to write")
+    if path.exists() and not force:
+        raise InputError(f"{path}: {THERE}")
+    return path
+
+
+@dataclass(frozen=True)
+class Ours:
+    """A kind of output folder that `--force` may replace.
+
+    names: patterns of what the command writes there; the first is in every such folder. A folder
+    with anything else is left alone. reads: paths that the command reads, which it must not delete.
+    """
+
+    names: Sequence[str]
+    reads: Sequence[str | Path] = ()
+
+    def check(self, folder: Path) -> None:
+        """Raises InputError where a folder is not of this kind, or holds a path that is read."""
+        there = {path.name for path in folder.iterdir()}
+        known = (*self.names, LOCK, ".*.part*")
+        other = [name for name in sorted(there) if not any(fnmatch(name, one) for one in known)]
+        kept = [str(path) for path in self.reads if folder.resolve() in resolved_parents(path)]
+        why = ""
+        if kept:
+            why = f"{kept[0]} is in it and is read"
+        elif other or self.names[0] not in there:
+            why = f"it holds {other[0]}" if other else f"it has no {self.names[0]}"
+            why = f"this command did not make it, since {why}"
+        if why:
+            raise InputError(f"{folder}: --force leaves it alone: {why}; choose another folder")
+
+
+def resolved_parents(path: str | Path) -> list[Path]:
+    """The path itself and all folders that hold it, without symbolic links."""
+    whole = Path(path).resolve()
+    return [whole, *whole.parents]
+
+
+def check_new_folder(path: str | Path, ours: Ours | None = None) -> Path:
+    """Check that an output folder can be made at `path`, and return it as a Path. Makes nothing.
+
+    ours: kind of folder that may be there, to be replaced. Raises InputError if `path` is a file,
+    is a folder that is not empty or in which another process works, or could not be written.
     """
     path = check_writable(path)
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file, not a folder; choose another output folder")
     if path.is_dir() and any(there.name != LOCK for there in path.iterdir()):
         _check_unlocked(path / LOCK)
-        raise InputError(f"{path}: the output folder is not empty; choose a new one or delete it")
+        if ours is None:
+            raise InputError(f"{path}: {THERE}")
+        ours.check(path)
     return path
+
+
+def clear_folder(path: Path, ours: Ours) -> None:
+    """Delete what a folder of this kind holds. Raises InputError as `check_new_folder`."""
+    if check_new_folder(path, ours).is_dir():
+        with locked(path):
+            _clear(path)
 
 
 def new_folder(path: str | Path) -> Path:
@@ -174,24 +236,29 @@ def new_folder(path: str | Path) -> Path:
 
 
 @contextmanager
-def atomic_folder(path: str | Path) -> Iterator[Path]:
+def atomic_folder(path: str | Path, ours: Ours | None = None) -> Iterator[Path]:
     """Context manager: a temporary folder beside `path`, renamed to it after the block.
 
     So a folder named `path` is always complete. The temporary folder is locked. If the block fails,
     it and the parents made for it are removed; what a killed process left in it is removed first.
-    Raises InputError as `new_folder`, and if another process makes the same folder.
+    ours: kind of folder that may be there, which the new one replaces. Raises InputError as
+    `check_new_folder`, and if another process makes the same folder.
     """
-    path = check_new_folder(path).resolve()
-    temporary = path.with_name(f".{path.name}.part")
+    path = check_new_folder(path, ours).resolve()
+    temporary, replaced = (path.with_name(f".{path.name}.{end}") for end in ("part", "old"))
     try:
         with folder_locked(temporary):
             try:
                 _clear(temporary)
                 yield temporary
                 try:
+                    if any(check_new_folder(path, ours).glob("*")):
+                        shutil.rmtree(replaced, ignore_errors=True)
+                        os.replace(path, replaced)
                     (path / LOCK).unlink(missing_ok=True)  # of a killed process
                     os.replace(temporary, path)
                     (path / LOCK).unlink()
+                    shutil.rmtree(replaced, ignore_errors=True)
                 except OSError as error:
                     raise not_writable(path, error) from None
             except BaseException:

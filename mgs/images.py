@@ -23,8 +23,7 @@ PNG_BIT_DEPTH = 24
 """Index of the byte of a PNG file that holds the bits of a sample (PNG specification, 11.2.1)."""
 
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
-"""Pillow's pixel modes that it converts to 8-bit RGBA without loss: grey, palette and RGB, with and
-without alpha."""
+"""Pillow's pixel modes that convert to 8-bit RGBA without loss."""
 
 LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of R, G and B in grey (ITU-R BT.601)."""
@@ -267,8 +266,7 @@ def _exr_size(path: Path) -> tuple[int, int]:
 
 @contextmanager
 def _reading_exr(path: Path) -> Iterator[None]:
-    """Context manager: turns errors of OpenEXR into an InputError, without the lines that it prints
-    itself."""
+    """Context manager: turns errors of OpenEXR into InputError, and hides what it prints."""
     try:
         with _silent():
             yield

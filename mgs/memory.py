@@ -24,8 +24,7 @@ VIEW_BYTES = 1 << 29
 122 views of 100,000 Gaussians. That of others is computed again for each choice."""
 
 LITTLE = 1 << 30
-"""Bytes up to which `check_room` checks nothing: the check takes part of the time of a small image.
-"""
+"""Bytes up to which `check_room` checks nothing, to be quick for small images."""
 
 MEMORY_FILE = Path("/proc/meminfo")
 """Linux's report of the memory that is free without swapping."""
@@ -86,13 +85,11 @@ def _spare() -> float:
 
 
 PADDING = 64
-"""Numbers that a kernel may read beyond the end of an array: it reads whole registers, of at most
-16."""
+"""Numbers that a kernel may read beyond the end of an array: whole registers, at most 16."""
 
 
 ALIGNMENT = 64
-"""Bytes. Dr.Jit compiles different kernels for arrays whose addresses are multiples of this and for
-others."""
+"""Bytes. Dr.Jit compiles another kernel for arrays that are not aligned so."""
 
 
 def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:

@@ -33,15 +33,10 @@ rock's mask; `_inside`, over the pixels that the rock covers wholly, without its
 `_corrected`: after the render is brought to the exposure and white balance of the truth
 (`colour_corrected`)."""
 
-SPACINGS = (1, 3, 10)
-"""Depths behind the true surface beyond which a pixel is too deep, in spacings of the prior's
-samples. One is about what the Gaussians resolve; at ten, the pixel shows another part of the rock.
-"""
-
 OPAQUE = 0.9
 """A pixel wholly on the rock is see-through if the model's alpha is below this."""
 
-SURFACE_METRICS = ("alpha_mae", "depth_error", *(f"too_deep_{k}" for k in SPACINGS), "see_through")
+SURFACE_METRICS = ("alpha_mae", "depth_error", "see_through")
 """Metrics of `compare_surface`, as in metrics.json: `depth_error` in metres, the others shares."""
 
 
@@ -164,19 +159,16 @@ def compare_surface(
     *,
     fractional: bool,
     true_depth: np.ndarray | None = None,
-    spacing: float | None = None,
 ) -> dict[str, float]:
     """SURFACE_METRICS of one view, those that the data has a truth for; NaN if no pixel counts.
 
     truth, mask, weight: as in `compare`. alpha, depth: [H,W] of the render, its expected z-depth in
     metres. fractional: whether the truth's alpha is a share of each pixel, not only a mask.
-    true_depth: [H,W] metres, 0 where unknown. spacing: of the prior's samples, metres.
+    true_depth: [H,W] metres, 0 where unknown.
 
     - alpha_mae: mean absolute error of alpha over the known pixels; only if `fractional`.
     - depth_error: median absolute error of depth inside the mask, metres; needs a true depth. A
       pixel where nothing is drawn is infinitely deep; NaN if the median is infinite.
-    - too_deep_1, too_deep_3, too_deep_10: share of the same pixels deeper than the truth by more
-      than so many spacings; needs a true depth and a spacing.
     - see_through: share of the pixels wholly on the rock whose alpha is below OPAQUE.
     """
     known = weight > 0
@@ -189,8 +181,6 @@ def compare_surface(
         behind = np.where(alpha > 0, depth.astype(np.float64) - true_depth, np.inf)[rock]
         median = float(np.median(np.abs(behind))) if behind.size else math.nan
         found["depth_error"] = median if math.isfinite(median) else math.nan
-        if spacing is not None:
-            found |= {f"too_deep_{k}": _mean(behind > k * spacing) for k in SPACINGS}
     return {name: found[name] for name in SURFACE_METRICS if name in found}
 
 

@@ -6,12 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 QUAT_MIN = 1e-12
-"""Quaternions whose components are all at most this mean the identity. Normalised, their
-derivatives would overflow float32."""
+"""Quaternions no larger than this mean the identity."""
 
 WORLD_FROM_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Rotation [4,4] from the axes of glTF and GLB files (+Y up) to the world's (+Z up); its inverse is
-its transpose."""
+"""Rotation [4,4] from the axes of glTF (+Y up) to the world's (+Z up)."""
 
 
 def rotmat_from_quat(quats: ArrayLike) -> NDArray[np.float64]:
@@ -30,8 +28,7 @@ def rotmat_from_quat(quats: ArrayLike) -> NDArray[np.float64]:
 
 
 def quat_from_normals(normals: ArrayLike) -> NDArray[np.float64]:
-    """Unit quaternions wxyz [N,4] of the shortest rotations from +Z to the normals [N,3], which
-    have any length but 0."""
+    """Unit quaternions wxyz [N,4] of the shortest rotations from +Z to normals [N,3]."""
     n = np.asarray(normals, np.float64)
     n = n / np.linalg.norm(n, axis=1, keepdims=True)
     q = np.stack([1 + n[:, 2], -n[:, 1], n[:, 0], np.zeros(len(n))], 1)

@@ -99,8 +99,7 @@ def find_libllvm() -> Libllvm:
 
 
 def _candidates() -> list[str]:
-    """Paths of libraries to try, each once: in Dr.Jit's order, then those in folders where Dr.Jit
-    does not look."""
+    """Paths of libraries to try: in Dr.Jit's order, then those where it does not look."""
     usual = _installed(_DRJIT_FOLDERS, "libLLVM*.so.*")
     prefixes = {sys.prefix, os.environ.get("CONDA_PREFIX", sys.prefix)}
     more = (*(f"{prefix}/lib" for prefix in sorted(prefixes)), *_OTHER_FOLDERS)
@@ -155,8 +154,7 @@ _checked: set[str] = set()
 
 
 def _choose_libllvm() -> None:
-    """Point Dr.Jit to a usable libLLVM by its environment variable. Raises InputError as
-    `find_libllvm`."""
+    """Point Dr.Jit to a usable libLLVM. Raises InputError as `find_libllvm`."""
     library = find_libllvm()
     if "/" in library.path:
         os.environ[LIBRARY_VARIABLE] = library.path
@@ -231,8 +229,7 @@ def processor() -> dict[str, str | int]:
 
 
 def check_kernel() -> None:
-    """Run a small kernel that old versions of LLVM cannot compile. Raises InputError if its result
-    is wrong."""
+    """Run a kernel that old versions of LLVM cannot compile. Raises InputError if wrong."""
     import drjit as dr
     import mitsuba as mi
 

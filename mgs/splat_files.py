@@ -76,8 +76,7 @@ def _load(path: Path) -> tuple[Gaussians, str]:
 
 
 def _kind(path: Path) -> str:
-    """Format of a file by its first bytes: "glb", "spz", or else "ply". Raises InputError for
-    formats that are not read."""
+    """Format of a file by its first bytes: "glb", "spz" or "ply". Raises InputError."""
     with reading(path, "file; give a PLY, GLB or SPZ of Gaussians"), path.open("rb") as file:
         first = file.read(4)
     if first == MAGIC:

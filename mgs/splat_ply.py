@@ -146,8 +146,7 @@ def _parse_any_comment(path: Path) -> PlyData:
 
 
 def _from_columns(path: Path, columns: Mapping[str, np.ndarray], n: int) -> Gaussians:
-    """Gaussians from the properties of the 3DGS layout, an array [n] each. Raises InputError if one
-    is missing or is a list."""
+    """Gaussians from properties of the 3DGS layout, [n] each. Raises InputError."""
     rest = sum(re.fullmatch("f_rest_[0-9]+", name) is not None for name in columns)
     coefficients = 1 + rest // 3
     if rest % 3 or coefficients not in (1, 4, 9, 16):

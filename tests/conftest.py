@@ -57,7 +57,5 @@ def coarse_arena():
 
 @pytest.fixture(scope="session")
 def photographs():
-    """The module tools/photographs.py."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.syspath_prepend(Path(__file__).parent.parent / "tools")
-        return importlib.import_module("photographs")
+    """The module tests/photographs.py, which needs packages of its own."""
+    return importlib.import_module("photographs")

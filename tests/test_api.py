@@ -80,7 +80,9 @@ def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
     information = mgs.fisher(run.gaussians, loaded.frames[0].camera)
     assert information.shape == (tiny.POINTS, 11)
     assert isinstance(information, np.ndarray)
-    with pytest.raises(mgs.InputError, match=r"holds a run; `mgs\.resume_nbv\('.*run'\)`"):
+    with pytest.raises(
+        mgs.InputError, match=r"run is there already; .* with force; `mgs\.resume_nbv\('.*run'\)`"
+    ):
         mgs.run_nbv(dataset, tmp_path / "run", prior=prior)
     with pytest.raises(mgs.InputError, match=r"^seeds 0: must be at least 1"):
         mgs.run_nbv(dataset, tmp_path / "other", prior=prior, seeds=0)

@@ -32,9 +32,6 @@ def test_a_step_is_a_view_and_the_last_of_a_batch_has_its_fit(loaded, tmp_path):
     state = recording.run(out, settings, loaded, parts, tiny.silent, on_step)
     assert fits == seen == [3, 5, 7, 8], "the budget of 5 views is no multiple of 2"
     lines = steps(out)
-    assert [line["step"] for line in lines] == list(range(6))
-    assert [line["images"] for line in lines] == list(range(3, 9))
-    assert [line["frame"] for line in lines[1:]] == state.taken[3:]
     assert [set(line) >= OF_A_FIT for line in lines] == [True, False, True, False, True, True]
     assert all(OF_A_FIT & set(line) in (set(), OF_A_FIT) for line in lines)
     # Step 3 is in the second batch, so it is evaluated at the end of that.
@@ -65,14 +62,12 @@ def test_a_batch_measures_each_candidate_once_if_there_is_room(loaded, tmp_path,
     assert len(set(measured)) == candidates + taken
 
 
-def test_the_policies_that_use_the_model_exist():
-    assert set(policy_names()) >= AT_THE_MODEL
-
-
-@pytest.mark.parametrize("policy", policy_names())
-@pytest.mark.parametrize("nearest", [None, 3])
+@pytest.mark.parametrize(
+    ("policy", "nearest"), [("d-optimal", 3), *((name, None) for name in policy_names())]
+)
 def test_a_batch_counts_as_taken_for_every_policy(loaded, tmp_path, policy, nearest):
     """A batch has the views that are chosen one by one, where fits do not change the policy."""
+    assert set(policy_names()) >= AT_THE_MODEL
     parts = tiny.operations()
     if policy in AT_THE_MODEL:
         parts = tiny.operations(fit=lambda g, *rest: tiny.Fit(g, 0.1, 1))

@@ -32,18 +32,8 @@ from mgs.view.subject import read_subject
 TINY = RenderPreset(width=64, height=48, frames=8, spp=2)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=4))
 TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 4\n"
-RUN = [
-    "--seed-views",
-    "3",
-    "--budget",
-    "3",
-    "--passes",
-    "3",
-    "--evaluate-every",
-    "1",
-    "--random-seed",
-    "1",
-]
+RUN = ["--seed-views", "3", "--budget", "3", "--passes", "3", "--evaluate-every", "1"]
+RUN += ["--random-seed", "1"]
 KILLED = """
 import os, signal
 from mgs import runtime
@@ -145,7 +135,7 @@ def test_only_test_views_are_rendered_in_advance(full, poses):
     for ours, theirs in zip(poses.test_views().frames, full.test_views().frames, strict=True):
         assert same_files(ours, theirs)
     paths = [path.relative_to(poses.root) for path in poses.root.rglob("*") if path.is_file()]
-    written = {"transforms.json", "config.json", "timings.json", "contact_sheet.png", "rock.glb"}
+    written = {"transforms.json", "config.json", "contact_sheet.png", "rock.glb"}
     written |= {"survey", "test"}
     assert {path.parts[0] for path in paths} == written
 
@@ -161,7 +151,6 @@ def test_an_interrupted_dataset_goes_on_only_as_on_demand(poses, tmp_path):
         synthesise(out, *given, seed=3, test_views=2)
     synthesise(out, *given, seed=3, test_views=2, on_demand=True)
     ours, theirs = listing(out), listing(poses.root)
-    del ours["timings.json"], theirs["timings.json"]
     assert ours == theirs
 
 
@@ -347,27 +336,21 @@ def test_a_survey_with_noise_of_an_on_demand_dataset(poses, tmp_path):
     """`mgs survey` of the survey, and a prior of that; neither has images."""
     command("survey", poses.root / "survey", "--out", tmp_path / "survey", "--poses", "exact")
     command("prior", tmp_path / "survey", "--out", tmp_path / "prior", "--gaussians", 300)
-    assert json.loads((tmp_path / "prior/prior.json").read_text())["seen_by_seeds"] > 0.5
+    assert (tmp_path / "prior/prior.json").is_file()
     assert there(load_dataset(tmp_path / "survey"))
     assert not (tmp_path / "survey/images").exists()
 
 
-def test_bad_scenes_and_options_are_refused(small, poses, tmp_path, capsys):
+def test_bad_scenes_and_options_are_refused(small, tmp_path, capsys):
     """With one line, before anything is made."""
-    bad, full = tmp_path / "bad.toml", occupied(tmp_path / "full")
-    capture = ["--capture", "boulder"]
+    bad, out = tmp_path / "bad.toml", ["--out", tmp_path / "out"]
     bad.write_text("[rock]\nsiez = 1\n")
-    out = ["--out", tmp_path / "out"]
     for arguments, message in (
-        (["--capture", "nosuch", *out], "nosuch"),
-        (["--capture", bad, *out], "rock.siez"),
-        ([poses.root, *capture, *out], "give a DATASET or --capture"),
-        (["--resume", tmp_path, *capture], "--capture: --resume takes its settings"),
-        ([*capture, "--seed-views", 3, "--budget", 6, *out], "--budget 6 exceeds its 5"),
-        ([*capture, "--out", full], "not empty"),
-        ([*capture, "--prior", tmp_path / "no", *out], "no such prior"),
+        ([bad, *out], "rock.siez"),
+        (["boulder", "--seed-views", 3, "--budget", 6, *out], "--budget 6 exceeds its 5"),
+        (["boulder", "--out", occupied(tmp_path / "full")], "is there already"),
     ):
-        assert message in refused(capsys, ["nbv", *arguments], tmp_path)
+        assert message in refused(capsys, ["nbv", "--capture", *arguments], tmp_path)
 
 
 def test_commands_say_which_image_an_on_demand_dataset_lacks(fresh, tmp_path, capsys):

@@ -106,5 +106,5 @@ def test_the_front_of_a_building(photographs, tmp_path):
     assert distance.mean() < 0.06  # a pixel is 42 mm
     assert np.quantile(distance, 0.9) < 0.15
     assert prior.numbers["sampled_area"] / scale**2 > 12  # of 24 square metres
-    masked = make_masks(dataset, prior.mesh, 0.1)
+    masked = make_masks(dataset, prior.mesh)
     assert all(0.2 < frame.mask().mean() < 0.95 for frame in masked.frames)

@@ -10,7 +10,6 @@ import pytest
 import tiny
 import typer
 from program import command
-from refusals import refused
 
 from mgs.cli.app import app
 from mgs.errors import InputError
@@ -206,9 +205,3 @@ def test_a_chart_is_measured_once_and_written(small, tmp_path, capsys):
     assert [row["total_passes"] for row in written["fit"]["rows"]] == [2, 1]
     assert written["run"]["claims"][0]["runs"] == 1
     assert "| **fast**: " in (out / "run.md").read_text()
-
-
-def test_a_dataset_without_test_views_is_refused_in_one_line(capsys, dataset, tmp_path):
-    line = refused(capsys, ["chart", tmp_path / "out", "--dataset", dataset])
-    assert "has no test views" in line
-    assert not (tmp_path / "out").exists()

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mgs.bench.core import surface_camera, surface_gaussians
+from mgs.bench import surface_camera, surface_gaussians
 from mgs.errors import InputError
 from mgs.fit.density import MOST_COPIES, Statistics, relocate, split, statistics
 from mgs.fit.fitting import fit

@@ -126,7 +126,7 @@ def test_files(run):
 
 
 def test_views(run):
-    frames = load_dataset(run_folder.read_settings(run).dataset).frames
+    frames = load_dataset(run_folder.open_run(run).settings.dataset).frames
     state = run_folder.read_checkpoint(run)
     trained = [frames[i].name for i in state.taken]
     chosen = diagnostics.choose_views(frames, trained, None)

@@ -17,14 +17,12 @@ from synthetic import orbit_cameras, write_dataset
 
 from mgs.colour import srgb_from_linear
 from mgs.errors import InputError
-from mgs.files import write_json
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr, write_png
 from mgs.metrics import (
     METRICS,
     OPAQUE,
     PSNR_LIMIT,
-    SPACINGS,
     SURFACE_METRICS,
     compare_surface,
     psnr,
@@ -118,7 +116,7 @@ def test_views_are_measured_beside_each_other_but_large_ones_alone(
             weakref.finalize(part, lambda: freed.append(threading.current_thread()))
         return drawn
 
-    def measured(frame, rendered, spacing, folder):
+    def measured(frame, rendered, folder):
         with lock:
             active[0] += 1
             seen.append(active[0])
@@ -181,12 +179,12 @@ def random_view(rng, shape=(6, 5)):
     return truth, weight, mask, true_depth, drawn, np.where(drawn > 0, rng.normal(2, 0.5, shape), 0)
 
 
-@given(seed=st.integers(0, 10_000), spacing=st.floats(0.01, 0.5))
-def test_surface_metrics_follow_their_definitions(seed, spacing):
+@given(seed=st.integers(0, 10_000))
+def test_surface_metrics_follow_their_definitions(seed):
     """Against sums over single pixels."""
     truth, weight, mask, true_depth, alpha, depth = random_view(np.random.default_rng(seed))
     found = compare_surface(
-        truth, alpha, depth, mask, weight, fractional=True, true_depth=true_depth, spacing=spacing
+        truth, alpha, depth, mask, weight, fractional=True, true_depth=true_depth
     )
     assert tuple(found) == SURFACE_METRICS
     errors, see_through, behind = [], [], []
@@ -204,9 +202,6 @@ def test_surface_metrics_follow_their_definitions(seed, spacing):
         "see_through": np.mean(see_through) if see_through else math.nan,
         "depth_error": median if median < math.inf else math.nan,
     }
-    for k in SPACINGS:
-        share = np.mean([b > k * spacing for b in behind]) if behind else math.nan
-        expected[f"too_deep_{k}"] = share
     for name, value in expected.items():
         assert found[name] == pytest.approx(value, nan_ok=True)
 
@@ -219,9 +214,8 @@ def test_a_surface_is_measured_as_far_as_the_truth_is_known():
 
     assert names(fractional=False) == {"see_through"}
     assert names(fractional=True) == {"see_through", "alpha_mae"}
-    assert names(fractional=False, spacing=0.1) == {"see_through"}
     assert names(fractional=False, true_depth=true_depth) == {"see_through", "depth_error"}
-    assert names(fractional=True, true_depth=true_depth, spacing=0.1) == set(SURFACE_METRICS)
+    assert names(fractional=True, true_depth=true_depth) == set(SURFACE_METRICS)
 
 
 def test_test_views_are_measured_and_drawn_apart(tmp_path):
@@ -253,7 +247,7 @@ def test_evaluate_a_perfect_model_and_nothing_held_out(tmp_path):
         for frame in dataset.frames
     }
     names, perfect = ["kf_0000", "kf_0001"], lambda g, camera: truths[id(camera)]
-    result = evaluate_model(grey(), dataset.frames, names, spacing=1e-9, renderer=perfect)
+    result = evaluate_model(grey(), dataset.frames, names, renderer=perfect)
     assert result["all"]["psnr"] == result["all"]["psnr_mask"] == PSNR_LIMIT
     assert result["all"]["ssim"] == pytest.approx(1)
     # A mask does not say which share of a pixel is rock.
@@ -319,14 +313,13 @@ def test_what_is_known_of_a_model_is_not_measured_again(dataset, prior, tmp_path
 
     first = again(pictures=False)
     assert work() == (12, 0)
-    left_out = f"{dataset}: has no images of the rock alone, so the error of alpha is left out"
-    assert said == [left_out, f"wrote {run}/metrics.json"]
-    assert {"depth_error", "too_deep_3", "see_through"} < set(first["all"])
+    assert said == [f"wrote {run}/metrics.json"]
+    assert {"depth_error", "see_through"} < set(first["all"])
     assert "alpha_mae" not in first["all"]
     assert again(pictures=False) == first
     assert work() == (0, 0)
     kept = f"kept {run}/metrics.json, measured before on this very model and dataset"
-    assert said[2:] == [left_out, kept]
+    assert said[1:] == [kept]
     drawn = again()
     assert drawn == first | {"pictures": True} == json.loads((run / "metrics.json").read_text())
     assert work() == (0, 12)
@@ -334,7 +327,7 @@ def test_what_is_known_of_a_model_is_not_measured_again(dataset, prior, tmp_path
     pictures = listing(run / "renders")
     assert again() == again(pictures=False) == drawn
     assert work() == (0, 0)
-    assert said.pop(-3).endswith(f"dataset, and {run}/renders")
+    assert said.pop(-2).endswith(f"dataset, and {run}/renders")
     (run / "renders/kf_0003.png").unlink()
     again()
     assert work() == (0, 12)
@@ -359,7 +352,6 @@ CHANGES = {
     "image": lambda run, data: write_png(data / "images/kf_0003.png", np.dstack([ONES] * 3)),
     "mask": lambda run, data: write_png(data / "masks/kf_0003.png", ONES > 0),
     "depth": lambda run, data: write_exr(data / "depth/kf_0003.exr", {"Z": ONES}),
-    "spacing": lambda run, data: write_json(run.parent / "prior/prior.json", {"spacing": 0.01}),
     "damaged": lambda run, data: (run / "metrics.json").write_text("{"),
 }
 
@@ -412,21 +404,8 @@ def test_a_run_is_measured_on_the_test_views_of_its_dataset(dataset, prior, tmp_
         evaluate_run(run)
 
 
-def test_without_the_prior_nothing_is_called_too_deep(dataset, prior, tmp_path):
-    run, lines = tiny.write_run(tmp_path / "run", dataset, prior), []
+def test_convergence_needs_the_prior(dataset, prior, tmp_path):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
     prior.rename(tmp_path / "elsewhere")
-    found = evaluate_run(run, pictures=False, say=lines.append)["all"]
-    assert "depth_error" in found
-    assert not [name for name in found if name.startswith("too_deep")]
-    missing = "is not there, so the shares that are too deep, in its spacings, are left out"
-    assert lines[1] == f"{prior}: {missing}"
     with pytest.raises(InputError, match="prior"):
         evaluate_run(run, pictures=False, convergence=True)
-
-
-@pytest.mark.parametrize("numbers", [{"spacing": "wide"}, {"spacing": -1}, []])
-def test_a_damaged_spacing_is_named(dataset, prior, tmp_path, numbers):
-    run = tiny.write_run(tmp_path / "run", dataset, prior)
-    write_json(prior / "prior.json", numbers)
-    with pytest.raises(InputError, match=r"prior\.json: spacing must be positive metres"):
-        evaluate_run(run)

@@ -157,7 +157,7 @@ def test_a_folder_that_fails_leaves_all_as_it_was(tmp_path, there):
 
 def test_what_is_in_a_folder_is_never_touched(tmp_path):
     (tmp_path / "precious.txt").touch()
-    with pytest.raises(InputError, match="not empty"), atomic_folder(tmp_path):
+    with pytest.raises(InputError, match="is there already"), atomic_folder(tmp_path):
         pass
     assert (tmp_path / "precious.txt").exists()
 

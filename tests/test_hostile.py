@@ -27,7 +27,7 @@ from mgs.data.dataset import load_dataset
 from mgs.data.meshes import load_mesh
 from mgs.data.sources import read_source
 from mgs.errors import InputError
-from mgs.files import read_json
+from mgs.files import atomic_folder, folder_locked, read_json
 from mgs.images import image_size, read_exr, read_rgba, write_exr
 from mgs.run.folder import open_run
 from mgs.splat_ply import read_ply, write_ply
@@ -61,19 +61,16 @@ def exr_bomb(path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("side", [4_000, 13_300, 200_000])
-@pytest.mark.parametrize("command", ["check", "import"])
-def test_an_image_is_measured_by_its_header(capsys, dataset, tmp_path, monkeypatch, side, command):
-    bomb(dataset / "images/kf_0000.png", side)
+def test_an_image_is_measured_by_its_header(capsys, dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(ImageFile.ImageFile, "load", None)  # decoding would fail
-    if command == "import":
-        line = refused(capsys, ["import", dataset, "--out", tmp_path / "out"], tmp_path / "out")
-    else:
-        with pytest.raises(InputError) as error:
+    image, out = dataset / "images/kf_0000.png", tmp_path / "out"
+    for side in (4_000, 13_300, 200_000):
+        image.unlink()
+        bomb(image, side)
+        with pytest.raises(InputError, match=f"kf_0000.png.*{side}x{side}"):
             load_dataset(dataset).frames[0].rgb()
-        line = str(error.value)
-    assert f"{side}x{side}" in line
-    assert "kf_0000.png" in line
+        line = refused(capsys, ["import", dataset, "--out", out], out)
+        assert f"{side}x{side}" in line
 
 
 def test_other_bombs(tmp_path, monkeypatch):
@@ -103,26 +100,6 @@ def test_a_damaged_exr_is_one_line(tmp_path, capfd):
     with pytest.raises(InputError, match="not a readable EXR"):
         read_exr(tmp_path / "a.exr")
     assert capfd.readouterr().err == ""
-
-
-LONG = "a" * 5000
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["dataset", "check", LONG],
-        ["synth-orbit", "out", "--scene", f"{LONG}.toml"],
-        ["import", LONG, "--out", "out"],
-        ["survey", LONG],
-        ["report", LONG],
-        ["eval", LONG],
-    ],
-    ids=lambda arguments: arguments[0],
-)
-def test_a_name_of_5000_characters(capsys, tmp_path, monkeypatch, arguments):
-    monkeypatch.chdir(tmp_path)
-    assert len(refused(capsys, arguments, tmp_path)) < 300
 
 
 def test_a_full_disk_behind_the_standard_output():
@@ -194,13 +171,6 @@ def test_a_mesh_without_a_height(capsys, tmp_path):
     assert "flat on the ground" in refused(capsys, arguments, tmp_path / "out")
 
 
-@pytest.mark.parametrize("options", ["--spp 100000000000", "--frames 1000000000 --size 1x1"])
-def test_counts_are_bounded(capsys, tmp_path, options):
-    line = refused(capsys, ["synth-orbit", tmp_path / "out", *options.split()], tmp_path / "out")
-    assert "hours and" in line
-    assert "GiB on disk; at most" in line
-
-
 def test_a_pipe_is_no_file(capsys, dataset, tmp_path):
     os.mkfifo(tmp_path / "pipe.glb")
     pipe, out = tmp_path / "pipe.glb", tmp_path / "out"
@@ -230,8 +200,9 @@ FAR = [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 ABSURD = {"w": {"w": 16.5}, "pose": {"frame": {"transform_matrix": FAR}}, "focal": {"fl_x": 1e300}}
 
 
-@pytest.mark.parametrize("command", ["import", "survey", "nbv"])
-@pytest.mark.parametrize("case", ABSURD)
+@pytest.mark.parametrize(
+    ("case", "command"), [("w", "import"), ("pose", "survey"), ("focal", "nbv")]
+)
 def test_absurd_cameras(capsys, dataset, tmp_path, case, command):
     change(dataset, **ABSURD[case])
     line = refused(capsys, [command, dataset, "--out", tmp_path / "out"], tmp_path / "out")
@@ -275,53 +246,30 @@ def test_damaged_images_of_a_colmap_model(tmp_path, damage):
     assert len(str(error.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize("k1", [-1e6, -5, 1e6])
-def test_distortion_that_folds_the_image(capsys, dataset, tmp_path, k1):
-    change(dataset, k1=k1)
+def test_distortion_that_folds_the_image(capsys, dataset, tmp_path):
     out = tmp_path / "out"
-    assert "the distortion" in refused(capsys, ["import", dataset, "--out", out], out)
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["synth-orbit", "--pose-noise", "1e300"],
-        ["synth-orbit", "--rotation-noise", "1e9"],
-        ["survey", "--drift", "1e30"],
-        ["survey", "--sensor-noise", "1e30"],
-    ],
-    ids=" ".join,
-)
-def test_absurd_errors(capsys, dataset, tmp_path, arguments):
-    command, *options = arguments
-    place = [dataset, "--out"] if command == "survey" else []
-    arguments = [command, *place, tmp_path / "out", *options]
-    assert options[0] in refused(capsys, arguments, tmp_path / "out")
+    for k1 in (-1e6, -5, 1e6):
+        change(dataset, k1=k1)
+        assert "the distortion" in refused(capsys, ["import", dataset, "--out", out], out)
 
 
 def test_the_loser_is_told_who_works_there(capsys, dataset, prior, tmp_path):
     """One lock for all who write a folder, held from the start to the end of their work."""
     out = tmp_path / "out"
     write_ply(tmp_path / "a.ply", tiny.initial([]))
-    script = "import sys; from mgs.files import *\n"
-    script += "with {}(sys.argv[1]):\n    print(flush=True); sys.stdin.read()"
     writers = {
-        "folder_locked": [
+        folder_locked: [
             ["synth-orbit", out],
             ["import", dataset, "--out", out],
             ["render", tmp_path / "a.ply", "--cameras", dataset, "--out", out],
             ["stress", out],
         ],
-        "atomic_folder": [["survey", dataset, "--out", out], ["prior", dataset, "--out", out]],
+        atomic_folder: [["survey", dataset, "--out", out], ["prior", dataset, "--out", out]],
     }
     for lock, losers in writers.items():
-        program = [sys.executable, "-c", script.format(lock), str(out)]
-        with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as winner:
-            winner.stdout.readline()
+        with lock(out):
             for arguments in losers:
-                line = refused(capsys, arguments, out)
-                assert f"process {winner.pid} works on it" in line
-            winner.stdin.close()
+                assert f"process {os.getpid()} works on it" in refused(capsys, arguments, out)
         shutil.rmtree(out, ignore_errors=True)
 
 
@@ -335,12 +283,19 @@ def test_a_finished_import_says_so(capsys, dataset, tmp_path):
     assert "a finished dataset of other" in refused(capsys, arguments, tmp_path / "out")
 
 
-@pytest.fixture
-def stranger(dataset, prior, tmp_path):
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
     """A run that anyone may have made."""
-    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    root = tmp_path_factory.mktemp("stranger")
+    data, prior = tiny.write_dataset(root / "dataset"), tiny.write_prior(root / "prior")
+    run = tiny.write_run(root / "run", data, prior)
     assert open_run(run).state.taken
     return run
+
+
+@pytest.fixture
+def stranger(made, tmp_path):
+    return Path(shutil.copytree(made, tmp_path / "run"))
 
 
 def members(**changed: object):
@@ -416,19 +371,17 @@ PLACES = {"report": "report", "diagnose": "diagnostics", "eval": "", "prune": ""
 """Command on a run -> folder in the run that it locks."""
 
 
-@pytest.mark.parametrize("command", PLACES)
-def test_two_commands_on_one_run(capsys, stranger, command, monkeypatch):
+def test_two_commands_on_one_run(capsys, stranger, monkeypatch):
+    """The second one would remove the half-written files of the first."""
     monkeypatch.setattr("mgs.report.runs.compare_runs", lambda runs: runs)
-    out = stranger / PLACES[command]
-    script = f"from mgs.files import *\nwith folder_locked({str(out)!r}):\n    print(flush=True)\n"
-    script += "    input()"
-    program = [sys.executable, "-c", script]
-    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as winner:
-        winner.stdout.readline()
-        given = ["--out", out] if command == "report" else []
-        line = refused(capsys, [command, stranger, *given], stranger)
-        assert f"process {winner.pid} works on it" in line
-        winner.communicate(b"\n")
+    for command, place in PLACES.items():
+        with folder_locked(stranger / place):
+            (stranger / ".checkpoint.1.part.npz").write_bytes(b"half")
+            given = ["--out", stranger / place] if command == "report" else []
+            line = refused(capsys, [command, stranger, *given], stranger)
+            assert f"process {os.getpid()} works on it" in line
+    with folder_locked(stranger):
+        assert "works on it" in refused(capsys, ["nbv", "--resume", stranger], stranger)
 
 
 @pytest.mark.parametrize("damage", CHECKPOINTS)
@@ -439,8 +392,7 @@ def test_the_checkpoint_of_a_stranger(capsys, stranger, damage):
         open_run(stranger).state  # noqa: B018
     assert tracemalloc.get_traced_memory()[1] < 32 << 20
     tracemalloc.stop()
-    for arguments in (["eval"], ["nbv", "--resume"]):
-        assert "checkpoint.npz: " in refused(capsys, [*arguments, stranger], stranger)
+    assert "checkpoint.npz: " in refused(capsys, ["eval", stranger], stranger)
 
 
 SEEDS = {"seeds": [0], "images": 1, "coverage": 1}

@@ -78,7 +78,7 @@ WRITERS = {name: COMMANDS[name] for name in COMMANDS if name != "study"} | {
 LONG = {name: f"{name} {{out}}" for name in ("demo", "chart", "stress", "parsimony", "reproduce")}
 """Commands whose winner is stopped when the loser has ended."""
 ON_RUNS = ("refit", "eval", "diagnose", "prune", "report", "page")
-LOST = "works on it|is finished already|holds a run|is not empty|has a mask already"
+LOST = "works on it|is finished already|is there already|has a mask already"
 """Pattern of the loser's line."""
 
 
@@ -132,7 +132,7 @@ def cleared(name: str, places: dict[str, Path]) -> Path:
 
 
 def contents(work: Path) -> dict[str, object]:
-    """Every file below a folder but its timings and commit: bytes, or of checkpoints the arrays."""
+    """Every file below a folder but its commit: bytes, or of checkpoints the arrays."""
     found: dict[str, object] = {}
     for path in sorted(work.rglob("*")):
         key, data = str(path.relative_to(work)), path.read_bytes() if path.is_file() else b""
@@ -141,7 +141,7 @@ def contents(work: Path) -> dict[str, object]:
         if path.suffix == ".npz":
             with np.load(path) as arrays:
                 found[key] = [arrays[n].tobytes() for n in arrays.files if n != "json"]
-        elif path.name != "timings.json":
+        else:
             found[key] = data
     return found
 

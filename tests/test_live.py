@@ -23,7 +23,7 @@ from mgs.errors import InputError, Notice
 from mgs.images import read_exr, read_rgba, write_png
 from mgs.prior.build import load_prior
 from mgs.run import live, transports
-from mgs.run.photograph import check_photograph
+from mgs.run.live import check_photograph
 
 SCRIPT = """
 name=$(basename "$2" .pose.json)

@@ -172,7 +172,7 @@ def test_units_are_spacings_of_the_prior_unless_given(files, tmp_path):
     made = start_run(files[0], tmp_path / "run", **options(files, "normal")).settings
     assert made.prior_std["mean"] == MEAN_STD * 0.5
     assert made.train.rates["mean"] == MEAN_RATE * 0.5
-    assert run_folder.read_settings(tmp_path / "run") == made
+    assert run_folder.open_run(tmp_path / "run").settings == made
     train = {"means": "normal", "rates": {"mean": 0.01}}
     given = options(files, "normal", prior_std={"mean": 0.3}, train=train)
     own = start_run(files[0], tmp_path / "own", **given).settings
@@ -183,7 +183,7 @@ def test_units_are_spacings_of_the_prior_unless_given(files, tmp_path):
 
 def test_criteria_see_the_means_and_coverage_does_not(files, whole):
     means, out, state = whole
-    made, prior = run_folder.read_settings(out), load_prior(files[1])
+    made, prior = run_folder.open_run(out).settings, load_prior(files[1])
     frames = [load_dataset(files[0]).frames[i] for i in state.taken]
     facing = initial_normals(prior)
     H = sum(
@@ -253,7 +253,7 @@ def test_diagnostics_and_viewer_read_such_a_run(files, whole):
     assert out / "diagnostics/information.ply" in written
     found = read_subject(out)
     assert set(found.scalars) == set(SCALARS)
-    lam = run_folder.read_settings(out).regularisation(groups(0, means))
+    lam = run_folder.open_run(out).settings.regularisation(groups(0, means))
     assert found.scalars["information"] == pytest.approx(0.5 * np.log1p(state.H / lam).sum(1))
     for name in LEARNED:
         assert getattr(found.gaussians, name).shape == getattr(state.gaussians, name).shape

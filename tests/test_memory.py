@@ -115,7 +115,7 @@ def test_commands_before_a_run_hold_few_images_at_once(
     for path in (tmp_path / "d/masks").iterdir():
         path.unlink()
     bare = [Frame(f.name, f.camera, f.timestamp, f.image_path) for f in imported.frames]
-    make_masks(Dataset(tmp_path / "d", tuple(bare)), read_mesh(rock.root / "rock.glb"), 0.1)
+    make_masks(Dataset(tmp_path / "d", tuple(bare)), read_mesh(rock.root / "rock.glb"))
     assert live.most <= 4
     assert len(load_dataset(tmp_path / "d")) == 9
 

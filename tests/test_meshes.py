@@ -86,27 +86,6 @@ def test_bad_mesh_is_one_line(dataset, tmp_path, case, capsys):
         load_rock(tmp_path / name, Rock())
 
 
-GB = r"[\d.e+Infinity]+"
-MEMORY = f"N = {GB} samples take about {GB} GB of memory, and this machine has [\\d.]+ GB"
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--spacing 1e-6", MEMORY),
-        ("--spacing 1e-300", MEMORY),
-        (f"--gaussians 1{30 * '0'}", MEMORY),
-        ("--gaussians 100 --prior-noise 0.01", "--prior-noise.*--mesh"),
-        ("--gaussians 100 --holes 0.2", "--holes.*--mesh"),
-        ("--gaussians 100 --poisson-depth 0", "--poisson-depth.*--mesh"),
-    ],
-)
-def test_options_that_do_not_fit_a_mesh_are_one_line(dataset, options, message, capsys):
-    mesh = ["--mesh", dataset.root / "rock.glb"]
-    line = refused(capsys, ["prior", dataset.root, *mesh, *options.split()], dataset.root)
-    assert re.search(message, line)
-
-
 def test_a_mesh_that_is_small_and_far_away_is_one_line(tmp_path):
     (tmp_path / "a.obj").write_text(obj("1e6 0 0", "1000001 0 0", "1e6 1 0"))
     with pytest.raises(InputError, match="float32 does not resolve"):

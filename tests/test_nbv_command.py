@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from mgs.cli.nbv import start_and_print
 from mgs.cli.printing import print_run, step_line
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
-from mgs.files import locked, write_json
+from mgs.files import write_json
 from mgs.fit.settings import ALPHA_WEIGHT, TrainSettings
 from mgs.images import write_png
 from mgs.policy import criteria
@@ -119,7 +118,8 @@ def state_of(steps: list[dict]) -> State:
     return State(tiny.initial([]), np.zeros(0), np.zeros(0), [0], steps)
 
 
-def test_a_quality_that_could_not_be_measured_is_a_dash(tmp_path):
+def test_what_is_printed_of_a_run(tmp_path):
+    """A quality that was not measured is a dash; test views go before the others."""
     views = {"count": 2, "psnr": 30.123, "ssim": 0.95, "psnr_mask": None, "ssim_mask": None}
     console = Console(record=True, width=500)
     print_run(tmp_path, state_of([]), NOT_SHOWN | {"all": views}, console)
@@ -128,6 +128,18 @@ def test_a_quality_that_could_not_be_measured_is_a_dash(tmp_path):
     assert "test views" not in console.export_text()
     print_run(tmp_path, state_of([]), NOT_SHOWN | {"all": views, "test": views}, console)
     assert f"test views {text}\ntraining views {text}" in console.export_text()
+    line = {"step": 0, "name": None, "seed_names": ["a", "b"], "score": None, "coverage": 1.0}
+    line |= {"seconds": {"fit": 2.5}, "images": 2, "iterations": 14, "loss": 0.1}
+    line |= {"stop_reason": "pass-limit", "psnr": 20.0, "test_psnr": 30.12, "test_psnr_mask": 25.5}
+    console = Console(record=True, width=80, force_terminal=True)
+    print_run(tmp_path, state_of([line]), NOT_SHOWN, console)
+    shown = console.export_text()
+    assert all(text in shown for text in ("30.12", "25.50", "masked PSNR", "test", " 7 "))
+    assert "20.0" not in shown
+    assert step_line(line) == (
+        "step 0: a, b, coverage 100.00 %, 7 passes, PSNR test views 30.12 dB, "
+        "masked PSNR test views 25.50 dB, 2.5 s"
+    )
 
 
 @pytest.mark.parametrize("made", ["dataset", "random"])
@@ -147,6 +159,9 @@ def test_a_replaced_prior_is_one_line_on_resume(dataset, prior, tmp_path, capsys
     run, known = tiny.write_run(tmp_path / "run", dataset, prior), load_prior(prior)
     change_settings(run, budget=1)
     prior.rename(tmp_path / "kept")
+    said = refused(capsys, ["nbv", "--resume", run], run)
+    where = f"run/config.json: prior {prior} is not there; if it was moved, correct `prior`"
+    assert where in said
     for i, changes in enumerate(
         (
             {"normals": known.normals[::-1]},
@@ -161,17 +176,6 @@ def test_a_replaced_prior_is_one_line_on_resume(dataset, prior, tmp_path, capsys
         prior.rename(tmp_path / f"other{i}")
     (tmp_path / "kept").rename(prior)
     command("nbv", "--resume", run)
-
-
-@pytest.mark.parametrize("arguments", [["nbv", "--resume"], ["eval"]])
-def test_one_process_at_a_time_works_on_a_run(dataset, prior, tmp_path, capsys, arguments):
-    """A second one would remove the half-written files of the first."""
-    run = tiny.write_run(tmp_path / "run", dataset, prior)
-    with locked(run):
-        (run / ".checkpoint.1.part.npz").write_bytes(b"half")
-        said = refused(capsys, [*arguments, run], run)
-        assert f"{run}: process {os.getpid()} works on it" in said
-    command(*arguments, run)
 
 
 def test_a_run_folder_appears_when_it_is_complete(dataset, prior, tmp_path, monkeypatch):
@@ -211,38 +215,6 @@ def test_a_damaged_setting_is_named_with_its_file(dataset, prior, tmp_path, caps
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--estimator block", "--estimator block: unknown; choose one of exact, hutchinson"),
-        ("--optimiser hope", "--optimiser 'hope': unknown; choose one of natural, adam"),
-        ("--lam 0", "--lam 0.0: must be at least"),
-        ("--rate colour", "--rate colour: expected KIND=NUMBER, as in --rate colour=0.01"),
-        ("--rate hue=1", f"--rate {{'hue': 1.0}}: {KINDS}"),
-        ("--prior-std scale=inf", "--prior-std scale=inf: Input should be a finite number"),
-        ("--pixel-noise 1e-200", "1e-200: must be at least 1e-06"),
-        ("--batch 0", "--batch 0: must be at least 1"),
-        ("--alpha-weight -1", "--alpha-weight -1.0: must be at least 0"),
-        ("--stop-gain 0", "--stop-gain 0.0: must be more than 0"),
-        ("--stop-uncertainty 1", "--stop-uncertainty 1.0: must be less than 1"),
-        ("--policy best", "--policy best: unknown; choose one of"),
-        ("--seed-views 13", "fewer than 13 seeds"),
-        ("--seed-views 0", "--seed-views"),
-        ("--budget -1", "--budget -1: must be at least 0"),
-        ("--travel nan", "--travel"),
-        ("--nearest 0", "--nearest 0: must be at least 1"),
-        ("--means loose", "--means loose: Input should be 'frozen', 'normal' or 'free'"),
-        ("--means free --estimator hutchinson", "hutchinson has no information"),
-        ("--means free --policy paper", "--policy paper has no information about means"),
-        ("--means normal --prior-std mean=0", "--prior-std mean=0.0: must be at least"),
-    ],
-)
-def test_bad_options_are_one_line(dataset, prior, tmp_path, capsys, options, message):
-    start = ["nbv", dataset, "--prior", prior, "--budget", "1", "--out", tmp_path / "run"]
-    assert message in refused(capsys, [*start, *options.split()])
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
     ("values", "message"),
     [
         ({"optimizer": "adam"}, "setting optimizer = 'adam': Extra inputs are not permitted"),
@@ -258,15 +230,15 @@ def test_settings_without_an_option_are_named_by_their_key(
 
 def test_options_win_over_a_file_of_settings(dataset, prior, tmp_path, capsys, monkeypatch):
     """The config.json of a run is such a file, too."""
-    monkeypatch.setattr(nbv_command, "resume_and_print", lambda *given, live: None)
+    monkeypatch.setattr(nbv_command, "resume_and_print", lambda *given, **more: None)
     file, first, second = (tmp_path / name for name in ("mine.toml", "first", "second"))
     text = f'dataset = "{dataset.name}"\nprior = "{prior}"\nseeds = 3\nbudget = 2\n'
     file.write_text(text + "[train]\npasses = 2\n")
     command("nbv", "--config", file, "--budget", 1, "--out", first)
-    made = run_folder.read_settings(first)
+    made = run_folder.open_run(first).settings
     assert (made.seeds, made.budget, made.train.passes, made.prior) == (3, 1, 2, prior.resolve())
     command("nbv", "--config", first / "config.json", "--policy", "random", "--out", second)
-    assert run_folder.read_settings(second) == made.model_copy(update={"policy": "random"})
+    assert run_folder.open_run(second).settings == made.model_copy(update={"policy": "random"})
     for wrong, said in {
         "budgett = 1": "mine.toml: budgett: Extra inputs are not permitted; correct it",
         "budget = -1": "mine.toml: budget: must be at least 0; correct it",
@@ -276,21 +248,6 @@ def test_options_win_over_a_file_of_settings(dataset, prior, tmp_path, capsys, m
         assert said in refused(capsys, ["nbv", dataset, "--config", file, "--out", tmp_path / "x"])
 
 
-def test_the_table_of_steps_has_the_psnr_that_was_measured(tmp_path):
-    line = {"step": 0, "name": None, "seed_names": ["a", "b"], "score": None, "coverage": 1.0}
-    line |= {"seconds": {"fit": 2.5}, "images": 2, "iterations": 14, "loss": 0.1}
-    line |= {"stop_reason": "pass-limit", "psnr": 20.0, "test_psnr": 30.12, "test_psnr_mask": 25.5}
-    console = Console(record=True, width=80, force_terminal=True)
-    print_run(tmp_path, state_of([line]), NOT_SHOWN, console)
-    shown = console.export_text()
-    assert all(text in shown for text in ("30.12", "25.50", "masked PSNR", "test", " 7 "))
-    assert "20.0" not in shown
-    assert step_line(line) == (
-        "step 0: a, b, coverage 100.00 %, 7 passes, PSNR test views 30.12 dB, "
-        "masked PSNR test views 25.50 dB, 2.5 s"
-    )
-
-
 def test_options_reach_the_run(dataset, prior, tmp_path):
     """Here the paper's Eq. 7: squared gradients of one scalar loss per image, one lambda."""
     options = "--estimator loss-gradient --lam 1e-6 --budget 1 --seed-views 3 --passes 2"
@@ -298,7 +255,7 @@ def test_options_reach_the_run(dataset, prior, tmp_path):
     options += " --nearest 5 --travel 2.5 --batch 3 --stop-gain 1e-9 --stop-uncertainty 1e-9"
     run = tmp_path / "run"
     command("nbv", dataset, "--prior", prior, "--out", run, *options.split())
-    state, settings = run_folder.read_checkpoint(run), run_folder.read_settings(run)
+    state, settings = run_folder.read_checkpoint(run), run_folder.open_run(run).settings
     assert settings.train.rates == {"colour": 0.1, "scale": 0.04, "rotation": 0.02, "opacity": 0}
     assert settings.train.alpha_weight == 0.3
     assert settings.prior_std == criteria.PRIOR_STD | {"scale": 2.0}
@@ -343,27 +300,11 @@ def test_a_run_of_a_policy_of_ones_own_can_be_read_without_it(loaded, tmp_path, 
         tiny.resume(run, loaded)
 
 
-@pytest.mark.parametrize("moved", ["dataset", "prior"])
-def test_a_dataset_or_prior_that_moved_is_named(dataset, prior, tmp_path, capsys, moved):
-    run = tiny.write_run(tmp_path / "run", dataset, prior)
-    (tmp_path / moved).rename(tmp_path / "elsewhere")
-    said = refused(capsys, ["nbv", "--resume", run], run)
-    where = f"run/config.json: {moved} {tmp_path / moved} is not there"
-    assert f"{where}; if it was moved, correct `{moved}`" in said
-
-
-def test_a_run_that_exists_is_not_started_again(dataset, prior, tmp_path, capsys):
-    run = tiny.write_run(tmp_path / "run", dataset, prior)
-    said = refused(capsys, ["nbv", dataset, "--prior", prior, "--out", run], run)
-    assert f"{run}: holds a run; `mgs nbv --resume {run}` continues it" in said
-    assert "for another, choose a new folder" in said
-
-
-@pytest.mark.parametrize("option", ["--budget 9", "--exposure", "--prior-std colour=1"])
-def test_resume_takes_no_other_setting(dataset, prior, tmp_path, capsys, option):
-    run = tiny.write_run(tmp_path / "run", dataset, prior)
-    said = refused(capsys, ["nbv", "--resume", run, *option.split()], run)
-    where = f"--resume takes its settings from {run / 'config.json'}; change it there"
-    assert f"nbv: {option.split()[0]}: {where}" in said
-    said = refused(capsys, ["nbv", "--resume", run, "--policy", "random"], run)
-    assert f"--policy random: is not the policy of {run}, d-optimal" in said
+def test_steps_are_logged_for_tensorboard(dataset, prior, tmp_path):
+    pytest.importorskip("tensorboardX")
+    short = ["--seed-views", 3, "--budget", 1, "--passes", 1, "--evaluate-every", 1]
+    run = tmp_path / "run"
+    command("nbv", dataset, "--prior", prior, "--out", run, *short, "--tensorboard")
+    (log,) = (run / "tensorboard").iterdir()
+    logged = log.read_bytes()
+    assert all(name in logged for name in (b"psnr", b"information_gain", b"newest_view/render"))

@@ -11,7 +11,7 @@ import pytest
 import synthetic
 import tiny
 import typer
-from program import command
+from program import command, steps
 from refusals import a_file, listing, occupied, refused
 
 from mgs import __version__
@@ -43,7 +43,7 @@ def writers(dataset: Path, prior: Path, splats: Path, out: Path) -> dict[str, li
 
 
 IN_THE_WAY = {
-    "not empty": lambda tmp_path: occupied(tmp_path / "out"),
+    "is there already": lambda tmp_path: occupied(tmp_path / "out"),
     "is a file": lambda tmp_path: a_file(tmp_path / "out"),
     "under a file": lambda tmp_path: a_file(tmp_path / "file") / "out",
     "long name": lambda tmp_path: tmp_path / ("long" * 99),
@@ -54,7 +54,11 @@ COMMANDS_THAT_WRITE = list(writers(*[Path()] * 4))
 
 @pytest.mark.parametrize(
     ("command", "place"),
-    [(command, place) for command in COMMANDS_THAT_WRITE for place in ("not empty", "read only")]
+    [
+        (command, place)
+        for command in COMMANDS_THAT_WRITE
+        for place in ("is there already", "read only")
+    ]
     + [("render", place) for place in ("is a file", "under a file", "long name")],
 )
 def test_output_that_is_in_the_way(capsys, dataset, prior, tmp_path, command, place):
@@ -62,8 +66,61 @@ def test_output_that_is_in_the_way(capsys, dataset, prior, tmp_path, command, pl
     out = IN_THE_WAY[place](tmp_path)
     before = listing(tmp_path)
     line = refused(capsys, writers(dataset, prior, tmp_path / "splats.ply", out)[command])
-    assert (place if place in ("not empty", "is a file") else "cannot be written") in line
+    assert (place if place in ("is there already", "is a file") else "cannot be written") in line
     assert listing(tmp_path) == before
+
+
+def test_force_replaces_what_the_command_made_and_nothing_else(capsys, dataset, prior, tmp_path):
+    out, few = tmp_path / "out", ["--gaussians", 60]
+    made = ["prior", dataset, "--out", out, *few]
+    command(*made)
+    assert "is there already" in refused(capsys, made, out)
+    (out / "prior.png").write_text("old")
+    command(*made, "--force")
+    assert {path.name for path in tmp_path.iterdir()} == {"dataset", "prior", "out"}
+    assert (out / "prior.png").read_bytes()[:4] == b"\x89PNG"
+    again = [*made, "--force"]
+    assert "mesh.ply is in it" in refused(capsys, [*again, "--mesh", out / "mesh.ply"], out)
+    (out / "notes.txt").write_text("keep me")
+    assert "it holds notes.txt" in refused(capsys, again, out)
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    assert "it holds" in refused(capsys, ["prior", dataset, "--out", run, *few, "--force"], run)
+    nbv = ["nbv", dataset, "--prior", prior, "--out", out, "--budget", 1, "--force"]
+    assert "is there already" in refused(capsys, nbv, out)
+    nbv[nbv.index(out)] = run
+    command(*nbv, "--seed-views", 3, "--passes", 1, "--warm-passes", 1)
+    assert not (run / "renders").exists()
+    assert len(steps(run)) == 2
+
+
+ONE_FILE = {
+    "report": ["report", "RUN", "--html", "FILE.html"],
+    "bench": ["bench", "--json", "FILE.json"],
+    "prune": ["prune", "RUN"],
+}
+
+
+@pytest.mark.parametrize("name", ONE_FILE)
+def test_a_file_that_is_there_is_kept(capsys, dataset, prior, tmp_path, name):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    words = [str(word) for word in ONE_FILE[name]]
+    words = [str(run) if word == "RUN" else word for word in words]
+    kept = [tmp_path / word for word in words if word.startswith("FILE")]
+    a_file(kept[0] if kept else run / "gaussians_pruned.ply")
+    words = [str(kept[0]) if word.startswith("FILE") else word for word in words]
+    assert "is there already; choose another place" in refused(capsys, words, tmp_path)
+
+
+def test_a_run_is_drawn_through_its_own_cameras(capsys, dataset, prior, tmp_path):
+    run, out = tiny.write_run(tmp_path / "run", dataset, prior), tmp_path / "out"
+    drawn = ["render", run, "--out", out, "--width", 8]
+    command(*drawn)
+    pictures = [path.name for path in (dataset / "images").iterdir()]
+    assert sorted(path.name for path in out.iterdir()) == sorted(pictures)
+    assert "is there already" in refused(capsys, drawn, out)
+    command(*drawn, "--force")
+    both = ["export", run, run, "--out", out / "a.glb"]
+    assert "is one file for 2; leave it out" in refused(capsys, both, tmp_path)
 
 
 def test_a_file_where_a_run_keeps_its_pictures(capsys, dataset, prior, tmp_path):
@@ -81,25 +138,12 @@ def test_a_report_under_a_file(capsys, dataset, prior, tmp_path):
         assert "cannot be written" in line
 
 
-@pytest.mark.parametrize("option", ["--json", "--chart"])
-def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path, option):
+def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path):
     for path, named in (
         (a_file(tmp_path / "file") / "x", "cannot be written"),
         (occupied(tmp_path / "folder"), "is a folder"),
     ):
-        assert named in refused(capsys, ["bench", "scaling", option, path])
-
-
-@pytest.mark.parametrize("command", ["nbv", "prior", "synth-orbit", "survey", "demo"])
-def test_negative_seed(capsys, dataset, prior, tmp_path, command):
-    arguments = writers(dataset, prior, tmp_path, tmp_path / "out")[command]
-    assert "--random-seed" in refused(capsys, [*arguments, "--random-seed", -1], tmp_path)
-
-
-def test_a_picture_too_large(capsys, dataset, tmp_path):
-    write_ply(tmp_path / "splats.ply", tiny.initial([]))
-    arguments = ["render", tmp_path / "splats.ply", "--cameras", dataset, "--out", tmp_path / "out"]
-    assert "100000000x" in refused(capsys, [*arguments, "--width", 100_000_000], tmp_path)
+        assert named in refused(capsys, ["bench", "--json", path])
 
 
 @pytest.mark.parametrize("existing", [False, True])
@@ -126,7 +170,7 @@ WHOLE = {
 @pytest.mark.parametrize("name", WHOLE)
 def test_a_result_appears_whole(tmp_path, monkeypatch, name):
     """Nothing is under its name while its picture, the last file, is drawn."""
-    module = importlib.import_module(f"mgs.{name}.figure")
+    module = importlib.import_module({"survey": "mgs.survey.folder"}.get(name, "mgs.prior.figure"))
     draw, drawn, out = getattr(module, f"draw_{name}"), [], tmp_path / "out"
     root, (option, files) = synthetic.write_dataset(tmp_path / "data").root, WHOLE[name]
 
@@ -139,20 +183,6 @@ def test_a_result_appears_whole(tmp_path, monkeypatch, name):
     assert drawn == [True]
     assert sorted(path.name for path in out.iterdir() if path.is_file()) == files.split()
     assert not list(tmp_path.glob(".*"))
-
-
-OPTIONS: dict[str, tuple[list, str]] = {
-    "unknown command": (["fly"], "fly"),
-    "unknown option": (["nbv", "--fast"], "--fast"),
-    "number of words": (["bench", "splat", "--repeats", "many"], "--repeats"),
-    "unknown choice": (["bench", "speed"], "speed"),
-}
-
-
-@pytest.mark.parametrize("case", OPTIONS)
-def test_wrong_options(capsys, case):
-    arguments, named = OPTIONS[case]
-    assert named in refused(capsys, arguments)
 
 
 def printed(capsys, *arguments) -> str:

@@ -15,7 +15,7 @@ from mgs.policy import from_file
 from mgs.policy.registry import check_policy, policy_named
 from mgs.report.runs import read_run
 from mgs.run import recording
-from mgs.run.folder import read_settings
+from mgs.run.folder import open_run
 from mgs.run.nbv import start_run
 
 FUNCTIONS = """
@@ -154,7 +154,7 @@ def test_a_run_goes_on_with_the_same_file_only(dataset, file, tmp_path, monkeypa
     loaded = load_dataset(dataset)
     run(half, loaded, policy=f"{file}:poses", budget=1)
     assert read_run(half).policy == "mine.py:poses"
-    settings = read_settings(half).model_copy(update={"budget": 2})
+    settings = open_run(half).settings.model_copy(update={"budget": 2})
     further = lambda: recording.run(half, settings, loaded, tiny.operations(), tiny.silent)  # noqa: E731
     file.write_text(FUNCTIONS + "\n")
     with pytest.raises(InputError, match=r"mine\.py:poses: its file has changed since .*half was"):

@@ -10,7 +10,7 @@ import pytest
 import synthetic
 import trimesh
 from program import command, said
-from refusals import listing, refused
+from refusals import refused
 from scipy.spatial import cKDTree
 
 from mgs.camera import Camera, look_at
@@ -258,7 +258,6 @@ def test_command_writes_everything(dataset, tmp_path, capsys):
     assert {path.name for path in (tmp_path / "p").iterdir()} == files
     numbers = read_json(tmp_path / "p/prior.json")
     assert (numbers["n"], numbers["backed"]) == (333, 167)
-    assert 0.8 < numbers["seen_by_seeds"] < 1
     assert "500" in said(capsys)[0]
 
 
@@ -314,35 +313,13 @@ def faceless_truth(root: Path) -> None:
         (no_return, "no depth image has a return"),
         (truncated_depth, "kf_0003.exr: not a readable EXR"),
         (small_depth, "is 10x10"),
-        (occupied, "not empty"),
+        (occupied, "is there already"),
         (faceless_truth, "no faces"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(make, message, tmp_path, capsys):
     make(tmp_path / "data")
     assert message in refused(capsys, ["prior", tmp_path / "data"], tmp_path / "data")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--gaussians 0", "0 Gaussians are too few"),
-        ("--gaussians -5", "-5 Gaussians are too few"),
-        ("--spacing 0", "must be positive"),
-        ("--spacing 9", "samples are too few"),
-        ("--spacing nan", "must be positive"),
-        ("--gaussians 50 --spacing 0.1", "give one of them"),
-        ("--prior-noise -1", "must be 0 or more"),
-        ("--prior-noise nan", "must be 0 or more"),
-        ("--holes 1.0", "0 to 0.9"),
-        ("--poisson-depth 0", "poisson-depth"),
-        ("--poisson-depth 30", "poisson-depth"),
-    ],
-)
-def test_bad_options_are_one_line(built, dataset, options, message, capsys):
-    before = listing(dataset.root)
-    assert message in refused(capsys, ["prior", dataset.root, *options.split()])
-    assert listing(dataset.root) == before
 
 
 def test_one_frame_with_depth_gives_what_it_saw(tmp_path):

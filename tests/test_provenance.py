@@ -16,7 +16,7 @@ from mgs.provenance import command_line, versions
     [
         (["/usr/bin/mgs", "chart", "out"], "mgs chart out"),
         (["/lib/mgs/__main__.py", "chart", "out dir"], "mgs chart 'out dir'"),  # python -m mgs
-        (["benchmarks/ranking.py", "a.json"], "ranking.py a.json"),
+        (["tools/ranking.py", "a.json"], "ranking.py a.json"),
     ],
 )
 def test_the_command_that_is_recorded_is_the_one_that_was_typed(monkeypatch, typed, said):

@@ -329,7 +329,7 @@ def test_a_recording_becomes_a_model(dataset, tmp_path, kind):
     """Bag, dataset, masks of the rock's mesh, prior of the depth, run, renders."""
     source, out = WRITERS[kind](tmp_path, dataset), tmp_path / "out"
     command("import", source, "--out", out, "--mesh", dataset.root / "rock.glb")
-    options = ["--seeds", 3, "--budget", 1, "--passes", 2, "--gaussians", 200]
+    options = ["--seed-views", 3, "--budget", 1, "--passes", 2, "--gaussians", 200]
     command("nbv", out, *options, "--out", tmp_path / "run")
     command("eval", tmp_path / "run")
     assert len(list((tmp_path / "run/renders").glob("*.png"))) > 0

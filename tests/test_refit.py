@@ -11,10 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plyfile import PlyData
 from program import change_settings, command
-from refusals import refused
 from scipy.stats import multivariate_normal
 
-from mgs.bench.core import surface_camera, surface_gaussians
+from mgs.bench import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
 from mgs.fit.fitting import fit
@@ -33,7 +32,7 @@ from mgs.report.evidence import (
     regularisation,
     worth,
 )  # fmt: skip
-from mgs.report.refitting import REFITTED, refit_run
+from mgs.report.smaller import REFITTED, refit_run
 from mgs.run.folder import open_run
 from mgs.run.nbv import run_nbv
 from mgs.run.settings import NbvSettings
@@ -289,20 +288,6 @@ def test_a_run_that_learns_means_is_refitted_too(run, tmp_path, means):
     held = vertices["learned_mean"] == 0
     assert 0 < held.mean() < 1
     assert held.mean() == pytest.approx(1 - found.lean.learned["mean"].mean())
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--learn", "some"], "--learn some: is unknown; choose one of all, auto"),
-        (["--sh", "1"], "--sh 1: is unknown; choose one of 0, auto"),
-        (["--learn", "all", "--sh", "0"], "leaves nothing to choose; leave out one of them"),
-        (["--loss", "-1"], "--loss -1.0: must be from 0 to 10 dB"),
-        (["--loss", "nan"], "--loss nan: must be from 0 to 10 dB"),
-    ],
-)
-def test_what_cannot_be_chosen_is_one_line(run, capsys, options, said):
-    assert said in refused(capsys, ["refit", run, *options])
 
 
 def test_a_prior_that_is_gone_is_one_line(run, tmp_path):

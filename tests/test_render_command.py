@@ -276,8 +276,7 @@ BAD = {
     "no intrinsics": (framed("a.png"), "frame 0 lacks fl_x; correct the intrinsics"),
     "open brackets": (written("transforms.json", "[" * 100_000), "not valid JSON"),
     "5000 digits": (written("transforms.json", '{"w": ' + "9" * 5000 + "}"), "not valid JSON"),
-    "not empty": (lambda folder: (folder / "out/kept").mkdir(parents=True), "is not empty"),
-    "background": (lambda folder: None, "must be three numbers from 0 to 1"),
+    "not empty": (lambda folder: (folder / "out/kept").mkdir(parents=True), "is there already"),
 }
 
 
@@ -287,7 +286,4 @@ def test_bad_input_is_one_line_and_nothing_is_written(folder, capsys, case):
     foreign_ply(folder / "x.ply", gaussians(0))
     change(folder)
     arguments = ["render", folder / "x.ply", "--cameras", folder / "transforms.json"]
-    arguments += ["--out", folder / "out"]
-    if case == "background":
-        arguments += ["--background", 255, 255, 255]
-    assert message in refused(capsys, arguments, folder)
+    assert message in refused(capsys, [*arguments, "--out", folder / "out"], folder)

@@ -15,7 +15,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 from program import command, table_numbers
 from program import steps as read_steps
-from refusals import refused
 from rich.console import Console
 
 from mgs import plotting
@@ -179,10 +178,6 @@ def test_figures_are_written_as_asked_for(runs, tmp_path, capsys):
     ending = r"gain\.eps: figures are written as png, pdf, svg; choose another ending"
     with pytest.raises(InputError, match=ending):
         figures.gain_figure(tmp_path / "gain.eps", {"random": [0.2, 0.1]})
-    line = refused(capsys, ["report", *runs, "--figures", "eps"])
-    assert "--figures eps: unknown; choose one of png, pdf, svg" in line
-    page = ["--html", tmp_path / "page.html", "--figures", "pdf"]
-    assert "--html alone writes no figures" in refused(capsys, ["report", *runs, *page])
 
 
 def test_a_figure_that_is_left_out_is_named(runs, tmp_path, capsys):

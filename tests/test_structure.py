@@ -95,7 +95,7 @@ def test_every_room_has_its_place_and_imports_only_from_rooms_below_it():
     assert not found, "; ".join(found)
 
 
-@pytest.mark.parametrize("folder", ["mgs", "plugins", "benchmarks", "tools"])
+@pytest.mark.parametrize("folder", ["mgs", "plugins", "tools"])
 def test_nothing_but_tests_imports_tests(folder):
     tests = {"tests", *(path.stem for path in (ROOT / "tests").rglob("*.py"))} - {"__init__"}
     for path in (ROOT / folder).rglob("*.py"):

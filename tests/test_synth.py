@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from refusals import listing, refused
+from refusals import listing
 from scipy.spatial import cKDTree
 
 from mgs.camera import opencv_from_opengl
@@ -98,7 +98,7 @@ def test_test_views_are_a_dataset_of_their_own_and_change_nothing_else(dataset, 
     again = synthesise(out, **made, test_views=4)
     assert {path: path.stat().st_mtime_ns for path in written} == written
     here, there = listing(again.root), listing(dataset.root)
-    differ = "config.json", "timings.json"
+    differ = ("config.json",)
     assert all(here[name] == content for name, content in there.items() if name not in differ)
     assert all(name.startswith("test") for name in here.keys() - there.keys())
 
@@ -163,7 +163,7 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise(dataset, tmp_path):
 def test_output_folder_that_is_not_empty(dataset, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("mgs.synth.rendering.make_rock", None)  # refused before the rock is made
-        with pytest.raises(InputError, match="not empty"):
+        with pytest.raises(InputError, match="is there already"):
             synthesise(dataset.root, SCENE, TINY, seed=4)
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(InputError, match="other settings"):
@@ -246,21 +246,6 @@ def test_without_the_denoiser_more_samples_and_a_note(tmp_path, monkeypatch):
     assert '`pip install "mgs[denoise]"`' in notes[0]
     assert read_json(dataset.root / "config.json")["samples_per_pixel"] == 8
     assert dataset.frames[0].rgb()[dataset.frames[0].mask()].mean() == pytest.approx(0.2, rel=0.5)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--scene", "moon"], "scene 'moon': unknown; choose one of boulder"),
-        (["--scale", "huge"], "scale 'huge': unknown; choose one of quick, paper"),
-        (["--orbit", "figure-eight"], "--orbit 'figure-eight': unknown"),
-        (["--size", "320"], "expected WIDTHxHEIGHT"),
-        (["--mesh", "nowhere.glb"], "no such mesh"),
-    ],
-)
-def test_bad_options_leave_nothing_behind(tmp_path, capsys, options, message):
-    assert message in refused(capsys, ["synth-orbit", tmp_path / "out", *options])
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

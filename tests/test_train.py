@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mgs.bench.core import surface_camera, surface_gaussians
+from mgs.bench import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
 from mgs.fit.fitting import COLOUR_MIN, fit

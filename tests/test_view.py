@@ -180,14 +180,7 @@ def test_refusals(capsys, run, dataset, prior, tmp_path, monkeypatch):
         return refused(capsys, ["view", *arguments])
 
     (tmp_path / "file.ply").write_text("no PLY")
-    assert "no such run folder or PLY file" in view(tmp_path / "none.ply")
-    assert "holds no run" in view(tmp_path)
-    assert "--port" in view(run, "--port", 70000)
-    assert "--port" in view(run, "--port", "many")
     assert "file.ply" in view(tmp_path / "file.ply")
-    assert "--follow needs the folder of a run" in view(tmp_path / "file.ply", "--follow")
-    # An address of an example network, not ours.
-    assert "cannot be served there" in view(run, "--host", "192.0.2.1")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

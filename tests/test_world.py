@@ -24,7 +24,7 @@ from mgs.report.page import write_page
 from mgs.report.runs import up_of
 from mgs.report.writing import write_report
 from mgs.run import recording
-from mgs.run.folder import open_run, read_settings
+from mgs.run.folder import open_run
 from mgs.view import layers
 from mgs.view.subject import read_subject
 
@@ -129,7 +129,7 @@ def test_the_viewer_knows_both(runs):
 
 
 def test_the_axis_of_the_prior_goes_before_that_of_the_dataset(runs, tmp_path):
-    dataset = load_dataset(read_settings(runs[1]).dataset)
+    dataset = load_dataset(open_run(runs[1]).settings.dataset)
     assert up_of(tmp_path, dataset) == dataset.up
     write_json(tmp_path / "prior.json", {"up": [0, 2, 0]})
     assert up_of(tmp_path, dataset) == (0, 1, 0)

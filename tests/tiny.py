@@ -162,7 +162,7 @@ def run(out: Path, dataset: Dataset, parts: problem.Operations | None = None, **
 
 def resume(out: Path, dataset: Dataset, parts: problem.Operations | None = None) -> State:
     """Run a started run to its end; its last state."""
-    settings = run_folder.read_settings(out)
+    settings = run_folder.open_run(out).settings
     return recording.run(out, settings, dataset, parts or operations(), silent)
 
 

@@ -1,1 +1,223 @@
-"""Timings of the splatting kernels on this machine."""
+"""Time the splatting kernels and Mitsuba's own splatting integrator, `volprim_rf_basic`.
+
+Kernels are compiled and memory is allocated before anything is timed. Times are medians. Ratios of
+times are about the same on other machines; times are not.
+"""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mgs.camera import Camera, look_at
+from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
+from mgs.memory import padded
+from mgs.rotation import quat_from_normals
+from mgs.seeds import derive_seed, generator
+from mgs.splat import ListCache, as_drjit, fisher, render
+
+WARM_UP = 2
+"""Untimed calls before the timed ones: they compile kernels and allocate memory."""
+
+
+def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
+    """Sample n flat Gaussians on the surface of the default rock, the scene of `mgs bench`.
+
+    Their standard deviations are 0.8, 0.8 and 0.2 spacings (the square root of area / n). Their
+    opacity is 0.73 (logit 1), their colours are random.
+    """
+    import trimesh
+
+    mesh = _rock(seed)
+    points, faces = trimesh.sample.sample_surface(mesh, n, seed=derive_seed(seed, "bench/points"))
+    spacing = np.sqrt(mesh.area / n)
+    return Gaussians(
+        means=np.asarray(points, np.float32),
+        log_scales=np.tile(np.log(spacing * np.array([0.8, 0.8, 0.2])), (n, 1)).astype(np.float32),
+        quats=quat_from_normals(mesh.face_normals[faces]).astype(np.float32),
+        logit_opacities=np.full(n, 1.0, np.float32),
+        sh=sh_from_rgb(generator(seed, "bench/colours").uniform(0.1, 0.6, (n, 3))),
+    )
+
+
+@cache
+def _rock(seed: int) -> Any:
+    """Mesh of the default rock. It takes seconds, and tests use it often."""
+    from mgs.synth.noise import Noise
+    from mgs.synth.rock import rock_shape
+    from mgs.synth.scene_file import load_scene_file
+
+    return rock_shape(load_scene_file("boulder").rock, Noise(generator(seed, "bench/rock")))[0]
+
+
+def surface_camera(gaussians: Gaussians, width: int, height: int) -> Camera:
+    """Camera 25 degrees above the horizon and three radii away, whose image the Gaussians fill."""
+    low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
+    centre, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
+    pose = look_at(centre + 3 * radius * np.array([np.cos(0.44), 0.0, np.sin(0.44)]), centre)
+    x, y, z = (gaussians.means @ pose[:3, :3].T + pose[:3, 3]).T
+    focal = 0.49 * min(width / np.abs(x / z).max(), height / np.abs(y / z).max())
+    return Camera(
+        np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), width, height, pose
+    )
+
+
+def turned_cameras(camera: Camera, gaussians: Gaussians, count: int) -> list[Camera]:
+    """Turn the camera about the vertical axis through the centre, in `count` even steps.
+
+    Intrinsics, distance and elevation stay the same, so the number of (splat, block) pairs is
+    similar (within 6 % for 100,000 Gaussians).
+    """
+    to_centre = np.eye(4)
+    to_centre[:3, 3] = -(gaussians.means.min(axis=0) + gaussians.means.max(axis=0)) / 2
+    cameras = []
+    for angle in 2 * np.pi * np.arange(1, count + 1) / (count + 1):
+        turn = np.eye(4)
+        turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        pose = camera.world_to_camera @ np.linalg.inv(to_centre) @ turn @ to_centre
+        cameras.append(Camera(camera.K, camera.width, camera.height, pose))
+    return cameras
+
+
+def median_seconds(call: Callable[[], Any], repeats: int) -> float:
+    """Median wall-clock seconds of `repeats` calls, after WARM_UP untimed ones.
+
+    The result of each call is evaluated within its time.
+    """
+    seconds = []
+    for i in range(repeats + WARM_UP):
+        start = time.perf_counter()
+        dr.eval(call())
+        dr.sync_thread()
+        if i >= WARM_UP:
+            seconds.append(time.perf_counter() - start)
+    return float(np.median(seconds))
+
+
+def gradient(
+    gaussians: Gaussians, camera: Camera, weights: Any, cache: ListCache | None
+) -> list[Any]:
+    """Gradients of sum(image * weights) with respect to each of LEARNED.
+
+    weights: TensorXf [H,W,3]. cache: as in `mgs.splat.render`.
+    """
+    dr.enable_grad([getattr(gaussians, name) for name in LEARNED])
+    loss = dr.sum(render(gaussians, camera, cache=cache).rgb * weights, axis=None)
+    dr.backward(loss)
+    gradients = [dr.grad(getattr(gaussians, name)) for name in LEARNED]
+    dr.disable_grad([getattr(gaussians, name) for name in LEARNED])
+    return gradients
+
+
+def time_core(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
+    """Time each operation on these Gaussians (NumPy fields); seconds by name.
+
+    forward_cold renders a new view in each call, so its block lists must be built. The others use
+    one camera and keep its lists: forward_warm renders, gradient_warm is `gradient`, fisher_exact
+    and fisher_block are `mgs.splat.fisher`.
+    """
+    device, cache = as_drjit(gaussians), ListCache()
+    new_views = iter(turned_cameras(camera, gaussians, repeats + WARM_UP))
+    weights = mi.TensorXf(
+        padded(np.random.default_rng(0).normal(size=(camera.height, camera.width, 3)))
+    )
+    dr.eval(device, weights)
+    calls: dict[str, Callable[[], Any]] = {
+        "forward_cold": lambda: render(device, next(new_views)).rgb,
+        "forward_warm": lambda: render(device, camera, cache=cache).rgb,
+        "gradient_warm": lambda: gradient(device, camera, weights, cache),
+        "fisher_exact": lambda: fisher(device, camera, "exact", cache=cache),
+        "fisher_block": lambda: fisher(device, camera, "block", cache=cache),
+    }
+    return {name: median_seconds(call, repeats) for name, call in calls.items()}
+
+
+def volprim_scene(gaussians: Gaussians, camera: Camera) -> Any:
+    """Mitsuba scene of the Gaussians, with the integrator `volprim_rf_basic`."""
+    quats = gaussians.quats / np.linalg.norm(gaussians.quats, axis=1, keepdims=True)
+    forward = camera.world_to_camera[2, :3]
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "volprim_rf_basic"},
+            "sensor": {
+                "type": "perspective",
+                "fov": float(np.degrees(2 * np.arctan(camera.width / 2 / camera.K[0, 0]))),
+                "fov_axis": "x",
+                "to_world": mi.ScalarTransform4f().look_at(
+                    camera.position, camera.position + forward, [0, 0, 1]
+                ),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": camera.width,
+                    "height": camera.height,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                },
+            },
+            "gaussians": {
+                "type": "ellipsoids",
+                "centers": mi.TensorXf(padded(gaussians.means)),
+                "scales": mi.TensorXf(padded(np.exp(gaussians.log_scales))),
+                "quaternions": mi.TensorXf(padded(quats[:, [1, 2, 3, 0]])),
+                "opacities": mi.TensorXf(padded(gaussians.opacities[:, None])),
+                "sh_coeffs": mi.TensorXf(padded(gaussians.sh.reshape(len(gaussians), -1))),
+            },
+        }
+    )
+
+
+def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
+    """Time Mitsuba's integrator: volprim_forward, an image; volprim_gradient, an image and the
+    gradients of its sum; seconds."""
+    scene = volprim_scene(gaussians, camera)
+    parameters = mi.traverse(scene)
+    names = ["gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs"]
+
+    def backward() -> list[Any]:
+        dr.enable_grad([parameters[name] for name in names])
+        parameters.update()
+        dr.backward(dr.sum(mi.render(scene, parameters, spp=1), axis=None))
+        return [dr.grad(parameters[name]) for name in names]
+
+    primal = median_seconds(lambda: mi.render(scene, spp=1), repeats)
+    return {"volprim_forward": primal, "volprim_gradient": median_seconds(backward, repeats)}
+
+
+def bench_splat(
+    n: int, width: int, height: int, repeats: int, report: Callable[[str], None]
+) -> dict[str, Any]:
+    """Measure what `mgs bench` prints: n Gaussians in an image of width x height pixels.
+
+    report(what) is called before each measurement. Returns "scene"; "seconds" of each operation;
+    "ratios", time of Mitsuba's integrator over ours (..._speedup) and of the Fisher information
+    over that of image and gradient; and "peak_memory_megabytes" of the process before Mitsuba's
+    integrator is loaded.
+    """
+    gaussians = surface_gaussians(n)
+    camera = surface_camera(gaussians, width, height)
+    report("splatting")
+    own = time_core(gaussians, camera, repeats)
+    memory = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 1e3
+    report("Mitsuba's volprim_rf_basic")
+    peer = time_volprim(gaussians, camera, max(repeats // 3, 3))
+    ratios = {
+        "forward_warm_speedup": peer["volprim_forward"] / own["forward_warm"],
+        "forward_cold_speedup": peer["volprim_forward"] / own["forward_cold"],
+        "gradient_warm_speedup": peer["volprim_gradient"] / own["gradient_warm"],
+        "fisher_over_gradient": own["fisher_exact"] / own["gradient_warm"],
+        "block_fisher_over_gradient": own["fisher_block"] / own["gradient_warm"],
+    }
+    return {
+        "scene": {"gaussians": n, "width": width, "height": height, "repeats": repeats},
+        "seconds": own | peer,
+        "ratios": ratios,
+        "peak_memory_megabytes": memory,
+    }

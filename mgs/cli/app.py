@@ -72,13 +72,9 @@ COMMANDS = {
 RESUMABLE = ("synth-orbit", "import", "demo", "reproduce", "chart", "stress", "parsimony")
 """Commands that continue where they stopped when they are given again."""
 
-OLD_NAMES = {"--seeds": "--seed-views", "--seed": "--random-seed", "--preset": "--scale"}
-"""Former names of options, which still work; `nbv` has a --preset of its own."""
-
 
 def _help(docstring: str | None) -> str:
-    """Join the lines of each paragraph, so that the help breaks lines only at the terminal's
-    width."""
+    """Join the lines of each paragraph, so that the terminal breaks them."""
     paragraphs = cleandoc(docstring or "").split("\n\n")
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
 
@@ -148,7 +144,7 @@ def main(arguments: list[str] | None = None) -> None:
     Bad input and wrong options print one line and end with exit code 2, an interruption with 130.
     Always raises SystemExit, except that errors of the program itself pass through.
     """
-    arguments = _renamed(sys.argv[1:] if arguments is None else arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may lack characters of the tables
         sys.stdout.reconfigure(errors="replace")
     warnings.simplefilter("always", Notice)
@@ -179,16 +175,6 @@ def main(arguments: list[str] | None = None) -> None:
     raise SystemExit(code or 0)
 
 
-def _renamed(arguments: list[str]) -> list[str]:
-    """Arguments with the present names of options in place of OLD_NAMES."""
-    kept = ("--preset",) if arguments[:1] == ["nbv"] else ()
-    parts = [text.partition("=") for text in arguments]
-    return [
-        (flag if flag in kept else OLD_NAMES.get(flag, flag)) + equals + value
-        for flag, equals, value in parts
-    ]
-
-
 def _print_warning(message: Any, category: type, filename: str, line: int, *_: Any) -> None:
     """Print a Notice as one line of ours, other warnings as Python does."""
     text = f"mgs: {message}\n" if category is Notice else None
@@ -199,7 +185,8 @@ def _hint(arguments: Sequence[str]) -> str:
     """End of the line of an interrupted command: the way to continue, if there is one."""
     command, *options = arguments or [""]
     if command in RESUMABLE:
-        return "; run the same command again to continue"
+        but = " without --force" if "--force" in options else ""
+        return f"; run the same command again{but} to continue"
     runs = [after for option, after in pairwise(options) if option in ("--out", "--resume")]
     if command not in ("nbv", "fit") or not runs or not (Path(runs[-1]) / "config.json").is_file():
         return ""

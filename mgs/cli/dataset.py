@@ -13,9 +13,6 @@ from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
 from mgs.files import working_in
 
-UNCERTAINTY = 2.0
-"""Error of a prior whose projections are masks, over its depth tolerance."""
-
 
 def dataset(
     action: Annotated[
@@ -26,9 +23,6 @@ def dataset(
     prior: Annotated[
         Path | None, option("masks: the prior to project. Default: DATASET/prior.")
     ] = None,
-    refine: Annotated[
-        bool, option("masks: move outlines to where colours change, near the prior's.")
-    ] = False,
 ) -> None:
     """Check a dataset, or make masks for one that has none.
 
@@ -40,22 +34,20 @@ def dataset(
     masks.png to look at.
     """
     if action == "masks":
-        _make_masks(path, path / "prior" if prior is None else prior, refine)
+        _make_masks(path, prior or path / "prior")
     else:
         _check(path)
 
 
-def _make_masks(path: Path, prior: Path, refine: bool) -> None:
+def _make_masks(path: Path, prior: Path) -> None:
     from mgs.data.dataset import load_dataset
     from mgs.data.masks import SHEET, make_masks
     from mgs.prior.build import load_prior
 
     loaded, known = load_dataset(path), load_prior(prior)
-    band = UNCERTAINTY * known.depth_tolerance
     console = Console()
     with working_in(path), progress_bar("masks", console) as progress:
-        shown = partial(progress, "masks")
-        made = make_masks(loaded, known.mesh, band, refine=refine, progress=shown)
+        made = make_masks(loaded, known.mesh, partial(progress, "masks"))
     console.print(
         f"{path}: {len(made)} masks of {prior}; look at {path / SHEET} before you use them"
     )

@@ -29,8 +29,7 @@ GAUSSIANS = 10_000
 """About one Gaussian per pixel of the rock at 320x240."""
 
 TEST_VIEWS = 12
-"""Test views on a dome around the rock: enough to see it from all sides, and few beside the 32 of
-the orbit."""
+"""Test views on a dome around the rock."""
 
 BUDGET = 8
 """Views beyond the four seeds, the same for every policy."""
@@ -79,7 +78,7 @@ def demo(
         heading(f"3/5 next best views: {policy}, 4 seeds and {BUDGET} views")
         resume_and_print(started_run, console, pictures=True, on_state=share)
     heading("4/5 what the views say about each Gaussian")
-    diagnose(runs[:1])
+    diagnose(runs[:1], force=True)
     heading("5/5 the report")
     compared = compare_runs(runs)
     written = write_report(report, compared)
@@ -100,9 +99,9 @@ def share_seeds(runs: list[Path], state: State) -> None:
 
 def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
     """Raises InputError if the dataset or a run exists with another seed."""
-    from mgs.run.folder import read_settings
+    from mgs.run.folder import open_run
 
-    recorded = {run: read_settings(run).seed for run in runs if (run / "config.json").is_file()}
+    recorded = {run: open_run(run).settings.seed for run in runs if (run / "config.json").is_file()}
     if (dataset / "config.json").is_file():
         config = read_json(dataset / "config.json")
         recorded[dataset] = config.get("seed", seed) if isinstance(config, dict) else seed

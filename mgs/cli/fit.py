@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from mgs.cli.nbv import resume_and_print, settings_of, start_and_print, with_settings_as_options
-from mgs.cli.options import DatasetFolder, option, parse_gaussians
+from mgs.cli.options import DatasetFolder, Force, option, parse_gaussians
 
 PANELS = {
     "Fitting": ("passes", "means", "density", "exposure", "alpha_weight", "optimiser", "rates"),
@@ -26,6 +26,7 @@ def fit(
         str | None,
         option("Build a prior of this many Gaussians in the run.", metavar="N|auto"),
     ] = None,
+    force: Force = False,
     **options: Any,
 ) -> None:
     """Fit a model to all images of a dataset, and measure it.
@@ -40,7 +41,7 @@ def fit(
 
     console = Console(highlight=False)
     given = {name: options[name] for name in options if options[name] not in (None, [])}
-    asked = {"prior": prior, "gaussians": parse_gaussians(gaussians)}
+    asked = {"prior": prior, "gaussians": parse_gaussians(gaussians), "force": force}
     run = start_and_print(dataset, out, console, start_fit, **asked, **settings_of(given))
     resume_and_print(run, console, run.settings.policy)
 

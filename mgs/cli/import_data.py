@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from rich.console import Console
 
-from mgs.cli.options import argument, option, parse_up
+from mgs.cli.options import Force, argument, option, parse_up
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
+from mgs.files import Ours, clear_folder
 
 if TYPE_CHECKING:
     from mgs.data.sources import Shot
@@ -23,6 +24,9 @@ MANY_PIXELS = 2_000_000
 
 EXPOSURE_DIFFERS = 0.1
 """Difference of exposure by EXIF, stops, beyond which --exposure is recommended."""
+
+FILES = ("import.json", "transforms.json", "images", "depth", "masks", "rock", "sparse.ply", "test")
+"""Names in a folder of this command."""
 
 
 def import_data(
@@ -73,6 +77,7 @@ def import_data(
     split: Annotated[
         str, option("Split of NeRF-synthetic data to import: train, val or test.")
     ] = "train",
+    force: Force = False,
 ) -> None:
     """Make a dataset from your own data: cameras and images, with depth and masks if there are any.
     Lens distortion is undone.
@@ -98,6 +103,8 @@ def import_data(
     found = found if unit is None else found.in_metres(unit)
     given = parse_up(up)
     upward, reason = found.up_or_estimate() if given is None else (given, "as --up says")
+    if force:
+        clear_folder(out, Ours(FILES, [path for path in (source, images, masks, mesh) if path]))
     finished = os.path.isfile(out / "transforms.json")  # else the import refuses what is there
     tests, listed = None, found.missing + len(found.shots)
     if test_every is not None:

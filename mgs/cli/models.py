@@ -10,15 +10,15 @@ import typer
 from rich.console import Console
 
 from mgs import runtime
-from mgs.cli.options import Runs, argument, option
+from mgs.cli.options import Force, Runs, argument, option
 from mgs.cli.printing import print_quality
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
-from mgs.files import folder_locked, working_in
+from mgs.files import check_new_file, folder_locked, working_in
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
 
 if TYPE_CHECKING:
-    from mgs.report.refitting import RefittedRun
+    from mgs.report.smaller import RefittedRun
 
 
 def evaluate(
@@ -45,9 +45,8 @@ def evaluate(
     the pixels of the rock. metrics.json also has the errors of alpha and depth, where the dataset
     has their truth.
     """
-    from mgs.report.measuring import evaluate as measured
-    from mgs.report.pruning import PRUNED
-    from mgs.report.refitting import REFITTED
+    from mgs.report.evaluation import evaluate as measured
+    from mgs.report.smaller import PRUNED, REFITTED
     from mgs.report.tables import metrics_row
 
     runtime.start()
@@ -103,6 +102,7 @@ def diagnose(
         bool,
         option("Instead, predict the errors of views not seen, and compare.", "--calibrate"),
     ] = False,
+    force: Force = False,
 ) -> None:
     """Draw maps of the Fisher information and the uncertainty of a run's model, for views and for
     Gaussians.
@@ -127,9 +127,12 @@ def diagnose(
         raise InputError(
             f"--views {views!r}: names no frame; give some, as in kf_0003,kf_0010, or leave it out"
         )
+    folders = [open_run(run).folder / "diagnostics" for run in runs]
+    for folder in folders:
+        check_new_file(folder / ("uncertainty.json" if calibrate else "information.ply"), force)
     runtime.start()
-    for run in runs:
-        with folder_locked(open_run(run).folder / "diagnostics"), progress_bar() as bar:
+    for run, folder in zip(runs, folders, strict=True):
+        with folder_locked(folder), progress_bar() as bar:
             if calibrate:
                 from mgs.report.predicted_error import calibrate_run
 
@@ -145,18 +148,21 @@ def prune(
     noise: Annotated[
         float, option("Allowed change of the training images: rms of a pixel, linear RGB.")
     ] = PRUNE_NOISE,
+    force: Force = False,
 ) -> None:
     """Remove Gaussians of a run that its images hardly need; write RUN/gaussians_pruned.ply.
 
     The change of the training images is measured, and stays within --noise. Nothing is fitted
     again, and the run itself stays as it is.
     """
-    from mgs.report.pruning import PRUNED, prune_run
+    from mgs.report.smaller import PRUNED, prune_run
     from mgs.run.folder import open_run
 
+    for run in runs:
+        check_new_file(open_run(run).folder / PRUNED, force)
     runtime.start()
     for run in runs:
-        with working_in(open_run(run).folder), progress_bar() as bar:
+        with working_in(run), progress_bar() as bar:
             found = prune_run(run, noise, bar)
         share = 1 - found.after / found.before
         lines = [
@@ -183,6 +189,7 @@ def refit(
     loss: Annotated[
         float, option("Allowed rise of the objective from parameters not learned, dB.")
     ] = LEARN_LOSS,
+    force: Force = False,
 ) -> None:
     """Fit the views of a run again, with no more parameters than they need; write
     RUN/gaussians_refitted.ply.
@@ -192,13 +199,15 @@ def refit(
     are not learned keep the prior's values, and are marked in the file. The run itself stays as it
     is.
     """
-    from mgs.report.refitting import REFITTED, refit_run
+    from mgs.report.smaller import REFITTED, refit_run
     from mgs.run.folder import open_run
 
+    for run in runs:
+        check_new_file(open_run(run).folder / REFITTED, force)
     runtime.start()
     options: Any = {"learn": learn, "sh": sh, "loss": loss}
     for run in runs:
-        with working_in(open_run(run).folder), progress_bar() as bar:
+        with working_in(run), progress_bar() as bar:
             found = refit_run(run, say=bar, **options)
         _print([*_refitted(found), f"wrote {run / REFITTED}"])
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
+from mgs.cli.options import argument, option
 from mgs.errors import FLAGS, flag
 from mgs.fit.settings import TrainSettings
 from mgs.policy.registry import policy_names
@@ -51,106 +53,87 @@ MORE_HELP = {
     "alpha_weight": " Default: 0.1, or 0 where frames have neither mask nor alpha.",
 }
 
+main = partial(option, rich_help_panel="Main options")
+data = partial(option, rich_help_panel="Data")
+capturing = partial(option, rich_help_panel="Live capture")
+
 
 def nbv(
     context: typer.Context,
     dataset: Annotated[
-        Path | None,
-        typer.Argument(help="Dataset folder (transforms.json). Not needed with --resume."),
+        Path | None, argument("Dataset folder (transforms.json). Not needed with --resume.")
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="New folder for the run.", rich_help_panel="Main options"),
-    ] = None,
+    out: Annotated[Path | None, main("New folder for the run.")] = None,
     prior: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of `mgs prior`. Default: DATASET/prior, or one built in the run.",
-            rich_help_panel="Main options",
-        ),
+        Path | None, main("Folder of `mgs prior`. Default: DATASET/prior, or one built in the run.")
     ] = None,
     resume: Annotated[
         Path | None,
-        typer.Option(
+        main(
+            "Continue this run by its config.json; repeat programs: --policy, --capture-...",
             metavar="RUN",
-            help="Continue this run by its config.json; repeat programs: --policy, --capture-...",
-            rich_help_panel="Main options",
         ),
     ] = None,
     capture: Annotated[
         str | None,
-        typer.Option(
+        data(
+            "In place of DATASET: a scene (name or .toml), rendered when a view is chosen.",
             metavar="SCENE",
-            help="In place of DATASET: a scene (name or .toml), rendered when a view is chosen.",
-            rich_help_panel="Data",
         ),
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(
+        main(
+            "Settings with the keys of config.json (that of a run works, too); options win.",
             metavar="FILE.toml",
-            help="Settings with the keys of config.json (that of a run works, too); options win.",
-            rich_help_panel="Main options",
         ),
     ] = None,
     capture_command: Annotated[
         str | None,
-        typer.Option(
+        capturing(
+            "Program that takes a picture of a pose: 'CMD {pose} {out}' (JSON in, PNG out).",
             metavar="COMMAND",
-            help="Program that takes a picture of a pose: 'CMD {pose} {out}' (JSON in, PNG out).",
-            rich_help_panel="Live capture",
         ),
     ] = None,
     capture_folder: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder in which poses are written and pictures of them are awaited.",
-            rich_help_panel="Live capture",
-        ),
+        capturing("Folder in which poses are written and pictures of them are awaited."),
     ] = None,
     capture_timeout: Annotated[
-        float,
-        typer.Option(
-            min=0.01, help="Longest wait for a picture, seconds.", rich_help_panel="Live capture"
-        ),
+        float, capturing("Longest wait for a picture, seconds.", min=0.01)
     ] = 600.0,
-    capture_tries: Annotated[
-        int,
-        typer.Option(
-            min=1, help="Most pictures asked for at a pose.", rich_help_panel="Live capture"
-        ),
-    ] = 3,
+    capture_tries: Annotated[int, capturing("Most pictures asked for at a pose.", min=1)] = 3,
     capture_failure: Annotated[
         str,
-        typer.Option(
+        capturing(
+            "After the last try: take the next best pose in its place, or stop the run.",
             metavar="skip|stop",
-            help="After the last try: take the next best pose in its place, or stop the run.",
-            rich_help_panel="Live capture",
         ),
     ] = "skip",
     capture_distance: Annotated[
         float | None,
-        typer.Option(
-            min=0.0,
-            help="Largest distance from the pose asked for. Default: a quarter of the object's.",
-            rich_help_panel="Live capture",
+        capturing(
+            "Largest distance from the pose asked for. Default: a quarter of the object's.", min=0.0
         ),
     ] = None,
     gaussians: Annotated[
         str | None,
-        typer.Option(
-            metavar="N|auto",
-            help="Build a prior of this many Gaussians in the run (`mgs prior`).",
-            rich_help_panel="Data",
-        ),
+        data("Build a prior of this many Gaussians in the run (`mgs prior`).", metavar="N|auto"),
     ] = None,
     preset: Annotated[
         str | None,
-        typer.Option(
-            help=f"Defaults of passes and of the number of Gaussians: {', '.join(PRESETS)}.",
+        option(
+            f"Defaults of passes and of the number of Gaussians: {', '.join(PRESETS)}.",
             rich_help_panel="Fitting",
         ),
     ] = None,
+    force: Annotated[bool, main("Replace a run that is there.", "--force")] = False,
+    tensorboard: Annotated[
+        bool,
+        typer.Option(
+            "--tensorboard", help="Log to RUN/tensorboard too.", rich_help_panel="Main options"
+        ),
+    ] = False,
     **options: Any,
 ) -> None:
     """Choose the next best views: fit to the seeds, choose a view, read its image, fit again.
@@ -163,7 +146,10 @@ def nbv(
 
     from mgs.cli.options import parse_gaussians
     from mgs.errors import InputError
+    from mgs.run.folder import open_run
 
+    if tensorboard:
+        import tensorboardX  # noqa: F401  # its absence is known before the work
     console = Console(highlight=False)
     given = {name: options[name] for name in options if options[name] not in (None, [])}
     live = live_capture(
@@ -176,7 +162,8 @@ def nbv(
     )
     if resume is not None:
         refuse_others(context, resume)
-        resume_and_print(resume, console, given.get("policy"), live=live)
+        logged = _logged(open_run(resume), tensorboard)
+        resume_and_print(resume, console, given.get("policy"), live=live, on_state=logged)
         return
     settings: dict[str, Any] = settings_in(config) if config else {}
     dataset = dataset or (None if capture else settings.get("dataset"))
@@ -196,9 +183,20 @@ def nbv(
         prior=prior,
         gaussians=parse_gaussians(gaussians),
         preset=preset,
+        force=force,
         **settings,
     )
-    resume_and_print(run, console, run.settings.policy, live=live)
+    logged = _logged(run, tensorboard)
+    resume_and_print(run, console, run.settings.policy, live=live, on_state=logged)
+
+
+def _logged(run: Run, wanted: bool) -> Callable[[State], None]:
+    """Callback that logs steps to RUN/tensorboard, or does nothing."""
+    from mgs.run import tensorboard
+
+    if not wanted:
+        return lambda state: None
+    return tensorboard.tensorboard(run.folder / "tensorboard", run.dataset)
 
 
 def live_capture(
@@ -223,8 +221,7 @@ def live_capture(
 
 
 def settings_of(given: dict[str, Any], fit: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Fields of `NbvSettings` from the options given, those of a fit under `train`, added to
-    `fit`."""
+    """Fields of `NbvSettings` from options; those of a fit, added to `fit`, under `train`."""
     settings, train = dict[str, Any](), dict(fit or {})
     for name, value in given.items():
         where = train if name in TrainSettings.model_fields and name != "seed" else settings
@@ -233,8 +230,7 @@ def settings_of(given: dict[str, Any], fit: dict[str, Any] | None = None) -> dic
 
 
 def with_settings_as_options(function: Any, panels: dict[str, tuple[str, ...]] = PANELS) -> Any:
-    """Give a command an option for each setting in `panels`; only options given reach
-    `**options`."""
+    """Give a command an option for each setting in `panels`, passed as `**options`."""
     signature = inspect.signature(function, eval_str=True)
     parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
     for panel, names in panels.items():
@@ -274,7 +270,7 @@ def refuse_others(context: typer.Context, resume: Path) -> None:
 
     for name in context.params:
         source = context.get_parameter_source(name)
-        again = name in ("resume", "policy") or name.startswith("capture_")
+        again = name in ("resume", "policy", "tensorboard") or name.startswith("capture_")
         if again or source is None or source.name != "COMMANDLINE":
             continue
         option = flag(name)

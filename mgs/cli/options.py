@@ -25,6 +25,7 @@ DatasetFolder = Annotated[Path, argument("Dataset folder (transforms.json).")]
 Seed = Annotated[
     int, option("Root seed: the same seed gives the same result.", "--random-seed", min=0)
 ]
+Force = Annotated[bool, option("Replace an output that is there.", "--force")]
 
 
 def parse_up(text: str) -> tuple[float, float, float] | None:

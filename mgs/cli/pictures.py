@@ -10,21 +10,28 @@ from typing import Annotated, Literal
 import typer
 
 from mgs import runtime
-from mgs.cli.options import argument, option
+from mgs.cli.options import Force, argument, option
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
 from mgs.files import check_new_folder, folder_locked
 
 
 def render(
-    splats: Annotated[
+    subject: Annotated[
         Path,
-        argument("Gaussians of mgs or others: 3DGS PLY (binary, ascii, compressed), GLB or SPZ."),
+        argument(
+            "Folder that `mgs nbv` wrote, or Gaussians of mgs or others: 3DGS PLY (binary, ascii, "
+            "compressed), GLB or SPZ.",
+            metavar="RUN|SPLATS",
+        ),
     ],
+    out: Annotated[Path, option("Folder to write.")],
     cameras: Annotated[
-        Path, option("transforms.json (nerfstudio), or the dataset folder that holds it.")
-    ],
-    out: Annotated[Path, option("Folder to write, new or empty.")],
+        Path | None,
+        option(
+            "transforms.json (nerfstudio), or the dataset folder that holds it. Default: the run's."
+        ),
+    ] = None,
     width: Annotated[
         int | None,
         option("Width in pixels; the height follows. Default: the cameras' own.", min=1),
@@ -50,33 +57,39 @@ def render(
             "Write an EXR too: linear R G B, opacity A, z-depth Z in metres (0: none).", "--exr"
         ),
     ] = False,
+    force: Force = False,
 ) -> None:
-    """Draw a model of Gaussians through every camera of a transforms.json. The images it lists need
-    not exist.
+    """Draw a run's model, or Gaussians from a file, through every camera of a transforms.json. The
+    images it lists need not exist.
 
     Writes one PNG for each camera, with the name of the camera's image.
     """
     from mgs.data.dataset import load_cameras
+    from mgs.report.exporting import read_model
     from mgs.report.pictures import draw_views
-    from mgs.splat_files import colour_space as space_of
-    from mgs.splat_files import load_gaussians
+    from mgs.run.folder import open_run
 
     if not all(0 <= value <= 1 for value in background):
         given = " ".join(map(str, background))
         raise InputError(f"--background {given}: must be three numbers from 0 to 1")
+    if cameras is None:
+        if not subject.is_dir():
+            raise InputError(f"{subject}: has no cameras; give --cameras TRANSFORMS.json")
+        cameras = open_run(subject).dataset.root
     views = [
         (name, camera.resized(width) if width else camera) for name, camera in load_cameras(cameras)
     ]
-    gaussians = load_gaussians(splats)
-    space = space_of(splats) if colour_space == "auto" else colour_space
+    model = read_model(subject)
+    gaussians, space = model.gaussians, model.space if colour_space == "auto" else colour_space
     runtime.start()
     with folder_locked(out), progress_bar() as bar:
-        check_new_folder(out)
+        if not force:
+            check_new_folder(out)
         progress = partial(bar, "rendering")
         draw_views(out, gaussians, views, space, background, exr, progress)
     colours = "linear RGB" if space == "linear" else "sRGB"
-    model = f"{len(gaussians):,} Gaussians (SH degree {gaussians.sh_degree}, colours in {colours})"
-    typer.echo(f"wrote {len(views)} views of {model} to {out}")
+    what = f"{len(gaussians):,} Gaussians (SH degree {gaussians.sh_degree}, colours in {colours})"
+    typer.echo(f"wrote {len(views)} views of {what} to {out}")
 
 
 def view(

@@ -79,8 +79,7 @@ def _quality(heading: str, first: Sequence[str], rows: Sequence[Mapping[str, Any
 
 
 def _heading(key: str, new: bool) -> str:
-    """Heading of a column: the metric, and below it the set of views. new: whether some views were
-    held out."""
+    """Heading of a column: metric and set of views. new: some views were held out."""
     views, _, metric = key.partition(".")
     if not metric:
         return {"coverage": "cover", "images": "n"}[key]
@@ -160,8 +159,7 @@ def step_line(line: Mapping[str, Any]) -> str:
 
 
 def _quality_lines(metrics: dict[str, Any], exposure: bool) -> list[str]:
-    """Mean quality over each set of views in metrics.json. exposure: whether the run estimated
-    it."""
+    """Mean quality over each set of views in metrics.json."""
     from mgs.report.tables import table_cell
 
     every = "all views" if metrics.get("held_out", {}).get("count") else "training views"

@@ -12,20 +12,19 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from mgs.cli.options import DatasetFolder, Seed, option, parse_gaussians, parse_up
+from mgs.cli.options import DatasetFolder, Force, Seed, option, parse_gaussians, parse_up
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
-from mgs.files import atomic_folder
+from mgs.files import Ours, atomic_folder
 
 if TYPE_CHECKING:
     from mgs.data.dataset import Dataset
-    from mgs.data.frames import Frame
     from mgs.prior.build import Prior
     from mgs.prior.segmentation import SegmentedCloud
     from mgs.prior.settings import PriorSettings
 
-SEEDS = 4
-"""Seed frames in the paper; the table says what share of the samples they see."""
+FILES = ("prior.json", "mesh.ply", "points.ply", "prior.png")
+"""Names in a folder of this command."""
 
 WHY = {
     "depth": ": the dataset has depth images",
@@ -86,6 +85,7 @@ def prior(
         float, option("Degrade the rock's points: share to remove, in round holes.")
     ] = 0.0,
     seed: Seed = 0,
+    force: Force = False,
 ) -> None:
     """Build a mesh of the rock, and sample N points on it.
 
@@ -99,7 +99,7 @@ def prior(
     from mgs.data.meshes import GLTF
     from mgs.prior.build import prior_from_mesh, save_prior
     from mgs.prior.figure import draw_prior
-    from mgs.prior.initial import AGREEMENT, colour_agreement, with_share_seen
+    from mgs.prior.initial import AGREEMENT, colour_agreement
     from mgs.prior.photographs import source_of
     from mgs.prior.settings import PriorSettings
 
@@ -114,7 +114,8 @@ def prior(
     number = parse_gaussians(gaussians)
     settings = PriorSettings(number, spacing, poisson_depth, prior_noise, holes, seed, backing)
     # The folder is checked and locked before the work.
-    with atomic_folder(folder) as unfinished, progress_bar(console=console) as progress:
+    ours = Ours(FILES, [path for path in (dataset, mesh, points) if path]) if force else None
+    with atomic_folder(folder, ours) as unfinished, progress_bar(console=console) as progress:
         segmented = None
         if mesh is not None:
             cameras = [frame.camera for frame in loaded.frames]
@@ -127,8 +128,6 @@ def prior(
             console.print(f"prior from {chosen}" + ("" if source or points else WHY[chosen]))
             options = {"source": chosen, "points": points, "up": upward}
             result, segmented = _built(loaded, settings, folder, progress, **options)
-        progress("seed frames")
-        result = with_share_seen(result, _seed_frames(loaded, result))
         if result.numbers["from"] != "random" and not loaded.on_demand:
             progress("colours of the surface")
             agreed = colour_agreement(result, loaded.frames)
@@ -148,7 +147,7 @@ def prior(
         )
     if "resolution" in result.numbers:
         console.print(_reason(result.numbers), soft_wrap=True)
-    console.print(f"wrote {folder}: mesh.ply, points.ply, prior.json, prior.png")
+    console.print(f"wrote {folder}: {', '.join(sorted(FILES))}")
 
 
 def _built(
@@ -169,17 +168,6 @@ def _built(
         picture = folder.with_name(f"{folder.name}-refused.png")
         draw_refused(picture, refused.points, refused.kept, np.array(dataset.up))
         raise InputError(f"{refused.line} (the points: {picture})") from None
-
-
-def _seed_frames(dataset: Dataset, prior: Prior) -> list[Frame]:
-    """The frames that `mgs nbv` would take as its SEEDS seeds, or all if there are fewer."""
-    from mgs.data.up import upright
-    from mgs.policy.poses import seed_views
-
-    turn = upright(prior.up)
-    positions = np.stack([frame.camera.position for frame in dataset.frames]) @ turn.T
-    middle = turn @ prior.points.mean(0)
-    return [dataset.frames[k] for k in seed_views(positions, middle, min(SEEDS, len(dataset)))]
 
 
 def _random(numbers: dict[str, Any]) -> str:
@@ -212,10 +200,6 @@ def _table(numbers: dict[str, Any]) -> Table:
     table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
     behind = f"a sample each, and {numbers['backed']:,} behind the surface"
     table.add_row("Gaussians", f"{n + numbers['backed']:,}: {behind}")
-    mean, least = (numbers[f"nearest_neighbour_{key}"] / spacing for key in ("mean", "min"))
-    table.add_row("nearest neighbour over spacing", f"mean {mean:.2f}, least {least:.2f}")
-    seen = f"{numbers['seen_by_seeds']:.1%}; the rest starts grey"
-    table.add_row(f"samples that {SEEDS} evenly spaced frames see", seen)
     if "colour_agreement" in numbers:
         agreed = f"{numbers['colour_agreement']:.0%}"
         table.add_row("colour variance that all frames agree on", agreed)

@@ -17,8 +17,7 @@ from rich.progress import (
 
 
 class ProgressBar:
-    """Lines at the bottom of the terminal, made by `progress_bar`: the stage at work, and above it
-    the whole work once `whole` was called."""
+    """Lines at the bottom of the terminal: the stage at work, and above it the whole."""
 
     def __init__(self, bar: Progress, stage: str) -> None:
         self._bar = bar

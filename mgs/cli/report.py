@@ -10,11 +10,11 @@ import typer
 from rich.console import Console
 
 from mgs import runtime
-from mgs.cli.options import argument, option
+from mgs.cli.options import Force, argument, option
 from mgs.cli.printing import print_quality
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
-from mgs.files import check_writable, folder_locked
+from mgs.files import check_new_file, folder_locked
 
 
 def report(
@@ -22,7 +22,7 @@ def report(
     out: Annotated[
         Path | None,
         option(
-            "Folder for the figures and the table. Files of an earlier report are replaced.",
+            "Folder for the figures and the table.",
             show_default="report; with --html none",
         ),
     ] = None,
@@ -33,6 +33,7 @@ def report(
         Path | None,
         option("One page with everything, interactive; it opens from the disk and loads nothing."),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Compare runs: draw the orbit, information gain, coverage, PSNR against images and one test
     view, and make a table.
@@ -50,22 +51,23 @@ def report(
         raise InputError(f"--figures {figures}: unknown; choose one of {', '.join(FORMATS)}")
     if figures and html is not None and out is None:
         raise InputError(f"--figures {figures}: --html alone writes no figures; give --out, too")
-    if html is not None and check_writable(html).is_dir():
-        raise InputError(f"--html {html}: is a folder; name a file to write")
+    if html is not None:
+        check_new_file(html, force)
     if out is not None or html is None:
-        _write_figures(runs, out or Path("report"), figures or "png")
+        _write_figures(runs, out or Path("report"), figures or "png", force)
     if html is not None:
         _write_page(runs, html)
 
 
-def _write_figures(runs: list[Path], out: Path, kind: str) -> None:
+def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
     """Write the figures and the table, and print the table."""
     from mgs.report.runs import compare_runs
     from mgs.report.tables import comparison_rows
-    from mgs.report.writing import write_report
+    from mgs.report.writing import report_files, write_report
     from mgs.run.ending import why_ended
 
-    check_writable(out / "table.md")  # before the work
+    for name in report_files(kind):
+        check_new_file(out / name, force)
     compared = compare_runs(runs)
     with folder_locked(out):
         written = write_report(out, compared, kind)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from mgs.cli.options import argument, option
+from mgs.cli.options import Force, Runs, argument, option
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
+from mgs.files import check_new_file
 
 
 def export(
-    model: Annotated[
-        Path,
-        argument("Folder that `mgs nbv` wrote, or a PLY, GLB or SPZ.", metavar="RUN|SPLATS"),
+    models: Annotated[
+        list[Path],
+        argument("Folders that `mgs nbv` wrote, or PLY, GLB, SPZ.", metavar="RUN|SPLATS..."),
     ],
     to: Annotated[
         Literal["glb", "spz", "ply", "compressed-ply"],
@@ -31,7 +33,7 @@ def export(
         Literal["srgb", "linear"],
         option("Colours to write: sRGB, as most viewers expect, or linear RGB, in which mgs fits."),
     ] = "srgb",
-    force: Annotated[bool, option("Replace a file that is there.", "--force")] = False,
+    force: Force = False,
 ) -> None:
     """Write a model for other programs: viewers, game engines, web pages.
 
@@ -40,21 +42,36 @@ def export(
     from mgs.report.exporting import in_srgb, read_model, to_y_up
     from mgs.splat_files import FORMATS, write_gaussians
 
-    found = read_model(model)
-    if found.space == "srgb" and colour_space == "linear":
-        raise InputError(f"{model}: its colours are sRGB already; leave out --colour-space linear")
-    shown = in_srgb(found) if colour_space == "srgb" else found
-    folder, stem = (model, "export") if model.is_dir() else (model.parent, f"{model.stem}-export")
-    path = out or folder / f"{stem}{FORMATS[to]}"
-    if path.is_dir() or (path.exists() and not force):
-        raise InputError(f"{path}: is there already; give another --out, or --force")
-    write_gaussians(path, shown.gaussians, to, shown.space, to_y_up(shown.up))
-    megabytes = path.stat().st_size / 1e6
-    typer.echo(f"wrote {len(shown.gaussians):,} Gaussians to {path} ({megabytes:.1f} MB)")
+    defaults = [
+        (one if one.is_dir() else one.parent)
+        / f"{'export' if one.is_dir() else f'{one.stem}-export'}{FORMATS[to]}"
+        for one in models
+    ]
+    for model, path in _targets(models, defaults, out, force):
+        found = read_model(model)
+        if found.space == "srgb" and colour_space == "linear":
+            raise InputError(
+                f"{model}: its colours are sRGB already; leave out --colour-space linear"
+            )
+        shown = in_srgb(found) if colour_space == "srgb" else found
+        write_gaussians(path, shown.gaussians, to, shown.space, to_y_up(shown.up))
+        megabytes = path.stat().st_size / 1e6
+        typer.echo(f"wrote {len(shown.gaussians):,} Gaussians to {path} ({megabytes:.1f} MB)")
+
+
+def _targets(
+    sources: list[Path], defaults: list[Path], out: Path | None, force: bool
+) -> list[tuple[Path, Path]]:
+    """Pairs of what is read and the file to write. Raises InputError as `check_new_file`, and where
+    one --out is given for several."""
+    if out is not None and len(sources) > 1:
+        raise InputError(f"--out {out}: is one file for {len(sources)}; leave it out")
+    targets = [out] if out is not None else defaults
+    return [(one, check_new_file(path, force)) for one, path in zip(sources, targets, strict=True)]
 
 
 def video(
-    run: Annotated[Path, argument("Folder that `mgs nbv` wrote.")],
+    runs: Runs,
     out: Annotated[
         Path | None,
         option("File to write: .mp4 (needs imageio-ffmpeg), .gif or .png. Default: RUN/video.mp4."),
@@ -81,31 +98,30 @@ def video(
     width: Annotated[
         int | None, option("Width of a picture in pixels. Default: the cameras' own.", min=16)
     ] = None,
-    force: Annotated[bool, option("Replace a file that is there.", "--force")] = False,
+    force: Force = False,
 ) -> None:
-    """Write a film of a run: around its model, or how it came to be."""
+    """Write a film of each run: around its model, or how it came to be."""
     from mgs import runtime
     from mgs.report.story import story_frames
     from mgs.report.video import check_film, path_frames, write_film
     from mgs.run.folder import open_run
 
-    target = out or run / "video.mp4"
-    check_film(target)
-    if target.is_dir() or (target.exists() and not force):
-        raise InputError(f"{target}: is there already; give another --out, or --force")
-    opened = open_run(run)
-    taken, views = len(opened.state.taken), len(opened.dataset)
+    targets = _targets(runs, [run / "video.mp4" for run in runs], out, force)
+    check_film(targets[0][1])
     runtime.start()
-    with progress_bar("drawing") as bar:
-        if story:
-            frames, count = story_frames(opened, bar), taken
-        else:
-            count = views if beside == "truth" else max(1, round((seconds or 8.0) * fps))
-            wide = width or opened.dataset.frames[0].camera.width
-            frames = path_frames(opened, path, beside, count, wide)
-        one_by_one = story or beside == "truth"
-        each = (seconds or float(count)) / count if one_by_one else 1 / fps
-        lengths = [each] * (count - 1) + [3 * each if story else each]
-        write_film(target, frames, lengths, lambda done, total: bar.whole("frames", done, total))
-    size = target.stat().st_size / 1e6
-    typer.echo(f"wrote {count} frames to {target} ({size:.1f} MB)")
+    for run, target in targets:
+        opened = open_run(run)
+        taken, views = len(opened.state.taken), len(opened.dataset)
+        with progress_bar("drawing") as bar:
+            if story:
+                frames, count = story_frames(opened, bar), taken
+            else:
+                count = views if beside == "truth" else max(1, round((seconds or 8.0) * fps))
+                wide = width or opened.dataset.frames[0].camera.width
+                frames = path_frames(opened, path, beside, count, wide)
+            one_by_one = story or beside == "truth"
+            each = (seconds or float(count)) / count if one_by_one else 1 / fps
+            lengths = [each] * (count - 1) + [3 * each if story else each]
+            write_film(target, frames, lengths, partial(bar.whole, "frames"))
+        size = target.stat().st_size / 1e6
+        typer.echo(f"wrote {count} frames to {target} ({size:.1f} MB)")

@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.table import Table
 
 from mgs import runtime
-from mgs.cli.options import argument, option, parse_gaussians
+from mgs.cli.options import Force, argument, option, parse_gaussians
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
-from mgs.files import atomic_folder
+from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,6 +29,9 @@ DOME = 100
 
 SHOWN = 10
 """Rows of the table of one view to take; suggestions.json has all."""
+
+FILES = ("suggestions.json", "suggestions.png", "transforms.json")
+"""Names in the folder --out."""
 
 
 def suggest(
@@ -86,6 +89,7 @@ def suggest(
         str | None, option("Build a prior of this many Gaussians.", metavar="N|auto")
     ] = None,
     preset: Annotated[str | None, option("As of `mgs nbv`.")] = None,
+    force: Force = False,
 ) -> None:
     """Rank candidate poses by what a picture from each would add; plan the next flight.
 
@@ -100,6 +104,7 @@ def suggest(
     place = parse_origin(origin) if origin else None
     for path in plan or ():
         check_plan_path(path)
+        check_new_file(path, force)
     if plan and place is None:
         raise InputError("suggest: --plan needs --origin LAT,LON,ALT, the place of the world's 0")
     settings = {
@@ -113,6 +118,9 @@ def suggest(
     }
     settings = {key: value for key, value in settings.items() if value is not None}
     band = _elevations(elevations)
+    ours = Ours(FILES, [path for path in (source, poses, prior) if path]) if force else None
+    if out is not None:
+        check_new_folder(out, ours)
     runtime.start()
     with TemporaryDirectory() as scratch, progress_bar("reading", console) as progress:
         fit = {"prior": prior, "gaussians": parse_gaussians(gaussians), "preset": preset}
@@ -141,7 +149,7 @@ def suggest(
         if out is not None:
             from mgs.report.suggestion import write_suggestion
 
-            with atomic_folder(out) as unfinished:
+            with atomic_folder(out, ours) as unfinished:
                 write_suggestion(unfinished, run, found)
         for path in plan or ():
             _write_plan(path, run, found, place, settings)

@@ -8,9 +8,15 @@ from typing import Annotated, Any, Literal
 from rich.console import Console
 from rich.table import Table
 
-from mgs.cli.options import Seed, argument, option
+from mgs.cli.options import Force, Seed, argument, option
 from mgs.cli.progress import progress_bar
-from mgs.files import atomic_folder
+from mgs.files import Ours, atomic_folder
+
+FILES = [
+    *("survey.json", "cloud.ply", "survey.png", "transforms.json", "rock.glb"),
+    *("images", "masks", "rock", "depth"),
+]
+"""Names in a folder of this command."""
 
 
 def survey(
@@ -34,6 +40,7 @@ def survey(
         option("Factor on the errors of odometry. Default: as the scene says, else 1."),
     ] = None,
     seed: Seed = 0,
+    force: Force = False,
 ) -> None:
     """Survey a dataset's orbit: noisy depth, drifting odometry, registration, loop closure, fusion.
 
@@ -53,7 +60,8 @@ def survey(
     drift = sensor.drift if drift is None else drift
     settings = SurveySettings(noise, drift, poses == "exact", seed)
     # The folder is checked and locked before the work.
-    with atomic_folder(folder) as unfinished, progress_bar("survey", console) as progress:
+    ours = Ours(FILES, [dataset]) if force else None
+    with atomic_folder(folder, ours) as unfinished, progress_bar("survey", console) as progress:
         flown = fly(frames, settings, progress)
         progress("writing")
         numbers = save_survey(unfinished, frames, flown, settings)

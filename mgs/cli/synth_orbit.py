@@ -12,10 +12,17 @@ from rich.console import Console
 
 from mgs import runtime
 from mgs.camera import MAX_PIXELS
-from mgs.cli.options import argument, option
+from mgs.cli.options import Force, Seed, argument, option
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError, row_named
+from mgs.files import Ours, clear_folder
 from mgs.synth.scene_file import ORBITS, load_scene_file
+
+FILES = [
+    *("config.json", "transforms.json", "images", "depth", "masks", "rock", "rock.glb", "test"),
+    *("survey", "timings.json", "true_poses.json", "contact_sheet.png"),
+]
+"""Names in a folder of this command."""
 
 
 def synth_orbit(
@@ -61,14 +68,8 @@ def synth_orbit(
     rotation_noise: Annotated[
         float, option("Noise on the rotations there, degrees per axis.", min=0)
     ] = 0.0,
-    seed: Annotated[
-        int,
-        option(
-            "Root seed: the same gives the same dataset bit for bit, but timings.json.",
-            "--random-seed",
-            min=0,
-        ),
-    ] = 0,
+    seed: Seed = 0,
+    force: Force = False,
 ) -> None:
     """Render a dataset with Mitsuba: an orbit around a rock, with photoreal images, depth, rock
     masks and exact poses.
@@ -99,6 +100,8 @@ def synth_orbit(
     views += f" and {test_views} test views" if test_views else ""
     stage = f"{views}, {images.width}x{images.height}"
     console = Console()
+    if force:
+        clear_folder(out, Ours(FILES, [path for path in (mesh, Path(scene)) if path]))
     with progress_bar(stage, console) as progress:
         synthesise(
             out,

@@ -48,8 +48,7 @@ def taken_frames(dataset: Dataset) -> list[Frame]:
 def check_dataset(
     dataset: Dataset, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Check:
-    """Read every pixel of the `taken_frames` and list all problems. progress: called (done, total)
-    after each frame."""
+    """Read every pixel of the `taken_frames` and list all problems."""
     problems: list[str] = []
     shares, ranges, through = [], [], []
     poses: dict[bytes, str] = {}

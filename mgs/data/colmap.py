@@ -76,8 +76,7 @@ def _parameters(model: int) -> int:
 
 
 def _bytes_of_sensors(data: bytes, place: int) -> int:
-    """Bytes of the sensors of a rig: their number, the reference, and the others, each with a pose
-    if its flag says so. Raises IndexError beyond the data."""
+    """Bytes of the sensors of a rig. Raises IndexError beyond the data."""
     (sensors,) = struct.unpack_from("<I", data, place)
     end = place + (12 if sensors else 4)
     for _ in range(1, sensors):

@@ -16,7 +16,7 @@ from mgs.camera import Camera, opencv_from_opengl, opengl_from_opencv
 from mgs.data.frames import SURVEY_FOLDER, Frame, as_captured
 from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.errors import InputError
-from mgs.files import check_new_folder, read_json, write_json
+from mgs.files import THERE, check_new_folder, read_json, write_json
 from mgs.notebook import html, thumbnails
 
 PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
@@ -302,10 +302,7 @@ def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
     found = read_json(out / record)
     if not isinstance(found, dict) or any(found.get(key) != asked[key] for key in asked):
         state = "a finished" if (out / "transforms.json").is_file() else "an unfinished"
-        raise InputError(
-            f"{out}: is not empty, but holds {state} dataset of other settings or sources; "
-            "choose a new folder or delete it"
-        )
+        raise InputError(f"{out}: {state} dataset of other settings or sources {THERE}")
     for left in out.rglob(".*.part*"):  # none is of a running process: the lock is held
         left.unlink()
     return True

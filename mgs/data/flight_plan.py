@@ -37,8 +37,7 @@ KML = "http://www.opengis.net/kml/2.2"
 
 @dataclass(frozen=True)
 class Origin:
-    """Place of the world's origin: degrees, metres above sea level, and the bearing of the world's
-    +Y, degrees clockwise from north."""
+    """Place of the world's origin, degrees and metres; bearing of +Y, clockwise from north."""
 
     latitude: float
     longitude: float

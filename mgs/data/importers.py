@@ -25,8 +25,7 @@ from mgs.files import copy_file, fingerprint, folder_locked, write_json
 from mgs.images import read_exr, read_mask, read_rgba, read_values, write_exr, write_png
 
 RECORD = "import.json"
-"""File in the output folder that says what is imported, written before the first frame. An
-interrupted import continues only if it asks for the same."""
+"""Record of what is imported; an interrupted import of the same continues."""
 
 
 def import_source(
@@ -215,8 +214,7 @@ def _read_depth(path: Path, unit: float) -> np.ndarray:
 
 
 def silhouette_of(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
-    """Return mask(camera): bool [H,W], pixels whose centre shows the mesh. Raises InputError as
-    `mesh_depth`."""
+    """Return mask(camera): bool [H,W], pixels whose centre shows the mesh."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     depth = mesh_depth(mesh)

@@ -1,9 +1,4 @@
-"""Masks for photographs that have none: a mesh of the object is projected into them.
-
-Optionally the outline moves to where colours change (GrabCut, Rother et al. 2004, by OpenCV),
-within a band as wide as the error of the mesh. A refinement that cuts off a part of the object
-costs a fit more than an outline that is a little too wide.
-"""
+"""Masks for photographs that have none: a mesh of the object is projected into them."""
 
 from __future__ import annotations
 
@@ -12,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes, label
+from scipy.ndimage import binary_dilation
 
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Dataset, write_transforms
@@ -20,15 +15,6 @@ from mgs.data.meshes import Mesh
 from mgs.data.visibility import has_masks
 from mgs.errors import InputError
 from mgs.images import write_png
-
-ROUNDS = 3
-"""GrabCut iterations."""
-
-LEAST_BAND = 2
-"""Least half width of the band in which the outline may move, pixels."""
-
-LEAST_AGREEMENT = 0.75
-"""Least intersection over union of a refined mask and its silhouette."""
 
 SHEET = "masks.png"
 """Contact sheet, in the folder of the dataset."""
@@ -40,46 +26,16 @@ ACROSS = 6
 """Photographs in a row of the contact sheet."""
 
 
-def refined_mask(silhouette: np.ndarray, rgb: np.ndarray, band: int) -> np.ndarray:
-    """Mask of an object, bool [H,W], with the outline of `silhouette` moved by up to `band` pixels.
-
-    rgb: [H,W,3] linear. Holes are filled and only the largest piece is kept. The silhouette itself
-    is returned if it has no pixel deeper than the band inside or outside, or if the outline moves
-    so far that the colours of object and background cannot be told apart.
-    """
-    import cv2
-
-    sure = binary_erosion(silhouette, iterations=band)
-    possible = binary_dilation(silhouette, iterations=band)
-    if not sure.any() or possible.all():
-        return silhouette
-    state = np.where(silhouette, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    state[sure], state[~possible] = cv2.GC_FGD, cv2.GC_BGD
-    cv2.setRNGSeed(0)  # GrabCut starts with k-means
-    pixels = np.round(srgb_from_linear(rgb) * 255).astype(np.uint8)
-    models, no_box = (np.zeros((1, 65)), np.zeros((1, 65))), (0, 0, 0, 0)
-    cv2.grabCut(pixels, state, no_box, *models, ROUNDS, cv2.GC_INIT_WITH_MASK)
-    pieces, _ = label(binary_fill_holes((state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)))
-    refined = pieces == 1 + np.argmax(np.bincount(pieces.ravel())[1:])
-    common, either = (refined & silhouette).sum(), (refined | silhouette).sum()
-    return refined if common >= LEAST_AGREEMENT * either else silhouette
-
-
 def make_masks(
     dataset: Dataset,
     mesh: Mesh,
-    uncertainty: float,
-    *,
-    refine: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Dataset:
     """Write a mask of a mesh for each frame of a dataset, a contact sheet, and transforms.json; the
     same first for its test views, if they have no masks.
 
-    uncertainty: error of the mesh, units of the world; with `refine` the half width of the band in
-    which outlines move (`refined_mask`). progress: called (done, total) before each frame. Raises
-    InputError if a frame has a mask already, if the mesh is in no image, or if a file cannot be
-    read or written.
+    progress: called (done, total) before each frame. Raises InputError if a frame has a mask
+    already, if the mesh is in no image, or if a file cannot be read or written.
     """
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
@@ -91,16 +47,12 @@ def make_masks(
             )
     tests = dataset.test_views()
     if tests is not None and not has_masks(tests.frames):
-        make_masks(tests, mesh, uncertainty, refine=refine, progress=progress)
-    depth, frames, middle, seen = mesh_depth(mesh), [], mesh.vertices.mean(0), False
+        make_masks(tests, mesh, progress)
+    depth, frames, seen = mesh_depth(mesh), [], False
     thumbnails = []
     for k, frame in enumerate(dataset.frames):
         progress(k, len(dataset))
         mask, rgb = depth(frame.camera) > 0, frame.rgb()
-        if refine:
-            away = max(frame.camera.project(middle[None])[1][0], 1e-9)
-            band = round(uncertainty * frame.camera.K[0, 0] / away)
-            mask = refined_mask(mask, rgb, max(LEAST_BAND, band))
         seen |= bool(mask.any())
         path = dataset.root / "masks" / f"{frame.name}.png"
         write_png(path, mask)

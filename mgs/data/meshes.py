@@ -124,8 +124,7 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
 
 
 def _load(path: Path) -> Any:
-    """Read a file with trimesh. Raises errors of many types, and InputError if a texture is too
-    large."""
+    """Read a file with trimesh. Raises errors of many types."""
     import trimesh
 
     class Files(trimesh.resolvers.FilePathResolver):
@@ -188,8 +187,7 @@ def to_glb(mesh: trimesh.Trimesh) -> bytes:
 
 
 def distinct_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Ascending indices of faces [F,3] that have an area; of faces with the same corners, whichever
-    way round, the first."""
+    """Indices of the distinct faces [F,3] that have an area, ascending; of equal ones the first."""
     kept = np.flatnonzero(np.linalg.norm(face_crosses(vertices, faces), axis=1) > 0)
     corners = np.sort(_places(vertices)[faces[kept]], axis=1)
     order, number = _numbered(corners)

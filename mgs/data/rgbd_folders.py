@@ -27,8 +27,7 @@ OPEN3D_INTERVAL = 0.5
 
 
 def rows(path: Path, least: int) -> list[list[str]]:
-    """Words of the lines of a text file, without comments. Raises InputError where a line has fewer
-    than `least`."""
+    """Words of the lines without comments. Raises InputError for fewer than `least`."""
     with reading(path):
         lines = path.read_text(errors="replace").splitlines()
     found = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]

@@ -16,8 +16,7 @@ from mgs.images import read_rgba, write_png
 
 
 def write_rock_image(path: str | Path, rgba: np.ndarray) -> None:
-    """Write linear RGB premultiplied by alpha, and alpha, [H,W,4], as 8-bit sRGB PNG with straight
-    alpha."""
+    """Write linear RGB and alpha, [H,W,4] premultiplied, as 8-bit sRGB PNG, straight alpha."""
     alpha = rgba[..., 3:]
     straight = rgba[..., :3] / np.where(alpha > 0, alpha, 1)
     rgba = np.dstack([srgb_from_linear(straight), np.clip(alpha, 0, 1)])
@@ -32,8 +31,7 @@ def read_rock_image(path: str | Path) -> np.ndarray:
 
 
 def premultiplied(rgba: np.ndarray) -> np.ndarray:
-    """sRGB with straight alpha [H,W,4], 0 to 1 -> linear RGB premultiplied by alpha, and alpha,
-    float32."""
+    """sRGB with straight alpha [H,W,4], 0 to 1 -> linear RGB premultiplied by alpha."""
     alpha = rgba[..., 3:]
     colour = linear_from_srgb(rgba[..., :3]) * alpha
     return np.concatenate([colour, alpha], axis=-1, dtype=np.float32)

@@ -42,8 +42,7 @@ DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 """Coefficients of the OPENCV camera model, in OpenCV's order."""
 
 LEVELLED = 10.0
-"""A transforms.json or recording whose cameras' common up vector is within this angle of +Z,
-degrees, is taken as +Z up."""
+"""Angle from +Z, degrees, up to which cameras' common up vector counts as +Z."""
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 """NeRF-synthetic names images without a suffix."""
@@ -86,8 +85,7 @@ class Source:
     no_cloud: Path | None = None
 
     def in_metres(self, unit: float) -> Source:
-        """Scale cameras and points by `unit` metres; depth is in metres already. Raises InputError
-        unless it is positive and finite."""
+        """Scale cameras and points by `unit` metres. Raises InputError unless it is positive."""
         if not 0 < unit < np.inf:
             raise InputError(
                 f"import: --unit {unit} must be a positive number of metres; correct it"
@@ -124,46 +122,29 @@ class Source:
         return found, "the cameras' common up vector"
 
 
-@dataclass(frozen=True)
-class Options:
-    """Options of the reader of a recording.
-
-    images: folder of the images, or of a bag their topic. spacing: of keyframes. unpack: folder in
-    which the keyframes of a bag are unpacked.
-    """
-
-    images: Path | None
-    spacing: Spacing
-    unpack: Path
-
-    @property
-    def topic(self) -> str | None:
-        """Topic of a bag's images."""
-        return None if self.images is None else str(self.images)
-
-
 Fields = list[dict[str, Any]]
 """Fields of each `Shot`."""
 
-RECORDINGS: dict[
-    str, tuple[Callable[[Path], bool], Callable[[Path, Options], tuple[Fields, str | None]]]
-] = {
+Reader = Callable[[Path, Path | None, Spacing, Path], tuple[Fields, str | None]]
+"""(path, images, spacing of keyframes, folder to unpack into) -> shots, and unit of length. images:
+folder of the images, or of a bag their topic."""
+
+RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
     "ROS bag": (
         is_bag,
-        lambda path, given: (
-            read_bag(path, given.unpack, given.topic, given.spacing),
-            "m",
+        lambda path, images, spacing, unpack: (
+            read_bag(path, unpack, str(images) if images else None, spacing), "m"
         ),
     ),
-    "TUM RGB-D": (is_tum, lambda path, given: (read_tum(path, given.spacing), "m")),
-    "Open3D": (is_open3d, lambda path, given: (read_open3d(path, given.spacing), "m")),
-    "RTAB-Map": (is_rtabmap, lambda path, given: (read_rtabmap(path, given.spacing), "m")),
+    "TUM RGB-D": (is_tum, lambda path, _, spacing, __: (read_tum(path, spacing), "m")),
+    "Open3D": (is_open3d, lambda path, _, spacing, __: (read_open3d(path, spacing), "m")),
+    "RTAB-Map": (is_rtabmap, lambda path, _, spacing, __: (read_rtabmap(path, spacing), "m")),
     "Metashape": (
         is_metashape,
-        lambda path, given: read_metashape(path, given.images or path.parent / "images"),
+        lambda path, images, *_: read_metashape(path, images or path.parent / "images"),
     ),
-}
-"""Recordings of robots: kind -> (whether a path is one, reader of its shots and unit)."""
+}  # fmt: skip
+"""Recordings of robots: kind -> (whether a path is one, its reader)."""
 
 
 def read_source(
@@ -195,8 +176,8 @@ def read_source(
     recording = next((kind for kind, (fits, _) in RECORDINGS.items() if fits(source)), None)
     if recording is not None:
         folder = unpack or source.with_name(f"{source.name}.unpacked")
-        options = Options(images, Spacing.parse(keyframes), folder)
-        fields, unit = RECORDINGS[recording][1](source, options)
+        reader = RECORDINGS[recording][1]
+        fields, unit = reader(source, images, Spacing.parse(keyframes), folder)
         shots = [Shot(**each) for each in fields if each["image"].is_file()]
         result = Source(recording, shots, len(fields) - len(shots), unit=unit)
     elif path.is_file() or split_path.is_file():
@@ -267,8 +248,7 @@ def _read_transforms(path: Path) -> Source:
 
 
 def record_camera(where: str, record: dict[str, Any], image: Path) -> tuple[Camera, np.ndarray]:
-    """Camera and distortion of a frame; intrinsics that are not given follow from the image.
-    Errors begin with `where`."""
+    """Camera and distortion of a frame; missing intrinsics follow from the image."""
     try:
         if "w" in record and "h" in record:
             width, height = float(record["w"]), float(record["h"])

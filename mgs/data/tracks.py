@@ -14,8 +14,7 @@ from mgs.errors import InputError
 
 
 def rigid(translation: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
-    """Matrix [4,4] of a translation and a quaternion (x, y, z, w). Raises ValueError if that is
-    zero."""
+    """Matrix [4,4] of a translation and a quaternion (x, y, z, w) that is not zero."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
     pose[:3, 3] = translation

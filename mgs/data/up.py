@@ -40,8 +40,7 @@ def up_of_cameras(cameras: Sequence[Camera]) -> Up:
 
 
 def unit_up(vector: Sequence[float] | np.ndarray) -> Up:
-    """The vector scaled to length 1. Raises InputError unless it is three finite numbers, not all
-    0."""
+    """The vector scaled to length 1. Raises InputError if it is none."""
     try:
         given = np.asarray(vector, np.float64)
     except (TypeError, ValueError):

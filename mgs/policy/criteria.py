@@ -37,10 +37,8 @@ held-out views the loss is one to two times that (docs/parsimony.md). A chosen c
 PRIOR_STD = {"colour": 1.0, "scale": 0.125, "rotation": 0.0625, "opacity": 2.0}
 """tau: standard deviation of each parameter around its start before any image, in its own unit.
 
-colour: 1 SH unit (0.28 linear RGB: albedo and shading of a rock). scale: 0.125 (13 %). rotation:
-0.0625 of a quaternion (about 7 degrees). opacity: logit 2 (0.12 to 0.88 about one half). Scale and
-rotation are small because the mesh gives size and orientation: with a larger tau, Gaussians grow
-into needles that stand out of the rock (docs/fit.md)."""
+colour: 0.28 linear RGB. scale: 13 %. rotation: 7 degrees. Both are small, as the mesh gives size
+and orientation: with a larger tau, Gaussians grow into needles (docs/fit.md)."""
 
 MEAN_STD = 0.5
 """tau of learned means, as a multiple of the spacing of the prior's samples. A chosen constant.

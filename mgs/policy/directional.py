@@ -47,12 +47,10 @@ DOME = 48
 """Number of poses of the dome for I-optimality. A chosen constant."""
 
 DOME_ELEVATIONS = (0.0, 85.0)
-"""Lowest and highest elevation of the dome, degrees: all directions from above, because the views
-for evaluation are not known."""
+"""Lowest and highest elevation of the dome, degrees."""
 
 CHUNK = 1024
-"""Gaussians per task of a thread. Bounds the memory: with 100 candidates and degree 3, the array of
-spherical harmonics takes 13 MB."""
+"""Gaussians per task of a thread, which bounds the memory."""
 
 
 class Views(NamedTuple):
@@ -106,8 +104,7 @@ def basis(points: Array, views: Views, degree: int) -> NDArray[np.float64]:
 
 
 def precision(degree: int, tau: float, lam: float) -> NDArray[np.float64]:
-    """Diagonal of Lambda [K]: lam = (sigma_e / tau_0)^2 for degree 0, lam / tau^2 for higher
-    degrees."""
+    """Diagonal of Lambda [K]: lam for degree 0, lam / tau^2 for higher degrees."""
     return np.repeat(
         [lam, *[lam / tau**2] * degree], [2 * order + 1 for order in range(degree + 1)]
     )
@@ -148,8 +145,7 @@ def of_points(views: Views, some: slice) -> Views:
 
 
 def in_parts(count: int, part: Callable[[slice], Result]) -> list[Result]:
-    """Results of `part` for slices of CHUNK out of `count` Gaussians, in order, computed in
-    threads."""
+    """Results of `part` for slices of CHUNK out of `count`, in order, from threads."""
     chunks = [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         return list(pool.map(part, chunks))

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 from mgs.policy.criteria import Array
 
 PosePolicy = Callable[[Array, Array, Array, np.random.Generator], Array]
-"""(candidates [C,3], taken [T,3], centre [3], rng) -> score of each candidate [C]. Positions in
-metres."""
+"""(candidates [C,3], taken [T,3], centre [3], rng) -> score of each candidate [C]; metres."""
 
 
 def azimuths(positions: Array, centre: Array) -> NDArray[np.float64]:
-    """Azimuths of camera centres [C,3] about the vertical through `centre` [3], radians in
-    [0, 2 pi), 0 = +X."""
+    """Azimuths of camera centres [C,3] about `centre` [3], radians in [0, 2 pi), 0 = +X."""
     offset = np.asarray(positions, np.float64) - centre
     return np.arctan2(offset[:, 1], offset[:, 0]) % (2 * np.pi)
 
@@ -82,8 +80,7 @@ POSE_POLICIES: dict[str, PosePolicy] = {
 
 
 def nearest_poses(positions: Array, here: Array, count: int) -> list[int]:
-    """Sorted indices of the `count` positions [C,3] nearest to `here` [3]; all if there are
-    fewer."""
+    """Sorted indices of the `count` positions [C,3] nearest to `here` [3]."""
     distance = _rounded(np.linalg.norm(positions - here, axis=1))
     return sorted(int(k) for k in np.argsort(distance, kind="stable")[:count])
 

@@ -37,8 +37,7 @@ def directional_d(context: PolicyContext) -> Array:
 
 
 def directional_i(context: PolicyContext) -> Array:
-    """Directional I-optimality over a dome, with colours of SH degree 3 and tau 0.1
-    (`mgs.policy.directional`)."""
+    """Directional I-optimality over a dome, with colours of SH degree 3 and tau 0.1."""
     return context.gains(context.taken_frames, context.candidate_frames, 3, 0.1, True)
 
 
@@ -51,8 +50,7 @@ def i_optimal(context: PolicyContext) -> Array:
 
 
 def block_d(context: PolicyContext) -> Array:
-    """Eq. 7 for the exact 11x11 blocks (`mgs.policy.criteria.block_log_determinant`), whatever the
-    estimator of the run."""
+    """Eq. 7 for the exact 11x11 blocks, whatever the estimator of the run."""
     H, lam = _summed(context, "block"), context.lam
     before = block_log_determinant(H, lam)
     after = _each(context, lambda i: block_log_determinant(H + context.estimate(i, "block"), lam))
@@ -164,8 +162,7 @@ def check_policy(name: str) -> None:
 
 
 def policy_of(policy: str | Callable[..., Any]) -> Policy:
-    """The policy of a name, or of a function. Raises InputError as `policy_named` and
-    `mgs.policy.from_file.by_parameter_name`."""
+    """The policy of a name, or of a function. Raises InputError as `policy_named`."""
     if isinstance(policy, str):
         return policy_named(policy)
     return from_file.by_parameter_name(from_file.name_of(policy), policy)

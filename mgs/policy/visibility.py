@@ -1,5 +1,4 @@
-"""Visibility of the prior's surface from camera poses. It depends on poses and surface alone, so it
-is measured once per run."""
+"""Visibility of the prior's surface from camera poses, measured once per run."""
 
 from __future__ import annotations
 

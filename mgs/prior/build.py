@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 from plyfile import PlyData, PlyParseError
-from scipy.spatial import cKDTree
 
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud, write_cloud
@@ -214,7 +213,6 @@ def _samples(
     backed = round(share * len(points)) if total is None else total - len(points)
     order = spread_first(points, backed, spacing)
     points = points[order]
-    nearest = cKDTree(points).query(points, 2)[0][:, 1]
     numbers = {
         "mesh_faces": len(mesh.faces),
         "mesh_area": float(mesh.areas.sum()),
@@ -222,8 +220,6 @@ def _samples(
         "n": len(points),
         "backed": backed,
         "spacing": spacing,
-        "nearest_neighbour_mean": float(nearest.mean()),
-        "nearest_neighbour_min": float(nearest.min()),
         **({} if resolved is None else {"resolution": asdict(resolved)}),
     }
     return points, normals[order], spacing, numbers

@@ -1,10 +1,8 @@
 """Exposure differences between photographs: a gain per image and channel, before any fit.
 
-Automatic exposure and white balance multiply the linear RGB of an image by a gain per channel.
 Where two images show the same surface samples, the ratio of mean colours is the ratio of their
 gains. All gains are the least-squares solution over all pairs (Brown and Lowe 2007, "Automatic
-Panoramic Image Stitching using Invariant Features", section 6), here of logarithms, so it is
-linear.
+Panoramic Image Stitching using Invariant Features", section 6), of logarithms, so it is linear.
 """
 
 from __future__ import annotations
@@ -38,8 +36,7 @@ RATIO_STD = 0.1
 """Standard deviation of the log ratio from one sample. A chosen constant."""
 
 GAIN_STD = 0.5
-"""Prior standard deviation of a log gain, 0.7 stops. It matters only for images that share few
-samples."""
+"""Prior standard deviation of a log gain, 0.7 stops."""
 
 
 def solve_gains(colours: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -144,8 +144,7 @@ def _cloud_panels(axes, view: _View, segmented: SegmentedCloud, up: np.ndarray) 
 
 
 def _oblique(up: np.ndarray) -> np.ndarray:
-    """Axes of picture coordinates, rows [3,3], of a viewer 30 degrees above a ground of normal `up`
-    [3], at an arbitrary fixed azimuth."""
+    """Axes of picture coordinates, rows [3,3], of a viewer 30 degrees above the ground."""
     side = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
     ahead = np.cross(side, up)

@@ -1,8 +1,7 @@
 """The visual hull: the largest body inside the masks of all frames (Laurentini 1994), by carving.
 
-A point has a value per frame: its projection's distance inside the mask's outline, pixels, times
-the size of a pixel there. The least value is positive inside the hull, negative outside, and about
-the distance to its surface nearby; marching cubes find the surface.
+A point has a value per frame: its projection's distance inside the mask's outline, times the size
+of a pixel there. The least value is positive inside the hull; marching cubes find its surface.
 """
 
 from __future__ import annotations
@@ -26,8 +25,7 @@ COARSE, REFINEMENTS = 48, 2
 """Cells along an edge of the first grid, and its refinements by two near the surface."""
 
 NEAR_SURFACE = 3.0
-"""Nodes of a refined grid are evaluated anew if their interpolated value is under this many cells.
-"""
+"""Nodes are evaluated anew if their interpolated value is under this many cells."""
 
 ROW = 4096
 """Points are passed to OpenCV in rows of this length."""
@@ -102,8 +100,7 @@ class _View:
     distance: np.ndarray
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Distance of points [N,3] inside the silhouette, units of the world; +inf outside the
-        image."""
+        """Distance of points [N,3] inside the silhouette, world; +inf outside the image."""
         import cv2
 
         if len(points) == 0:
@@ -180,8 +177,7 @@ def _inside(views: Sequence[_View], points: np.ndarray, reach: float) -> np.ndar
 
 
 def _against(frames: Sequence[Frame], views: Sequence[_View], points: np.ndarray) -> list[str]:
-    """Names of the frames whose mask does not contain the one of points [N,3] that the fewest
-    frames carve."""
+    """Names of the frames that carve the point, of [N,3], that the fewest carve."""
     carved, count = np.zeros(len(points), int), np.zeros(len(points), int)
     for view in views:
         value = view(points)
@@ -213,8 +209,7 @@ def _largest(field: np.ndarray) -> np.ndarray:
 
 
 def _checked_agreement(frames: Sequence[Frame], views: Sequence[_View], mesh: Mesh) -> np.ndarray:
-    """Share of each frame's mask that the mesh fills. Raises InputError if the median is below
-    AGREEMENT."""
+    """Share of each mask that the mesh fills. Raises InputError if too small."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     depth = mesh_depth(mesh)

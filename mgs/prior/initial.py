@@ -1,9 +1,8 @@
 """Initial Gaussians from the prior and some frames (paper, section III-A), with an opaque backing.
 
-Images do not require an opaque surface. With one layer of Gaussians, as in the paper, bright
-patches become transparent, and the far side of the rock shows through, a different part in every
-camera. So every second Gaussian on the surface has a larger, opaque one a spacing behind it, which
-shows the rock's own colour there. All are fitted alike. docs/fit.md has the measurements.
+With one layer of Gaussians, as in the paper, bright patches become transparent, and the far side of
+the rock shows through. So every second Gaussian on the surface has a larger, opaque one a spacing
+behind it (docs/fit.md). All are fitted alike.
 """
 
 from __future__ import annotations
@@ -31,28 +30,22 @@ IN_PLANE_SCALE = 0.65
 """Standard deviation of a Gaussian along the surface, over the spacing of the samples."""
 
 INITIAL_OPACITY = 0.9
-"""Opacity of a Gaussian, chosen with IN_PLANE_SCALE so that the far side is hidden from the start.
-
-For Gaussians of standard deviation s and opacity o, one per spacing^2, the mean log transmittance
-of a ray across the surface is -2 pi (s / spacing)^2 Li2(o), with the dilogarithm Li2: -3.45, or 3 %
-of the light, for 0.65 and 0.9. EPS2D makes it less. Opacity 0.99 would hide more, but its
-derivative by its logit, o (1 - o), is almost zero; at 0.9 it is 0.09.
-"""
+"""Opacity of a Gaussian, chosen with IN_PLANE_SCALE so that the far side is hidden from the start:
+the mean log transmittance across the surface is -2 pi (s / spacing)^2 Li2(o) = -3.45. With 0.99 the
+derivative by the logit, o (1 - o), would be almost zero."""
 
 INSET = 0.6
 """Depth of a Gaussian below the surface, pixels on the rock: EPS2D widens every footprint by about
 half a pixel, which would draw the rock too large. A chosen constant (docs/fit.md)."""
 
 THICKNESS = 0.1
-"""Standard deviation of a Gaussian across the surface, over the spacing: flat, but well
-conditioned."""
+"""Standard deviation of a Gaussian across the surface, over the spacing."""
 
 BACKING_DEPTH = 1.0
 """Distance of the backing behind the surface's Gaussians, over their spacing."""
 
 BACKING_SCALE = (0.8, 0.8, 0.2)
-"""Standard deviations of a backing Gaussian along the surface and the normal, over the backing's
-spacing: more overlap than on the surface, to leave no gaps."""
+"""Standard deviations of a backing Gaussian, over the backing's spacing."""
 
 BACKING_OPACITY = 0.99
 
@@ -118,8 +111,7 @@ def initial_gaussians(
 def _scattered(
     prior: Prior, frames: Sequence[Frame], gains: np.ndarray | None
 ) -> tuple[Gaussians, np.ndarray]:
-    """Round, nearly transparent Gaussians at random points, in the mean colour of all pixels that
-    show them; and whether some do."""
+    """Round, nearly transparent Gaussians at random points, and whether a pixel shows them."""
     points = prior.points
     total, count = np.zeros((len(points), 3)), np.zeros(len(points))
     for k, frame in enumerate(frames):
@@ -260,13 +252,3 @@ def colour_agreement(prior: Prior, frames: Sequence[Frame]) -> float:
     mean = total.sum(0) / count.sum()
     whole = squares.sum() / count.sum() - np.square(mean).sum()
     return float(1 - within / max(whole, 1e-12))
-
-
-def with_share_seen(prior: Prior, seed_frames: Sequence[Frame]) -> Prior:
-    """The prior with `numbers` of seen_by_seeds: the share of samples that some seed frame sees;
-    the rest would start grey. Raises InputError if a depth image or mask cannot be read."""
-    depth = depth_of(prior)
-    seen = np.logical_or.reduce(
-        [sees(prior.points, prior.normals, f, depth(f), prior.depth_tolerance) for f in seed_frames]
-    )
-    return replace(prior, numbers=prior.numbers | {"seen_by_seeds": float(seen.mean())})

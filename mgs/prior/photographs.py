@@ -36,8 +36,7 @@ LEAST_OVERLAP = 0.5
 """Least share of cameras that have in their image the point that all look at."""
 
 GAP = 4.0
-"""Distance from every point, in point spacings, beyond which the hull replaces the points.
-"""
+"""Distance from every point, in spacings, beyond which the hull replaces the points."""
 
 CELL_OF_SPACING = 0.5
 """Cloud spacing passed to the Poisson reconstruction, over the real one: its cells are then 0.75
@@ -49,8 +48,7 @@ and are not sampled. With a hull or a ground plane there is no need."""
 
 
 ONE_SIDED = 0.5
-"""Least length of the mean normal of points seen from one side: 0 all around an object, 1 for a
-wall."""
+"""Least length of the mean normal of points seen from one side."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
 """Points of the object, with normals, from a triangulated cloud.
 
-Clouds of real photographs are uneven: dense on texture, empty on plain parts, with wrong points
-anywhere, often without ground. Points are judged one by one (track, reprojection error), then by
-masks, else by ground plane and density clusters (HDBSCAN), and last by their neighbours.
+Points are judged one by one (track, reprojection error), then by masks, else by ground plane and
+density clusters (HDBSCAN), and last by their neighbours.
 """
 
 from __future__ import annotations
@@ -62,12 +61,10 @@ GROWN, GROWN_NEIGHBOURS = 0.15, 4
 extent, and min_samples. A part with few points, as in shade, is no cluster of its own."""
 
 PLANE_TILT = 45.0
-"""Largest angle between the ground's normal and the dataset's up, degrees: a facade is a plane too.
-"""
+"""Largest angle between the ground's normal and the dataset's up, degrees."""
 
 PLANE_VOXEL = 0.25
-"""Voxel passed to `ground_plane`, over the point spacing: triangulated points are more exact than
-dense."""
+"""Voxel passed to `ground_plane`, over the point spacing."""
 
 NEIGHBOURS = 16
 """Neighbours that decide whether a point lies off the surface."""
@@ -86,8 +83,7 @@ def spacing_of(points: np.ndarray) -> float:
 
 
 def reliable(cloud: SparseCloud) -> np.ndarray:
-    """Mask [N] of the points that are well triangulated, by track and reprojection error, where
-    known."""
+    """Mask [N] of the points that are well triangulated, as far as known."""
     kept = np.ones(len(cloud.points), bool)
     if cloud.track is not None:
         kept &= cloud.track >= LEAST_TRACK
@@ -183,8 +179,7 @@ def segment_points(
 def _plane_or_none(
     cloud: Cloud, frames: Sequence[Frame], up: Up, settings: PriorSettings
 ) -> Plane | None:
-    """The ground plane, if it is about level, below all cameras, and holds a fifth of the points
-    near what they look at; else None."""
+    """The ground plane, if it is about level and below all cameras; else None."""
     target = focus(frames)
     near = np.linalg.norm(cloud.points - target.point, axis=1) < REACH * target.distance
     fine = PLANE_VOXEL * cloud.voxel

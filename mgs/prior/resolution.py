@@ -1,7 +1,7 @@
 """Sample spacing that the training images can resolve, and the number of samples that follows.
 
-A detail of period under two pixels is not in an image (Nyquist), so samples closer than the pixels
-of the closest camera differ by noise only. Every part of the surface asks its closest camera.
+A detail of period under two pixels is not in an image (Nyquist). Samples closer than the pixels of
+the closest camera differ by noise only.
 """
 
 from __future__ import annotations

@@ -22,8 +22,7 @@ GAUSSIANS = 10_000
 """Number of Gaussians where none is given."""
 
 FAR = 10.0
-"""Radius within which the background of photographs without masks starts, over that of the ball
-that the cameras look at."""
+"""Radius of the random background, over that of the ball that the cameras look at."""
 
 DRAWS = 64
 """Draws per Gaussian after which too few lie inside the masks."""

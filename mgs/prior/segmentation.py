@@ -18,12 +18,10 @@ from mgs.survey.depth_sensor import SIGMA_FROM_MAD
 from mgs.survey.fusion import FILTERED_SHARE, Cloud, focus, fuse_frames, voxel_means
 
 PLANE_TOLERANCE = 0.02
-"""Largest distance of RANSAC's inliers from the plane, over the cameras' distance: more than the
-grain of a floor, less than a rock."""
+"""Largest distance of RANSAC's inliers from the plane, over the cameras' distance."""
 
 PLANE_REACH = 0.5
-"""Radius around the focus in which the plane is refined, over the cameras' distance: real ground is
-not flat, and only the ground near the rock matters."""
+"""Radius around the focus in which the plane is refined, over the cameras' distance."""
 
 PLANE_MIN_SHARE = 0.2
 """Least share of the cloud on the plane for it to be the ground."""
@@ -35,8 +33,7 @@ CLUSTER_NEIGHBOURS = 8
 """DBSCAN's min_samples. Its eps is twice the median distance to the neighbour of this number."""
 
 EQUAL_SIZE = 0.8
-"""Clusters of at least this share of the largest one count as equally large; the nearest to the
-focus is the rock."""
+"""Least share of the largest cluster for one to count as equally large."""
 
 NEARER = 1.25
 """Least ratio of distances from the focus that tells equally large clusters apart."""

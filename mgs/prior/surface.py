@@ -21,8 +21,7 @@ underside the surface bulges out; with pymeshlab's default, 1.1, it leaves the c
 closed."""
 
 POISSON_CELL = 1.5
-"""Largest edge of the finest cells, over the voxel. Finer cells fit noise; half the edge gained
-nothing."""
+"""Largest edge of the finest cells, over the voxel. Finer cells fit noise."""
 
 POISSON_DEPTHS = (5, 10)
 """Least and largest octree depth chosen automatically. Beyond 12, pymeshlab crashes."""
@@ -34,8 +33,7 @@ OVERSAMPLING = 5
 """Random candidates per sample."""
 
 SAMPLE_BYTES = 3400
-"""Memory per sample, bytes, mostly for pairs of candidates (measured: 3.3 to 3.5 kB for 10^5 to
-10^6 samples)."""
+"""Memory per sample, bytes, mostly for pairs of candidates (measured)."""
 
 
 def poisson_mesh(
@@ -77,8 +75,7 @@ def closed_poisson(
 
 
 def intersection(a: Mesh, b: Mesh) -> Mesh:
-    """Largest piece of the intersection of two watertight meshes (manifold3d). Raises InputError if
-    empty."""
+    """Largest piece of the intersection of watertight meshes. Raises InputError if empty."""
     pieces = (_to_solid(a.vertices, a.faces) ^ _to_solid(b.vertices, b.faces)).decompose()
     if not pieces:
         raise InputError(
@@ -190,8 +187,7 @@ def sample_surface(
 
 
 def spread_first(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
-    """Order of points [N,3], `spacing` metres apart, whose first `count` are evenly spread by
-    themselves: indices [N]."""
+    """Order [N] of points whose first `count` are evenly spread by themselves."""
     if not count:
         return np.arange(len(points))
     first = _blue_noise(points, count, spacing * np.sqrt(len(points) / count))

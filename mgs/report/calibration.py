@@ -48,8 +48,7 @@ def sparsification(errors: Array, sigma: Array) -> Array:
 
 
 def ause(errors: Array, sigma: Array) -> float:
-    """Area between the sparsification curves by sigma and by the errors themselves. errors: [n], 0
-    or more."""
+    """Area between the sparsification curves by sigma and by the errors [n] themselves."""
     return float((sparsification(errors, sigma) - sparsification(errors, errors)).mean())
 
 
@@ -137,7 +136,6 @@ def judged(
 
 
 def crps(errors: Array, sigma: Array) -> float:
-    """Mean continuous ranked probability score of normal distributions around 0, in the unit of the
-    errors; smaller is better."""
+    """Mean continuous ranked probability score of normal distributions around 0."""
     z = errors / sigma
     return float((sigma * (z * (2 * ndtr(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))).mean())

@@ -1,9 +1,7 @@
 """Predicted further fall of the objective of a run's last fit.
 
-A fit stops long before the minimum, because by then held-out images no longer improve and the
-ranking of candidates hardly changes (docs/fit.md). The loss from pass to pass does not show how far
-away the minimum is. The Newton decrease does: half of g^T (J^T J + lam)^-1 g, exact where images
-are linear in the parameters.
+A fit stops long before the minimum, when held-out images no longer improve (docs/fit.md). The
+Newton decrease, half of g^T (J^T J + lam)^-1 g, predicts the rest; it is exact for linear images.
 """
 
 from __future__ import annotations
@@ -22,8 +20,7 @@ from mgs.run.settings import NbvSettings
 from mgs.splat import as_drjit, groups
 
 CG_ITERATIONS = 20
-"""Iterations of conjugate gradients; `mgs bench fit` compares their prediction with a longer
-fit."""
+"""Iterations of conjugate gradients."""
 
 CONVERGED_SHARE = 0.02
 """A fit has converged if the objective is predicted to fall by at most this share of itself."""
@@ -40,10 +37,9 @@ def remaining_decrease(
 
     gaussians: the fitted model; frames: those taken, in their order, so the seeds first.
 
-    Returns "phi" (`mgs.fit.objective`, squared pixel values); "predicted_decrease", the Newton
-    decrease after CG_ITERATIONS as a share of phi; and "converged", whether that is at most
-    CONVERGED_SHARE. Raises InputError if a frame cannot be read, or the fit relocated Gaussians,
-    whose prior is not kept.
+    Returns "phi" (`mgs.fit.objective`, squared pixel values); "predicted_decrease", a share of phi;
+    and "converged", whether that is at most CONVERGED_SHARE. Raises InputError if a frame cannot be
+    read, or the fit relocated Gaussians, whose prior is not kept.
     """
     if settings.train.density != "fixed":
         raise InputError(

@@ -1,21 +1,18 @@
 """Maps of what the training views of a run say about its model: for views (EXR, PNG) and for
 Gaussians (PLY).
 
-H [N,P] is the diagonal of the Fisher information, summed over the training views. lam [P] is the
-information of the prior about each parameter (`mgs.policy.criteria.regularisation`). Every Gaussian
-has these numbers, its scalars:
+H [N,P] is the diagonal of the Fisher information, summed over the training views; lam [P] is that
+of the prior (`mgs.policy.criteria.regularisation`). Every Gaussian has these scalars:
 
 - `fisher.colour`, `fisher.scale`, `fisher.rotation`, `fisher.opacity`, and `fisher.mean` if the run
   learns means: sum of H over its parameters of that kind, in (pixel value / parameter)^2.
 - `information`: 1/2 sum_k log(1 + H_k / lam_k) over its parameters k, nats.
 - `uncertainty`: mean over its parameters of lam_k / (H_k + lam_k), the variance that is left over
   the variance of the prior: 1 if nothing is known, 0 if everything is.
-- `unobserved`: 1 if no training view sees its place on the surface, else 0, by the rule of the
-  coverage of a run (`mgs.policy.criteria.observed`). That rule looks at the Gaussians before
-  training, because training hides some Gaussians behind others.
+- `unobserved`: 1 if no training view sees its place on the surface, else 0
+  (`mgs.policy.criteria.observed` of the Gaussians before training).
 
-A map of a scalar v shows in each pixel the mean over the Gaussians that the pixel shows, with their
-blending weights w: sum w v / sum w; 0 in pixels that show none.
+A map of a scalar v is sum w v / sum w in each pixel, with blending weights w; 0 where none is.
 """
 
 from __future__ import annotations

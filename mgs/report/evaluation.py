@@ -23,18 +23,19 @@ from typing import Any
 import numpy as np
 
 from mgs.camera import Camera
-from mgs.colour import srgb_from_linear
-from mgs.data.dataset import TEST_FOLDER, Dataset
+from mgs.colour import linear_from_srgb, srgb_from_linear
+from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset
 from mgs.data.frames import Frame
 from mgs.errors import InputError
-from mgs.files import atomic_path, read_json, working_in, write_json
+from mgs.files import atomic_path, working_in, write_json
 from mgs.gaussians import Gaussians
 from mgs.images import PNG_LEVEL, read_png
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_surface
 from mgs.provenance import versions
 from mgs.report.runs import read_metrics
-from mgs.run.folder import Run, open_run
+from mgs.run.folder import Run, holds_run, open_run
 from mgs.run.inputs import array_digest, camera_digest, frame_digests
+from mgs.splat_ply import ply_colour_space, read_ply
 
 Renderer = Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray, np.ndarray]]
 """(gaussians, camera) -> linear RGB [H,W,3], alpha [H,W], expected z-depth [H,W] in metres."""
@@ -70,15 +71,13 @@ def evaluate_model(
     trained: Iterable[str],
     *,
     test_frames: Sequence[Frame] = (),
-    spacing: float | None = None,
     renderer: Renderer = render_view,
     pictures: Path | None = None,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Compare a model with every frame of a dataset, and with its test views if it has some.
 
-    trained: names of the training frames; the others are held out. spacing: of the prior's samples,
-    metres; without it the shares that are too deep are left out. pictures: folder for the
+    trained: names of the training frames; the others are held out. pictures: folder for the
     comparisons (`write_comparison`), NAME.png of every frame and test/NAME.png of every test view.
 
     Returns the contents of metrics.json, without the entries that are about a run:
@@ -116,7 +115,7 @@ def evaluate_model(
             # Copies: memory of Dr.Jit must not be freed by another thread. That thread would wait
             # for a lock of Dr.Jit while it holds Python's, and this one the other way round.
             drawn = tuple(map(np.array, renderer(gaussians, frame.camera)))
-            waiting.append((found, frame, pool.submit(_measured, frame, drawn, spacing, folder)))
+            waiting.append((found, frame, pool.submit(_measured, frame, drawn, folder)))
         while waiting:
             finish_first()
     result: dict[str, Any] = {"images": len(trained)}
@@ -131,21 +130,15 @@ def evaluate_model(
 
 
 def _measured(
-    frame: Frame, rendered: tuple[np.ndarray, ...], spacing: float | None, folder: Path | None
+    frame: Frame, rendered: tuple[np.ndarray, ...], folder: Path | None
 ) -> dict[str, float]:
-    """METRICS of one view, and SURFACE_METRICS that it has a truth for. Its picture goes into the
-    folder."""
+    """METRICS and SURFACE_METRICS of one view; writes its picture into the folder."""
     (truth, weight), mask, (rgb, alpha, depth) = frame.target(), frame.mask(), rendered
     true_depth = frame.depth() if frame.depth_path else None
-    found = compare(truth, rgb, mask, weight) | compare_surface(
-        truth,
-        alpha,
-        depth,
-        mask,
-        weight,
-        fractional=frame.rock_path is not None,
-        true_depth=true_depth,
-        spacing=spacing,
+    shares = frame.rock_path is not None
+    found = compare(truth, rgb, mask, weight)
+    found |= compare_surface(
+        truth, alpha, depth, mask, weight, fractional=shares, true_depth=true_depth
     )
     if folder is not None:
         write_comparison(folder / f"{frame.name}.png", truth[..., :3], rgb, found["psnr"])
@@ -224,7 +217,7 @@ def evaluate_run(
 
     run: folder or opened run. convergence: also predict how far the last fit is from its minimum
     (entry "fit": `mgs.report.convergence.remaining_decrease`). say: called with lines for the user:
-    metrics left out for want of a truth, files written and kept.
+    files written and kept.
 
     Metrics and pictures of the same model, dataset and version of mgs are kept, not made again. In
     an on-demand dataset only frames that the run has taken have an image, so none is held out.
@@ -238,10 +231,7 @@ def evaluate_run(
         trained = [frame.name for frame in run.taken]
         frames, tests = dataset.with_images(trained), dataset.test_views()
         test_frames = () if tests is None else tests.frames
-        spacing = _spacing(run.settings.prior)
-        subject = _subject(gaussians, [*frames, *test_frames], trained, spacing)
-        for reason in _left_out(dataset, run.settings.prior, spacing):
-            say(reason)
+        subject = _subject(gaussians, [*frames, *test_frames], trained)
         metrics = _measured_before(file, subject)
         if metrics is None:
             found = evaluate_model(
@@ -249,7 +239,6 @@ def evaluate_run(
                 frames,
                 trained,
                 test_frames=test_frames,
-                spacing=spacing,
                 pictures=folder if pictures else None,
                 progress=progress,
             )
@@ -303,48 +292,14 @@ def _informed(run: Run) -> dict[str, dict[str, int]]:
     }
 
 
-def _spacing(prior: Path) -> float | None:
-    """Spacing of the prior's samples, metres; None if its folder is gone. Raises InputError if its
-    file is damaged."""
-    file = prior / "prior.json"
-    if not file.is_file():
-        return None
-    numbers = read_json(file)
-    spacing = numbers.get("spacing") if isinstance(numbers, dict) else None
-    if not isinstance(spacing, float | int) or not 0 < spacing < math.inf:
-        raise InputError(
-            f"{file}: spacing must be positive metres; make the prior again with `mgs prior`"
-        )
-    return float(spacing)
-
-
-def _left_out(dataset: Dataset, prior: Path, spacing: float | None) -> list[str]:
-    """Why some of SURFACE_METRICS are not measured, in a line each."""
-    reasons = []
-    if not any(frame.rock_path for frame in dataset.frames):
-        reasons.append(
-            f"{dataset.root}: has no images of the rock alone, so the error of alpha is left out"
-        )
-    if not any(frame.depth_path for frame in dataset.frames):
-        reasons.append(f"{dataset.root}: has no depth images, so the errors of depth are left out")
-    elif spacing is None:
-        reasons.append(
-            f"{prior}: is not there, so the shares that are too deep, in its spacings, are left out"
-        )
-    return reasons
-
-
-def _subject(
-    gaussians: Gaussians, frames: Sequence[Frame], trained: list[str], spacing: float | None
-) -> str:
-    """Hash of all that the metrics of a run depend on: model, cameras and files of all views,
-    spacing of the prior, and versions without the commit."""
+def _subject(gaussians: Gaussians, frames: Sequence[Frame], trained: list[str]) -> str:
+    """Hash of all that the metrics of a run depend on."""
     kinds = ("image", "mask", "rock", "depth")
     views = [
         [frame.name, camera_digest(frame.camera), frame_digests(frame, kinds)] for frame in frames
     ]
     known = {name: version for name, version in versions().items() if name != "commit"}
-    text = json.dumps([array_digest(asdict(gaussians).values()), views, trained, spacing, known])
+    text = json.dumps([array_digest(asdict(gaussians).values()), views, trained, known])
     return array_digest([np.frombuffer(text.encode(), np.uint8)])
 
 
@@ -373,3 +328,60 @@ def compare_models(
     if not frames:
         return name, None
     return name, [float(evaluate_model(model, frames, ())["all"]["psnr"]) for model in models]
+
+
+def evaluate(
+    subject: str | Path | Run | Gaussians,
+    dataset: str | Path | Dataset | None = None,
+    *,
+    trained: Iterable[str] = (),
+    progress: Progress = no_progress,
+    **options: Any,
+) -> dict[str, Any]:
+    """Measure a run, or a model on the views of a dataset; return the contents of metrics.json.
+
+    subject: a run or its folder, measured by `evaluate_run` with its options; or Gaussians, or a
+    PLY. dataset: of a model; default of a PLY in a run's folder: that of the run. trained: names of
+    the frames that the model was trained on; there those of the run. The numbers of a PLY are
+    written beside it, as NAME.metrics.json. Raises InputError as `evaluate_run`, `read_ply` and
+    `load_dataset`, and where a model comes without a dataset.
+    """
+    if isinstance(subject, Run) or (not isinstance(subject, Gaussians) and Path(subject).is_dir()):
+        return evaluate_run(subject, progress=progress, **options)
+    renderer: Renderer = render_view
+    path = None
+    if not isinstance(subject, Gaussians):
+        path = Path(subject)
+        if not path.exists():
+            raise InputError(f"{path}: no such run folder or PLY file")
+        subject, renderer = read_ply(path), _renderer(ply_colour_space(path))
+        if dataset is None and holds_run(path.parent):
+            run = open_run(path.parent)
+            dataset, trained = run.dataset, [frame.name for frame in run.taken]
+    if dataset is None:
+        raise InputError(f"{path or 'the model'}: is of no run here; give a dataset with --dataset")
+    views = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
+    names, tests = list(trained), views.test_views()
+    metrics = evaluate_model(
+        subject,
+        views.with_images(names),
+        names,
+        test_frames=tests.frames if tests else (),
+        renderer=renderer,
+        progress=progress,
+    )
+    if path is not None:
+        write_json(path.with_suffix(".metrics.json"), metrics)
+    return metrics
+
+
+def _renderer(space: str) -> Renderer:
+    """Renderer of a model whose colours are blended in this space."""
+    if space == "linear":
+        return render_view
+
+    def render(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rgb, alpha, depth = render_view(gaussians, camera)
+        return linear_from_srgb(np.clip(rgb, 0, 1)), alpha, depth
+
+    return render

@@ -1,20 +1,17 @@
 """Choose by evidence which kinds of parameters each Gaussian learns, and the SH degree of the
 colours.
 
-Kinds of parameters are chosen by the evidence: the likelihood of the images, averaged over the
-prior of the parameters. In Laplace's approximation at a fit, with the exact diagonal H, learning
-one parameter with all else fixed adds
+The evidence is the likelihood of the images, averaged over the prior of the parameters. In
+Laplace's approximation with the exact diagonal H, learning one parameter adds
 
     gain = 1/2 (H + lam) delta^2 / sigma^2 - 1/2 log((H + lam) / lam)
 
 nats to the log evidence (MacKay 1992). Here lam = (sigma / tau)^2, and delta is how far the fit
-moved the parameter from its start. Parameters that gain least are left out too, as long as Phi, the
-objective of the fit, rises by no more than is allowed. Each of them raises it by
-1/2 (H + lam) delta^2.
+moved the parameter from its start. Parameters that gain least are left out too, while Phi, the
+objective of the fit, rises by no more than is allowed: each raises it by 1/2 (H + lam) delta^2.
 
-The SH degree cannot be chosen by images of the orbit, because it matters for views from elsewhere.
-It is chosen by blocked cross-validation (Roberts et al. 2017): views that are neighbours in azimuth
-are left out together, so that the others must predict views beyond them.
+The SH degree is chosen by blocked cross-validation (Roberts et al. 2017): neighbours in azimuth are
+left out together, so the others must predict views beyond them.
 """
 
 from __future__ import annotations
@@ -131,8 +128,7 @@ def last_images(settings: NbvSettings, prior: Prior, frames: Sequence[Frame]) ->
 
 
 def kinds(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
-    """Columns of the Fisher information by kind, as `mgs.splat.groups`, with colours of degrees
-    above 0 as a kind of their own."""
+    """Columns as `mgs.splat.groups`, with DIRECTIONAL as a kind of its own."""
     of = groups(sh_degree, means)
     if sh_degree == 0:
         return of
@@ -341,8 +337,7 @@ def fitted(
 
 
 def _masks(kept: Mapping[str, Mask], coefficients: int, means: str) -> dict[str, np.ndarray]:
-    """Masks of `LeanModel.learned` in shapes that broadcast to the learned arrays. coefficients: of
-    a colour channel."""
+    """Masks of `LeanModel.learned` that broadcast to the learned arrays."""
     flat = ("opacity", "mean") if means == "normal" else ("opacity",)  # arrays of shape [N]
     masks = {kind: mask if kind in flat else mask[:, None] for kind, mask in kept.items()}
     directional = masks.pop(DIRECTIONAL, None)

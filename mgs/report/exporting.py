@@ -16,8 +16,7 @@ from mgs.splat.reference import sh_basis
 from mgs.splat_files import colour_space, load_gaussians
 
 DIRECTIONS = 64
-"""Directions from which a view-dependent colour is converted; 16 coefficients are fitted to them.
-"""
+"""Directions to which the coefficients of a converted colour are fitted."""
 
 PART = 1 << 16
 """Gaussians whose colours are converted at a time."""
@@ -25,8 +24,7 @@ PART = 1 << 16
 
 @dataclass(frozen=True)
 class Model:
-    """Gaussians (NumPy fields), the space of their colours ("linear" or "srgb"), and the upward
-    direction of their world."""
+    """Gaussians, the space of their colours ("linear" or "srgb"), and the world's up."""
 
     gaussians: Gaussians
     space: str

@@ -250,8 +250,7 @@ def _curves_figure(
 
 
 def _legend_beside(figure: Figure) -> None:
-    """Put the legend of the first axes to the right of all axes, and enlarge the figure by its
-    width."""
+    """Put the legend of the first axes to the right of all, and widen the figure."""
     legend = figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper")
     box, (width, height) = legend.get_window_extent(), figure.get_size_inches()
     figure.set_size_inches(
@@ -357,8 +356,7 @@ def _draw_maps(figure: Any, maps: Sequence[tuple[str, Any, Any, Any]]) -> None:
 
 
 def _draw_ause(axis: Any, rows: Sequence[tuple[dict[str, Any], str]]) -> None:
-    """Draw AUSE of absolute errors as bars, with ticks for a perfect sigma and a line for a
-    constant one."""
+    """Draw AUSE as bars, with ticks for a perfect sigma and a line for a constant one."""
     for i, (row, colour) in enumerate(rows):
         area = row["ause"]
         ends, perfect = [i - 0.4, i + 0.4], [area["perfect"]] * 2

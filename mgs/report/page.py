@@ -44,6 +44,7 @@ from mgs.report.page_pictures import (
 )
 from mgs.report.page_plots import METRIC_NAMES, line_plot, orbit_plot, timing_plot, views_plot
 from mgs.report.runs import RunFiles, compare_runs, least_trained, step_curves
+from mgs.report.writing import shown_view
 
 COMPARED = 6
 """Most views of the dataset, and most test views, on which truth and renders are compared."""
@@ -132,11 +133,17 @@ def draw_pictures(
 
 def compared_frames(runs: Sequence[RunFiles], dataset: Dataset) -> list[Frame]:
     """Frames on which the page compares truth and renders: up to COMPARED that the fewest runs were
-    trained on, spread evenly, and as many test views, named `test/NAME`."""
+    trained on, spread evenly, and as many test views, named `test/NAME`. Of measured runs the first
+    is that of median PSNR (`shown_view`)."""
     there = dataset.with_images({dataset.frames[i].name for run in runs for i in run.taken})
     pool, tests = least_trained(runs, dataset, there), dataset.test_views()
     frames = () if tests is None else tests.frames
-    return [*_spread(pool), *_spread([replace(f, name=f"test/{f.name}") for f in frames])]
+    views = [*_spread(pool), *_spread([replace(f, name=f"test/{f.name}") for f in frames])]
+    if not views or any(run.measured is None for run in runs):
+        return views
+    first, of = shown_view(runs, dataset)
+    first = replace(first, name=f"test/{first.name}") if of == "test_views" else first
+    return [first, *(view for view in views if view.name != first.name)]
 
 
 def _spread(frames: Sequence[Frame]) -> list[Frame]:

@@ -17,7 +17,7 @@ from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.page_plots import METRIC_NAMES
 from mgs.report.runs import RunFiles, up_of
 from mgs.report.tables import table_cell, table_columns, table_heading, table_row
-from mgs.run.ending import fit_line, why_ended
+from mgs.run.ending import RunEnd, fit_line, why_ended
 from mgs.run.folder import read_checkpoint
 from mgs.splat_ply import read_ply
 
@@ -68,8 +68,9 @@ def _notes(run: RunFiles, drawn: bool) -> list[str]:
             f"Unfinished: {taken} of {planned} views are taken; "
             f"`mgs nbv --resume {run.folder}` goes on."
         ]
-    else:
-        notes = [f"The run has ended: {why_ended(run.ended)}."]
+    else:  # a spent budget is no news
+        spent = run.ended["reason"] == RunEnd.BUDGET
+        notes = [] if spent else [f"The run has ended: {why_ended(run.ended)}."]
     if run.metrics is None:
         notes.append(f"Not measured: `mgs eval {run.folder}` adds its PSNR and SSIM.")
     elif run.measured is None:

@@ -1,10 +1,8 @@
 """Pictures of the report page: truth, render, error and uncertainty of views, small enough for a
 page.
 
-They show the model that a run folder holds now: that of its last finished step, or without a
-checkpoint its gaussians.ply. A run keeps no models of earlier steps. The maps of uncertainty do
-change from step to step: they are by the exact Fisher information, at that model, of the views
-taken until then.
+They show the model that a run folder holds now; a run keeps none of earlier steps. The maps of
+uncertainty are by the exact Fisher information, at that model, of the views taken until then.
 """
 
 from __future__ import annotations

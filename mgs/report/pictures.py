@@ -50,8 +50,7 @@ def draw_views(
 
 
 def file_names(paths: Sequence[str]) -> list[str]:
-    """File names without suffix for image paths: their own, with a number before them if some are
-    equal."""
+    """File names without suffix for image paths; numbered if some are equal."""
     stems = [Path(path).stem for path in paths]
     if len(set(stems)) == len(stems):
         return stems

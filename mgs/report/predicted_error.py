@@ -1,9 +1,8 @@
 """Predicted errors of a run in views that it has not seen, and how true the predictions are: `mgs
 diagnose RUN --calibrate`.
 
-The posterior of the parameters alone, N(0, sigma^2 / (H + lambda)), says how noise in the images
-moves the render. It does not say what no parameters of this model can draw. So the predicted
-variance of a pixel and channel has three terms:
+The posterior of the parameters, N(0, sigma^2 / (H + lambda)), does not say what no parameters of
+this model can draw. So the predicted variance of a pixel and channel has three terms:
 
 - `parameters`: J diag(sigma^2 / (H + lambda)) J^T, the variance that the parameters bring;
 - `residual`: the mean squared error that each Gaussian showed in its training views, blended as
@@ -47,8 +46,7 @@ from mgs.splat import ListCache, as_drjit, fisher, groups, jvp, render
 Array = NDArray[np.floating]
 
 DRAWS = 32
-"""Draws from the posterior. The standard deviation of a variance estimated from 32 is a quarter of
-it."""
+"""Draws from the posterior, which give a variance within a quarter."""
 
 FOLDS = 3
 """Parts of a run's views; each is predicted by a model that was fitted to the others."""

@@ -19,8 +19,14 @@ from mgs.files import read_json, reading
 from mgs.policy.from_file import label
 from mgs.report.figures import Curves
 from mgs.run.ending import RunEnd
-from mgs.run.folder import check_frames, check_same_frames, open_run, read_config
-from mgs.run.lines import check_line, frames_of
+from mgs.run.folder import (
+    check_frames,
+    check_line,
+    check_same_frames,
+    frames_of,
+    open_run,
+    read_config,
+)
 from mgs.run.settings import validated
 
 
@@ -143,8 +149,7 @@ def read_metrics(folder: Path) -> dict[str, Any] | None:
 
 
 def _read_steps(folder: Path) -> list[dict[str, Any]]:
-    """Read steps.jsonl. Raises InputError if it is missing, or with the number of a damaged
-    line."""
+    """Read steps.jsonl. Raises InputError if it is missing or damaged."""
     path, resume = folder / "steps.jsonl", f"`mgs nbv --resume {folder}`"
     if not path.is_file():
         raise InputError(
@@ -232,8 +237,7 @@ def compare_runs(folders: Sequence[str | PathLike[str]]) -> Comparison:
 
 
 def step_curves(runs: Mapping[str, RunFiles], key: str, factor: float = 1.0) -> Curves:
-    """A number of the steps of each run, times a factor, against the number of images; without runs
-    that have none."""
+    """A number of the steps of each run that has it, against the number of images."""
     curves = {}
     for name, run in runs.items():
         points = [(s["images"], factor * s[key]) for s in run.steps if s.get(key) is not None]

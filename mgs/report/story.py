@@ -1,7 +1,6 @@
 """The story of a run: the model after each view, with the camera that took it and what is unknown.
 
-A run keeps only its last model, so the fits are done again, view by view, from the prior on. From
-the seeds on they are those of a run that takes one view at a time.
+A run keeps only its last model, so the fits are done again, view by view, from the prior on.
 """
 
 from __future__ import annotations
@@ -32,8 +31,7 @@ DPI = 110
 
 
 def models(run: Run, progress: Progress) -> Iterator[Fitted]:
-    """Fit the run's views again, one more each time; yield every model. Raises InputError as
-    `problem_of` and `learn`."""
+    """Fit the run's views again, one more each time; yield every model."""
     problem = problem_of(run, progress, run.settings.policy)
     taken, seeds = run.state.taken, run.settings.seeds
     before: Fitted | None = None

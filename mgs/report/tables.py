@@ -31,8 +31,7 @@ COLUMNS = {
     "path": "path ({unit})",
     "ended": "ended by",
 }
-"""Columns of the table: key in a row of `comparison_rows` -> heading. `table_columns` leaves out
-those that no row needs."""
+"""Columns of the table: key in a row of `comparison_rows` -> heading."""
 
 
 def comparison_rows(compared: Comparison) -> list[dict[str, Any]]:
@@ -76,8 +75,7 @@ def metrics_row(label: str, metrics: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Keys of COLUMNS of which some row has a value, in order. A fitted exposure is left out if no
-    run estimated exposure."""
+    """Keys of COLUMNS of which some row has a value, in order."""
     exposure = any(row.get("exposure") for row in rows)
     return [
         key

@@ -27,6 +27,13 @@ from mgs.report.runs import (
 from mgs.report.tables import comparison_rows, markdown_table
 from mgs.splat_ply import read_ply
 
+FIGURES = ("orbit", "gain", "coverage", "comparison", "psnr")
+
+
+def report_files(kind: str) -> list[str]:
+    """Names of the files of a report; the last figure is only in some."""
+    return [*(f"{name}.{kind}" for name in FIGURES), "table.md", "table.json"]
+
 
 def write_report(
     out: str | Path, runs: Sequence[str | PathLike[str]] | Comparison, kind: str = "png"
@@ -52,7 +59,7 @@ def write_report(
         check_measured(run)
     out, dataset = Path(out), compared.dataset
     frame, truth, renders, captions = _comparison(compared)
-    paths = {name: out / f"{name}.{kind}" for name in ("orbit", "gain", "coverage", "comparison")}
+    paths = {name: out / f"{name}.{kind}" for name in FIGURES[:-1]}
 
     first = next(iter(compared.runs.values()))
     positions = np.array([frame.camera.position for frame in dataset.frames])
@@ -123,8 +130,7 @@ def shown_view(runs: Sequence[RunFiles], dataset: Dataset) -> tuple[Frame, str]:
 
 
 def _median_view(runs: Sequence[RunFiles], frames: Sequence[Frame], views: str) -> Frame:
-    """The frame of median PSNR, mean over the runs; of an even number, the better of two. views:
-    key of metrics.json that lists them."""
+    """The frame of median PSNR, mean over the runs, by the key `views` of metrics.json."""
     measured = [{v["name"]: v["psnr"] for v in (run.metrics or {}).get(views, [])} for run in runs]
 
     def mean_psnr(frame: Frame) -> float:
@@ -147,8 +153,7 @@ def _caption(run: RunFiles, views: str, name: str) -> str:
 
 
 def _psnr_panels(runs: Mapping[str, RunFiles], every: str) -> dict[str, figures.Curves]:
-    """Panels of `psnr_figure`: over the test views, or else over all views, which are called
-    `every`. Empty if a run was measured on neither."""
+    """Panels of `psnr_figure`, over the test views or else `every`; empty without PSNR."""
     for prefix, views in (("test_", "test views"), ("", every)):
         panels = {
             f"PSNR, {views}": step_curves(runs, f"{prefix}psnr"),

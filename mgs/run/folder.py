@@ -34,6 +34,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict
 
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame
@@ -45,12 +46,18 @@ from mgs.notebook import cloud, html, thumbnails
 from mgs.policy.from_file import label
 from mgs.prior.build import Prior, load_prior
 from mgs.provenance import versions
-from mgs.run.lines import check_line, frames_of
+from mgs.run.ending import RunEnd
 from mgs.run.settings import NbvSettings, check_settings, validated
 from mgs.run.state import State
 from mgs.splat_ply import read_ply, write_ply
 
 POLICY_SOURCE = "policy.py"
+
+FILES = [
+    *("config.json", "checkpoint.npz", "steps.jsonl", "metrics.json", "gaussians*", POLICY_SOURCE),
+    *("prior", "dataset", "renders", "diagnostics", "tensorboard", "export.*", "video.*"),
+]
+"""Names in the folder of a run, with what commands add to it."""
 
 DATASET = "dataset"
 """Folder of a run that holds its dataset, where the run captures images (`mgs nbv --capture`)."""
@@ -204,11 +211,6 @@ def holds_run(out: Path) -> bool:
     return True
 
 
-def read_settings(out: Path) -> NbvSettings:
-    """Settings of a run folder. Raises InputError as `open_run`."""
-    return open_run(out).settings
-
-
 def check_same_frames(out: Path, dataset: Dataset) -> None:
     """Raises InputError where the dataset has other frames than the run was started on."""
     if read_config(out).get("frames") != [frame.name for frame in dataset.frames]:
@@ -304,3 +306,53 @@ def check_frames(path: Path, taken: Sequence[int], count: int) -> None:
     """Raises InputError where frames taken, as a file says, are not among this number."""
     if not all(0 <= frame < count for frame in taken):
         raise InputError(f"{path}: takes frames beyond the {count} of the run; start the run anew")
+
+
+class _Checked(BaseModel):
+    model_config = ConfigDict(allow_inf_nan=False)
+
+
+class _Ended(_Checked):
+    reason: RunEnd
+    views: int
+    name: str = ""
+    limit: float = 0.0
+    uncertainty: float = 0.0
+    information_gain: float = 0.0
+    metres: float = 0.0
+
+
+class _Line(_Checked):
+    """Keys of every line, and the types of optional ones."""
+
+    images: int
+    coverage: float
+    ended: _Ended | None = None
+    step: int = 0
+    name: str | None = None
+    warnings: list[str] = []
+    seconds: dict[str, float] = {}
+    exposure: dict[str, list[float]] | None = None
+
+
+class _SeedLine(_Line):
+    """The first line, which is about the seeds."""
+
+    seeds: list[int]
+
+
+class _ChoiceLine(_Line):
+    """Any other line, which is about one chosen view."""
+
+    frame: int
+    information_gain: float
+
+
+def check_line(number: int, line: Any) -> None:
+    """Raises ValueError (pydantic's ValidationError) where a line, counted from 1, is damaged."""
+    (_SeedLine if number == 1 else _ChoiceLine).model_validate(line)
+
+
+def frames_of(lines: Sequence[dict[str, Any]]) -> list[int]:
+    """Indices of the frames taken, by checked lines: seeds, then chosen ones."""
+    return [*lines[0]["seeds"], *(int(line["frame"]) for line in lines[1:])]

@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from mgs.run.settings import NbvSettings
 
 DECIMALS = 9
-"""Decimals of poses (metres, cosines) and intrinsics (pixels): the last bits of an inverse matrix
-differ between machines."""
+"""Decimals of poses and intrinsics: their last bits differ between machines."""
 
 
 def array_digest(arrays: Iterable[np.ndarray]) -> str:

@@ -1,8 +1,8 @@
 """Live capture: a pose goes out as a JSON file, and a picture of it comes back.
 
-Of a run, RUN/dataset has the poses (transforms.json), the pictures taken, undistorted, with masks
-(of the prior where none came), and captured/NAME.json, the record that is written last. What was
-received lies in RUN/dataset/flight, or in the watched folder; what was refused is renamed there.
+RUN/dataset has the poses (transforms.json), the pictures taken, undistorted, with masks, and
+captured/NAME.json, the record that is written last. What was received lies in RUN/dataset/flight or
+the watched folder; what was refused is renamed there.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mgs.camera import Camera, opengl_from_opencv
+from mgs.colour import srgb_from_linear
 from mgs.data.dataset import FILES, Dataset, intrinsics, load_dataset, read_records
 from mgs.data.frames import Frame, as_captured, capture_record
 from mgs.data.importers import import_shot, silhouette_of
@@ -25,7 +26,6 @@ from mgs.data.up import Up, upright
 from mgs.errors import InputError, Notice
 from mgs.files import read_json, write_json
 from mgs.prior.build import Prior
-from mgs.run.photograph import check_photograph
 from mgs.run.transports import Transport, answers, picture
 
 CONVENTION = (
@@ -42,6 +42,16 @@ REACH = 0.25
 
 DEPTH_UNIT = 1e-3
 """Metres in a step of a PNG depth image."""
+
+WHITE, MOST_WHITE = 254 / 255, 0.5
+"""A pixel is white from this sRGB value on; largest share of the object that may be."""
+
+BLACK, MOST_BLACK = 2 / 255, 0.95
+"""The same of black. Shadows on the Moon are black."""
+
+MOST_BLUR = 0.6
+"""Largest blur by Crete et al. (2007), 0 to 1 (`skimage.measure.blur_effect`). Sharp pictures have
+0.12 to 0.37, the same blurred by 11 pixels of motion 0.6 to 0.7; tiny ones never reach it."""
 
 
 @dataclass(frozen=True)
@@ -226,3 +236,22 @@ def _set_aside(out: Path) -> None:
     number = 1 + max((int(name.split(".")[0]) for name in names if name[:1].isdigit()), default=0)
     for end, path in answers(out).items():
         path.rename(out.with_name(f"{out.stem}.refused-{number}{end}"))
+
+
+def check_photograph(frame: Frame) -> None:
+    """Raises InputError where an image does not show the object, is black or white, or blurred."""
+    from skimage.measure import blur_effect
+
+    mask, path = frame.mask(), frame.image_path.name
+    if not mask.any():
+        raise InputError(f"{path}: the object is not in the picture")
+    grey = srgb_from_linear(frame.rgb()).mean(axis=-1)
+    for name, share, most in (
+        ("over", float((grey[mask] >= WHITE).mean()), MOST_WHITE),
+        ("under", float((grey[mask] <= BLACK).mean()), MOST_BLACK),
+    ):
+        if share > most:
+            raise InputError(f"{path}: {name}exposed, {100 * share:.0f} % of the object")
+    blur = float(blur_effect(grey)) if np.ptp(grey) > 0 else 0.0
+    if blur > MOST_BLUR:
+        raise InputError(f"{path}: blurred ({blur:.2f}, at most {MOST_BLUR})")

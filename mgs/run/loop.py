@@ -54,8 +54,7 @@ def select_views(
 
 
 def finished(problem: Problem, state: Fitted) -> bool:
-    """Whether the budget is spent, no view is in reach, or no more than `stop_uncertainty` of the
-    variance is left."""
+    """Whether the budget, the poses in reach or the uncertainty is used up."""
     settings = problem.settings
     if len(state.taken) - settings.seeds >= settings.budget:
         return True

@@ -12,14 +12,14 @@ from scipy.spatial import cKDTree
 from mgs import runtime
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError, row_named
-from mgs.files import atomic_folder, reading
+from mgs.files import THERE, Ours, atomic_folder, reading
 from mgs.policy.from_file import in_file, is_function, label, name_of, source_of
 from mgs.policy.registry import policy_of
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.photographs import source_of as source_of_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run import recording
-from mgs.run.folder import DATASET, POLICY_SOURCE, Run, holds_run, open_run, start
+from mgs.run.folder import DATASET, FILES, POLICY_SOURCE, Run, holds_run, open_run, start
 from mgs.run.live import Live, begin
 from mgs.run.operations import operations_of
 from mgs.run.problem import Problem, Progress, no_progress
@@ -59,10 +59,8 @@ def run_nbv(
     progress: Progress = no_progress,
     **settings: Any,
 ) -> Run:
-    """Choose views one by one, as the paper does: `start_run`, then `resume_nbv`.
-
-    dataset, out, settings: as `start_run`. Callbacks, result and errors: as `resume_nbv`.
-    """
+    """Choose views one by one, as the paper does: `start_run`, then `resume_nbv`, with their
+    arguments and errors."""
     run = start_run(dataset, out, progress=progress, **settings)
     return resume_nbv(run, on_step, progress, run.policy, settings.get("live"))
 
@@ -77,6 +75,7 @@ def start_run(
     gaussians: int | Literal["auto"] | None = None,
     preset: str | None = None,
     loose: float = 1.0,
+    force: bool = False,
     progress: Progress = no_progress,
     **settings: Any,
 ) -> Run:
@@ -91,7 +90,7 @@ def start_run(
     preset: a row of `PRESETS`, defaults of what is not given. settings: fields of `NbvSettings`;
     `policy` may be a function with arguments as in docs/howto/policy.md, whose source is kept in
     the run. By default the budget is 50 views or all candidates, and alpha_weight is ALPHA_WEIGHT,
-    or 0 where frames have neither mask nor alpha.
+    or 0 where frames have neither mask nor alpha. force: replace a run that is there.
 
     Leaves no folder behind where it fails. Raises InputError where the folder is not empty, a
     setting is invalid, the dataset is too small, an input is missing or damaged, or the cameras are
@@ -100,9 +99,8 @@ def start_run(
     out = Path(out)
     if (dataset is None) == (capture is None):
         raise InputError("nbv: give either a DATASET or --capture SCENE")
-    if holds_run(out):
-        resume = f"`mgs nbv --resume {out}` continues it"
-        raise InputError(f"{out}: holds a run; {resume}; for another, choose a new folder")
+    if holds_run(out) and not force:
+        raise InputError(f"{out}: a run {THERE}; `mgs nbv --resume {out}` continues it")
     given = dataset if isinstance(dataset, Dataset) else None
     root = given.root if given else out / DATASET if dataset is None else Path(str(dataset))
     if prior is not None and gaussians is not None:
@@ -128,7 +126,8 @@ def start_run(
     scores = policy_of(policy)  # a user's policy fails here, before there is a folder
     check_settings(complete, count)
     found = load_prior(prior) if isinstance(prior, str | Path) else prior
-    with atomic_folder(out) as unfinished:
+    read = [path for path in (root if capture is None else None, prior) if isinstance(path, Path)]
+    with atomic_folder(out, Ours(FILES, read) if holds_run(out) else None) as unfinished:
         frames = loaded or _poses(unfinished / DATASET, str(capture), complete.seed, progress)
         built = found or _built_prior(frames, gaussians, row, complete.seed, progress)
         if not isinstance(prior, str | Path):

@@ -109,8 +109,7 @@ class Case:
         return [*cells, Cell(self.prior_name, f"{__name__}:make_prior", arguments, needs)]
 
     def with_task(self, name: str, task: str, alone: bool = False, **arguments: Any) -> list[Cell]:
-        """The cells above, and last a cell of a task that gets their folders and these
-        arguments."""
+        """The cells above, and last a cell of a task that gets their folders."""
         cells = self.cells()
         needs = tuple(cell.name for cell in cells)
         return [*cells, Cell(name, task, {**self.folders, **arguments}, needs, alone)]

@@ -2,9 +2,8 @@
 held to a surface.
 
 The same: free means, SH degree 3, Adam with their learning rates, no prior, and 15,000 steps at the
-paper's size. Different: the fit starts on the prior's surface in the colours of all images. It adds
-and removes no Gaussians, and minimises the squared error instead of L1 and SSIM. All rates fall to
-a tenth.
+paper's size. Different: the fit starts on the prior's surface, adds and removes no Gaussians, and
+minimises the squared error instead of L1 and SSIM. All rates fall to a tenth.
 """
 
 from __future__ import annotations
@@ -40,8 +39,7 @@ MEAN_RATE = 1.6e-4
 def time_free_fit(
     root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
 ) -> dict[str, Any]:
-    """Fit to all images of a dataset in a new process; returns what `mgs.study.case.time_policy`
-    does, without a choice."""
+    """Fit to all images in a new process; returns as `time_policy`, without a choice."""
     return in_new_process(_free_fit, out, root / dataset, root / prior, settings["seed"])
 
 

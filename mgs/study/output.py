@@ -44,8 +44,7 @@ def text_of(cell: Content, row: Row) -> str:
 
 
 def with_interval(row: Row, key: str) -> str:
-    """A difference and its 95 % interval (entries KEY_low, KEY_high), where there is one; a dash
-    without the difference."""
+    """A difference and its 95 % interval (KEY_low, KEY_high), if there is one."""
     if row.get(key) is None:
         return "–"
     if row[f"{key}_low"] is None:
@@ -92,8 +91,7 @@ COLUMNS = 3
 
 
 def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row]) -> None:
-    """Draw the panels that have rows into one figure; panels with the same groups share a legend.
-    Raises InputError if the file cannot be written."""
+    """Draw the panels that have rows; panels with the same groups share a legend."""
     import matplotlib
 
     drawn = [(panel, chosen) for panel in panels if (chosen := _rows_of(panel, rows))]
@@ -184,8 +182,7 @@ def _size(panel: Panel, rows: Sequence[Row]) -> tuple[float, float]:
 
 
 def group_styles(groups: Sequence[Any]) -> list[dict[str, Any]]:
-    """Keywords for matplotlib: policies as in all figures, other groups in the order of the same
-    table."""
+    """Keywords for matplotlib: policies as in all figures, else in that order."""
     of_policies = all(group in POLICY_STYLE for group in groups)
     looks = [POLICY_STYLE[one] for one in groups] if of_policies else cycle(POLICY_STYLE.values())
     pairs = zip(groups, looks, strict=False)

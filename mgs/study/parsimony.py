@@ -104,8 +104,7 @@ Fixed = tuple[str, int | str, str, int]
 
 
 def fixed_choices(size: ParsimonySize) -> list[Fixed]:
-    """Fixed choices; the fit with the automatic number, all kinds and degree 0 is among the last
-    two."""
+    """Fixed choices of number, kinds and degree, one factor at a time."""
     choices: list[Fixed] = [(NUMBER, n, ALL, 0) for n in size.counts]
     choices += [(KINDS, AUTO, learned, 0) for learned in LEARNED]
     return choices + [(DEGREE, AUTO, ALL, degree) for degree in DEGREES]
@@ -116,8 +115,7 @@ def _fit_name(scene: str, gaussians: int | str, learned: str, degree: int) -> st
 
 
 def cells_of(size: ParsimonySize) -> list[Cell]:
-    """Cells of each scene: dataset, priors, fits, and the fit of `mgs refit`. All fits report
-    seconds."""
+    """Cells of each scene: dataset, priors, fits, and the fit of `mgs refit`."""
     cells: list[Cell] = []
     shared: dict[str, Any] = {"alone": True, "views": size.views, "seeds": size.seeds}
     for scene in size.scenes:
@@ -321,8 +319,7 @@ def run_study(
 
 
 def draw(path: Path, rows: Sequence[Row]) -> None:
-    """Draw PSNR against the number of parameters, a panel for each scene. Raises InputError if the
-    file cannot be written."""
+    """Draw PSNR against the number of parameters, a panel for each scene."""
     label, axes = "PSNR inside the rock (dB)", ("parameters", "psnr_inside")
     panels = [
         Panel(*axes, "learned parameters", label, "choice", True, (("run", scene),), scene)

@@ -227,8 +227,7 @@ def results_of(only: str | None) -> list[str]:
 
 
 def rocks_of(name: str, size: ReproduceSize, asked: int | None) -> int:
-    """Number of rocks of a result. asked: of the option --rocks. Raises InputError if out of
-    range."""
+    """Number of rocks of a result, asked for or default. Raises InputError if out of range."""
     result = RESULTS[name]
     if asked is None or result.rocks is None:
         return result.count(size)

@@ -22,8 +22,7 @@ from mgs.study.verdict import Row
 Rows = list[Row]
 
 PAPER_TABLE = (("D-Optimal NBV", 54, 25.97, 0.9654), ("Coverage-Greedy", 50, 26.06, 0.9648))
-"""Table I of the paper: method, images, PSNR in dB and SSIM over all 100 views of its own rock,
-which is not ours."""
+"""Table I of the paper, on its own rock: method, images, PSNR in dB, SSIM."""
 
 TABLE_COLUMNS = {
     "policy": "row",

@@ -116,12 +116,10 @@ def run_cells(
 ) -> Results:
     """Do all cells in the order of their needs, and return their results.
 
-    workers: number of processes. One: this process does all cells. More: independent cells run at
-    the same time and share the cores of this machine. scheduler: address of a Dask scheduler whose
-    workers are used instead. They must see `root` under the same path and have one thread each,
-    because a cell is parallel in itself. Raises what a cell raises; InputError if the scheduler
-    does not answer, has no worker, or a worker with several threads, and if a cell's worker is
-    killed repeatedly. Finished cells are kept.
+    workers: number of processes, which share the cores; one: this process. scheduler: address of a
+    Dask scheduler whose workers are used instead; they must see `root` under the same path and have
+    one thread each. Raises what a cell raises; InputError if the scheduler does not answer or its
+    workers do not fit, and if a cell's worker is killed repeatedly. Finished cells are kept.
     """
     root = root.resolve()  # workers may have another current folder
     by_name = {cell.name: cell for cell in cells}

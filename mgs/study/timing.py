@@ -1,8 +1,7 @@
 """Times that can be compared although the machine is busy with other work.
 
-Each timed call follows a fixed piece of work, the *reference*, in the same process. What slows the
-machine slows both, so the median of their ratios stays the same. Charts show seconds: the ratio
-times the median seconds of the reference over the whole study.
+Each timed call follows a fixed piece of work, the *reference*. What slows the machine slows both.
+Charts show seconds: the median ratio times the reference's median seconds over the whole study.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ def _reference() -> Callable[[], Any]:
     runtime.start()
     import mitsuba as mi
 
-    from mgs.bench.core import gradient, surface_camera, surface_gaussians
+    from mgs.bench import gradient, surface_camera, surface_gaussians
     from mgs.splat import ListCache, as_drjit
 
     gaussians, cache = surface_gaussians(REFERENCE_GAUSSIANS), ListCache()
@@ -85,8 +84,7 @@ def timed(
 
 
 def with_seconds(rows: Iterable[Row], unit: float) -> list[Row]:
-    """Rows with seconds, seconds_low and seconds_high: their ratios times the seconds of the
-    reference."""
+    """Rows with seconds, seconds_low and seconds_high: ratio times `unit`."""
     ends = ("", "_low", "_high")
     return [row | {f"seconds{end}": row[f"ratio{end}"] * unit for end in ends} for row in rows]
 

@@ -1,9 +1,8 @@
 """Claims and verdicts: one rule for all studies.
 
 A claim states on which side of a bound the mean of an effect lies. It *holds* if the whole 95 %
-interval of the mean (Student's t, over independent runs) lies on that side, *fails* if it lies on
-the other side, and otherwise *depends* on rock, views or chance. Fewer than two runs have no
-interval, so their verdict is `depends`.
+interval of the mean (Student's t, over independent runs) lies there, *fails* if it lies on the
+other side, and otherwise, and for fewer than two runs, *depends* on rock, views or chance.
 """
 
 from __future__ import annotations

@@ -33,8 +33,7 @@ DROP_OUT = (np.radians(65.0), np.radians(85.0))
 between. Chosen constants."""
 
 SIGMA_FROM_MAD = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution: robust noise
-estimates use the median."""
+"""Standard deviation over median absolute deviation of a normal distribution."""
 
 
 def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:

@@ -17,11 +17,13 @@ from mgs.errors import InputError
 from mgs.seeds import generator
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD, noisy_depth
 from mgs.survey.fusion import focus
-from mgs.survey.odometry import agrees, chain, drifting_odometry
 from mgs.survey.registration import (
     CLOSURE_OVERLAP,
     GRID,
     Edge,
+    agrees,
+    chain,
+    drifting_odometry,
     loop_candidates,
     optimise,
     register,
@@ -129,21 +131,15 @@ def fly(
 def trajectory_error(poses: np.ndarray, truth: np.ndarray) -> dict[str, float]:
     """Absolute trajectory error (Sturm et al. 2012) of poses [F,4,4] against true ones [F,4,4].
 
-    ate_rms, ate_max: distance of the positions, metres; rotation_rms: degrees; aligned_rms: as
-    ate_rms, after the rigid motion that aligns the trajectories best (Umeyama 1991).
+    ate_rms, ate_max: distance of the positions, metres; rotation_rms: degrees.
     """
     offset = np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1)
     turn = np.einsum("fki,fkj->fij", poses[:, :3, :3], truth[:, :3, :3])
     angle = np.degrees(np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)))
-    a, b = poses[:, :3, 3] - poses[:, :3, 3].mean(0), truth[:, :3, 3] - truth[:, :3, 3].mean(0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    aligned = np.linalg.norm(a @ rotation - b, axis=1)
     return {
         "ate_rms": float(np.sqrt(np.mean(offset**2))),
         "ate_max": float(offset.max()),
         "rotation_rms": float(np.sqrt(np.mean(angle**2))),
-        "aligned_rms": float(np.sqrt(np.mean(aligned**2))),
     }
 
 
@@ -152,8 +148,8 @@ def survey_numbers(dataset: Dataset, survey: Survey, settings: SurveySettings) -
 
     path_length: of the flight; depth_error_on_rock: robust standard deviation of the depth error in
     the rock's masks; returns_lost: share of pixels with true depth and no measured one;
-    steps_by_odometry: number of failed registrations; registration_overlap: of every step; loops:
-    [i, j, overlap] each; error: `trajectory_error` of each of the STAGES.
+    steps_by_odometry: number of failed registrations; loops: [i, j, overlap]
+    each; error: `trajectory_error` of each of the STAGES.
     """
     error, returns, possible = [], 0, 0
     for frame, measured in zip(dataset.frames, survey.depths, strict=True):
@@ -168,7 +164,6 @@ def survey_numbers(dataset: Dataset, survey: Survey, settings: SurveySettings) -
         "depth_error_on_rock": SIGMA_FROM_MAD * float(np.median(np.abs(np.concatenate(error)))),
         "returns_lost": 1 - returns / max(possible, 1),
         "steps_by_odometry": sum(not edge.registered for edge in survey.edges),
-        "registration_overlap": [edge.overlap for edge in survey.edges],
         "loops": [[edge.i, edge.j, edge.overlap] for edge in survey.loops],
         "error": {name: trajectory_error(getattr(survey, name), survey.truth) for name in STAGES},
     }

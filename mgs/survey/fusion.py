@@ -46,8 +46,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Focus:
-    """Point that the cameras look at, [3] world, metres, and their median distance from it,
-    metres."""
+    """Point that the cameras look at [3], and their median distance from it, metres."""
 
     point: np.ndarray
     distance: float

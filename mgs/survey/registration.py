@@ -1,8 +1,8 @@
 """Registration: relative poses of a flight's cameras from their depth images.
 
-Point clouds of two frames are aligned (GICP), frames that see the same place again are found (loop
-closure), and all relative poses are reconciled (pose graph). Poses are [4,4] camera-to-world,
-metres.
+Clouds of two frames are aligned (GICP), loops are closed, and all relative poses are reconciled
+(pose graph). Odometry that drifts gives the first guess. Poses are [4,4] camera-to-world, metres; a
+step is the pose of the next camera in the axes of the one before.
 """
 
 from __future__ import annotations
@@ -12,17 +12,16 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from mgs.camera import Camera
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.survey.depth_sensor import depth_noise, filter_depth
 from mgs.survey.fusion import usable_depth
-from mgs.survey.odometry import step_deviation
 
 GRID = 0.007
-"""Cell of the grid on which a frame's points are averaged, over the cameras' distance from what
-they look at: 3 cm at 4 m."""
+"""Cell of the grid of a frame's points, over the cameras' distance: 3 cm at 4 m."""
 
 MATCH = 4.0
 """Largest distance between matched points, grid cells."""
@@ -36,8 +35,7 @@ move with the camera and pull every measured motion towards zero: with them, the
 twenty times larger."""
 
 RANGE = 1.6
-"""Largest depth used, over the lower quartile of the frame's depths: noise and steps grow with
-depth."""
+"""Largest depth used, over the lower quartile of the frame's depths."""
 
 CLOSURE_GAP = 5
 """Fewest steps between two frames that close a loop."""
@@ -51,6 +49,18 @@ CLOSURE_DRIFT = 0.02
 
 CLOSURE_OVERLAP = 0.5
 """Least share of a frame's points that must match for a loop."""
+
+
+DRIFT_SCALE, DRIFT_YAW = 0.01, np.radians(0.3)
+"""Bias of every step: relative error of translations, and yaw about the vertical, radians."""
+
+DRIFT_SHAKE, DRIFT_TURN = 0.01, np.radians(0.2)
+"""Random errors of each step, standard deviations per axis: of the translation over the step's
+length, and of the rotation, radians. Visual-inertial odometry drifts by about one per cent of the
+way (Delmerico and Scaramuzza, ICRA 2018, table III)."""
+
+TRUST = 5.0
+"""Largest accepted difference from odometry, in its standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -170,3 +180,51 @@ def optimise(
         graph.add(gtsam.BetweenFactorPose3(edge.i, edge.j, gtsam.Pose3(edge.relative), noise))
     result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     return np.stack([result.atPose3(k).matrix() for k in range(len(initial))])
+
+
+def drifting_odometry(truth: np.ndarray, drift: float, rng: np.random.Generator) -> np.ndarray:
+    """Steps [F-1,4,4] that odometry reports for a flight along poses `truth` [F,4,4].
+
+    drift: factor on all errors; 0 gives the true steps.
+    """
+    steps = np.linalg.inv(truth[:-1]) @ truth[1:]
+    measured = steps.copy()
+    vertical = truth[1:, 2, :3]  # the world's +Z in the axes of the later camera
+    turn = DRIFT_YAW * vertical + DRIFT_TURN * rng.standard_normal((len(steps), 3))
+    measured[:, :3, :3] = steps[:, :3, :3] @ Rotation.from_rotvec(drift * turn).as_matrix()
+    length = np.linalg.norm(steps[:, :3, 3], axis=1, keepdims=True)
+    shake = DRIFT_SHAKE * length * rng.standard_normal((len(steps), 3))
+    measured[:, :3, 3] = (1 + drift * DRIFT_SCALE) * steps[:, :3, 3] + drift * shake
+    return measured
+
+
+def chain(first: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Poses [F,4,4] from the first pose [4,4] and the steps [F-1,4,4]."""
+    poses = [first]
+    for step in steps:
+        poses.append(poses[-1] @ step)
+    return np.stack(poses)
+
+
+def step_deviation(step: np.ndarray, drift: float) -> tuple[float, float]:
+    """Standard deviations of odometry in one step [4,4]: rotation, radians, and translation,
+    metres.
+
+    Biases count as if they were standard deviations.
+    """
+    length = float(np.linalg.norm(step[:3, 3]))
+    return drift * (DRIFT_YAW + DRIFT_TURN), drift * (DRIFT_SCALE + DRIFT_SHAKE) * length
+
+
+def agrees(measured: np.ndarray, odometry: np.ndarray, drift: float, grid: float) -> bool:
+    """Whether a measured step [4,4] is within TRUST standard deviations of odometry's [4,4].
+
+    The limits are widened by the error of a measurement: half a degree, and one cell of the
+    registration's grid, `grid` metres.
+    """
+    difference = np.linalg.inv(odometry) @ measured
+    turn = np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1))
+    turn_deviation, shift_deviation = step_deviation(odometry, drift)
+    turn_limit = TRUST * turn_deviation + np.radians(0.5)
+    shift_limit = TRUST * shift_deviation + grid
+    return bool(np.linalg.norm(difference[:3, 3]) < shift_limit and turn < turn_limit)

@@ -13,8 +13,7 @@ REACH = 400.0
 """Half the side of the square terrain, metres; its edge looks like the horizon."""
 
 ROWS = 480
-"""Vertices along one side of the terrain, about 3 cm apart near the rock and metres at the horizon.
-"""
+"""Vertices along one side of the terrain, about 3 cm apart near the rock."""
 
 TILE = 4.0
 """Side of the regolith's texture tile, metres."""
@@ -61,8 +60,7 @@ def make_ground(
 
 
 def regolith(settings: Arena, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Two seamless texture tiles, linear RGB [TEXELS,TEXELS,3]: fine pale dust, and darker coarse
-    grains."""
+    """Two seamless tiles, linear RGB [TEXELS,TEXELS,3]: pale dust, and darker grains."""
     fine, soft, tint = (tile(TEXELS, exponent, rng) for exponent in (0.35, 1.1, 1.3))
     grains = np.clip(tile(TEXELS, 0.2, rng, shortest=4) - 1.4, 0, 1)
     colour = np.asarray(settings.colour, np.float32)

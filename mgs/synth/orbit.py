@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     import trimesh
 
 EVALUATION_ELEVATIONS = (5.0, 75.0)
-"""Elevations of the test views above the rock's middle, degrees: from just over the stones on the
-ground to steeply down on the rock."""
+"""Elevations of the test views above the rock's middle, degrees."""
 
 
 def intrinsics(fov: float, width: int, height: int) -> np.ndarray:

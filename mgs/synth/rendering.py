@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -131,7 +130,7 @@ def synthesise(
     by another process, the mesh is bad, or the rock is not wholly in every view or is hidden.
     """
     runtime.start()
-    started, out = time.perf_counter(), Path(out)
+    out = Path(out)
     settings = scene if isinstance(scene, SceneFile) else load_scene_file(scene)
     preset = row_named(PRESETS, preset, "preset") if isinstance(preset, str) else preset
     denoise = importlib.util.find_spec("pyoidn") is not None
@@ -174,10 +173,9 @@ def synthesise(
             write_json(out / "config.json", resolved)
         with atomic_path(out / "rock.glb") as temporary:
             temporary.write_bytes(glb)
-        prepared = time.perf_counter()
         photographer = Photographer(world, exposure, spp, seed, denoise)
         views = tests if on_demand else [*frames, *tests]
-        seconds = _render_frames(photographer, views, progress)
+        _render_frames(photographer, views, progress)
         if views:
             write_contact_sheet(out / "contact_sheet.png", tests if on_demand else frames)
         record = {
@@ -187,12 +185,6 @@ def synthesise(
             "versions": versions(),
         }
         write_json(out / "config.json", resolved | record)
-        timings = {
-            "prepare_s": round(prepared - started, 2),
-            "frame_s": round(float(np.median(seconds)), 3) if seconds else None,
-            "total_s": round(time.perf_counter() - started, 2),
-        }
-        write_json(out / "timings.json", timings)  # apart from what repeats bit for bit
         if tests:
             write_transforms(out / TEST_FOLDER, tests)
         published = frames if pose_noise is None else _with_noise(out, frames, pose_noise, seed)
@@ -316,16 +308,12 @@ def _write_survey(
 
 def _render_frames(
     photographer: Photographer, frames: list[Frame], progress: Callable[[int, int], None]
-) -> list[float]:
-    """Render the frames that are not done. Returns the seconds that each took."""
-    seconds = []
+) -> None:
+    """Render the frames that are not done."""
     for index, frame in enumerate(frames):
         if not is_done(frame):
-            begun = time.perf_counter()
             photographer.take(frame)
-            seconds.append(time.perf_counter() - begun)
         progress(index + 1, len(frames))
-    return seconds
 
 
 def write_contact_sheet(path: str | Path, frames: list[Frame]) -> None:

@@ -36,8 +36,7 @@ def make_rock(settings: Rock, rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def rock_shape(settings: Rock, noise: Noise) -> tuple[trimesh.Trimesh, np.ndarray]:
-    """The rock without texture, standing in the ground, and the displacement of each vertex [V],
-    metres."""
+    """The rock without texture, standing in the ground; displacement of each vertex [V], m."""
     mesh = _body(settings, noise).subdivide()
     height = _relief(mesh, settings, noise)
     mesh.vertices += height[:, None] * mesh.vertex_normals
@@ -89,8 +88,7 @@ def _leave_out_bad_faces(mesh: trimesh.Trimesh) -> None:
 
 
 def _stand(mesh: trimesh.Trimesh, settings: Rock) -> trimesh.Trimesh:
-    """Scale a mesh to the settings' size, centre it over the origin, and bury the share `buried` of
-    it."""
+    """Scale a mesh to its size, centre it over the origin, bury the share `buried`."""
     mesh.apply_scale(settings.size / mesh.extents.max())
     low, high = mesh.bounds
     middle = (low + high) / 2
@@ -145,8 +143,7 @@ def _smooth_max(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
 
 
 def _relief(mesh: trimesh.Trimesh, settings: Rock, noise: Noise) -> np.ndarray:
-    """Displacement along the vertex normals [V], metres: ridges, rough patches, pits, cracks,
-    strata."""
+    """Displacement along the vertex normals [V], metres."""
     p = np.asarray(mesh.vertices, np.float32)
     size, amplitude = settings.size, settings.relief * settings.size
     warp = np.stack([noise.fractal(p, 0.4 * size, 2) for _ in range(3)], -1)
@@ -246,7 +243,6 @@ def _albedo(
 
 
 def _smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
-    """Cubic curve from 0 at x = low to 1 at x = high, constant beyond; low may be greater than
-    high."""
+    """Cubic curve from 0 at x = low to 1 at x = high, constant beyond."""
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)

@@ -20,8 +20,7 @@ CONTINUATION = 4.0
 and 4, 4 gives the denoised outline nearest to a rendering with many samples."""
 
 WEIGHT_MIN = 1e-4
-"""Least divisor in place of a sum of Gaussian weights: far from the rock the continuation is black.
-"""
+"""Least divisor in place of a sum of Gaussian weights."""
 
 
 class RockLayer(mi.SamplingIntegrator):
@@ -45,8 +44,7 @@ class RockLayer(mi.SamplingIntegrator):
     def sample(
         self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
     ) -> tuple[Any, Any, list[Any]]:
-        """RGB along a camera ray, whether it meets anything, and the other channels (Mitsuba's
-        interface)."""
+        """RGB along a camera ray, whether it meets anything, and the other channels."""
         hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         on_rock = hit.shape == self.rock
         rgb, valid, aovs = self.inner.sample(scene, sampler, ray, medium, active)
@@ -91,7 +89,6 @@ def continued(values: np.ndarray, coverage: np.ndarray) -> np.ndarray:
 
 
 def lattice(n: int) -> np.ndarray:
-    """n points [n,2], n odd, spread evenly over the unit square (Fibonacci lattice), the middle one
-    in its centre."""
+    """n points [n,2], n odd, spread over the unit square, one in its centre (Fibonacci)."""
     step = np.arange(n) - n // 2
     return (np.stack([step / n, step * (5**0.5 - 1) / 2], 1) + 0.5) % 1

@@ -22,8 +22,7 @@ from mgs.synth.arena import make_ground, make_stones, regolith
 from mgs.synth.scene_file import Rock, SceneFile, Sky
 
 MAX_DEPTH = 4
-"""Longest light path in Mitsuba's count: direct light and two bounces, which matter in the shade.
-"""
+"""Longest light path in Mitsuba's count: direct light and two bounces."""
 
 GUIDES_PER_SAMPLE = 2
 """Samples of the denoiser's guides (albedo, normals) per sample of light. They are cheap; with so
@@ -56,8 +55,7 @@ class Rendered:
 
 
 class MitsubaScene:
-    """A rock on its arena under sun and sky. All its cameras must have the size and the K of the
-    first."""
+    """A rock on its arena under sun and sky. All cameras have one size and K."""
 
     def __init__(
         self, settings: SceneFile, rock: trimesh.Trimesh, camera: Camera, seed: int
@@ -118,8 +116,7 @@ class MitsubaScene:
         return Rendered(rgb, np.dstack([rock, alpha]), depth, mask)
 
     def cast(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """z-depth, float32 [H,W], metres, 0 = sky, and rock mask, bool [H,W], along the pixel
-        centres."""
+        """z-depth, float32 [H,W], metres, 0 = sky, and rock mask, bool, at pixel centres."""
         rays = camera.unproject(np.ones((camera.height, camera.width))) - camera.position
         size = (camera.height, camera.width)
         z, mask = self._first_hits(camera, rays.reshape(-1, 3))
@@ -177,8 +174,7 @@ def _denoise(rgb: np.ndarray, guides: np.ndarray) -> np.ndarray:
 
 
 def sensor_dict(camera: Camera) -> dict[str, Any]:
-    """Mitsuba perspective sensor of a camera. Its box filter makes a pixel the mean over its own
-    area."""
+    """Mitsuba perspective sensor of a camera; a pixel is the mean over its area."""
     K, w, h = camera.K, camera.width, camera.height
     film = {"type": "hdrfilm", "width": w, "height": h, "pixel_format": "rgb"}
     return {
@@ -217,8 +213,7 @@ def _bitmap(linear: np.ndarray) -> dict[str, Any]:
 
 
 def _rock_bsdf(rock: trimesh.Trimesh, settings: Rock) -> dict[str, Any]:
-    """Material of the rock, coloured by the mesh's texture, else its vertex colours, else the light
-    mineral."""
+    """Material of the rock, by its texture, else vertex colours, else the light mineral."""
     visual: Any = rock.visual
     material = getattr(visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
@@ -239,8 +234,7 @@ def _rock_bsdf(rock: trimesh.Trimesh, settings: Rock) -> dict[str, Any]:
 
 
 def _mesh(name: str, mesh: trimesh.Trimesh, bsdf: dict[str, Any]) -> Any:
-    """A mi.Mesh of a trimesh mesh, with normals, UVs and attributes. v points down in Mitsuba, up
-    in trimesh."""
+    """A mi.Mesh of a trimesh mesh, with normals, UVs and attributes."""
     uv = getattr(mesh.visual, "uv", None)
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict({"type": "twosided", "material": bsdf})

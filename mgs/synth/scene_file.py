@@ -128,7 +128,7 @@ class Sensor(_Strict):
     noise: Annotated[float, Field(ge=0, le=MOST_ERROR)] = 1.0
     """Factor on the depth camera's noise (`mgs.survey.depth_sensor`)."""
     drift: Annotated[float, Field(ge=0, le=MOST_ERROR)] = 1.0
-    """Factor on the odometry's drift (`mgs.survey.odometry`)."""
+    """Factor on the odometry's drift (`mgs.survey.registration`)."""
 
 
 class SceneFile(_Strict):

@@ -1,8 +1,8 @@
 """Who may use the viewer, and text that a browser shows as it is.
 
-A browser lets every website open connections to servers on this machine. So a request must name
-this server as its host and, if it comes from a page, that page as its origin. On an address that
-others reach, the first request must have the token of the printed URL; a cookie carries it on.
+Every website can open connections to servers on this machine. So a request must name this server as
+its host and, if it comes from a page, as its origin. On an address that others reach, the first
+request must have the token of the printed URL; a cookie carries it on.
 """
 
 from __future__ import annotations
@@ -74,8 +74,7 @@ class Access:
 
     @contextmanager
     def guarding(self) -> Iterator[None]:
-        """A server of websockets that is started in this context answers as `answered`, and prints
-        nothing about messages that it cannot read."""
+        """Context manager in which a server of websockets answers as `answered`."""
         from websockets.asyncio import server
 
         serve, logger = server.serve, logging.getLogger("mgs.view")

@@ -18,8 +18,7 @@ from mgs.view.access import plain
 from mgs.view.subject import SCALARS, Subject
 
 FAR = 160.0
-"""Depth of pixels that show no model, metres: the browser draws its objects in front of it. viser's
-images of depth end at 167 m."""
+"""Depth of pixels that show no model, metres: viser's images of depth end at 167 m."""
 
 
 def layers(subject: Subject) -> list[str]:
@@ -40,8 +39,7 @@ def covariances(subject: Subject) -> np.ndarray:
 
 
 def gaussian_colours(subject: Subject, layer: str) -> np.ndarray:
-    """Colours of the Gaussians in a layer, sRGB uint8 [N,3]: white for alpha; grey for depth, which
-    is no property of a Gaussian."""
+    """Colours of the Gaussians in a layer, sRGB uint8 [N,3]; grey for depth."""
     g = _model(subject)
     if layer == "colour":
         return _eight_bits(_display(subject, g.rgb))
@@ -82,8 +80,7 @@ def kernel_image(
 
 
 def scale(subject: Subject, layer: str) -> tuple[float, float]:
-    """Ends of the colour scale of a scalar: information from 0 to what 0.1 % of the Gaussians
-    exceed, the others from 0 to 1."""
+    """Ends of the colour scale of a scalar: 0 to 1; of information 0 to its 99.9 %."""
     if layer != "information":
         return 0.0, 1.0
     return 0.0, max(float(np.quantile(subject.scalars[layer], 0.999)), 1e-9)
@@ -105,8 +102,7 @@ def legend(layer: str, ends: tuple[float, float], unit: str) -> str:
 
 
 def painted(values: np.ndarray, low: float, high: float, colours: str) -> np.ndarray:
-    """Values of any shape -> sRGB uint8 of that shape and 3, by matplotlib's colour map of this
-    name, clipped at its ends."""
+    """Values of any shape -> sRGB uint8 of that shape and 3, by a colour map."""
     import matplotlib
 
     share = np.clip((np.asarray(values, np.float64) - low) / max(high - low, 1e-12), 0, 1)

@@ -58,8 +58,7 @@ BLACK = np.zeros((2, 2, 3), np.uint8)
 
 
 def check_address(host: str, port: int) -> None:
-    """Raises InputError if no server can listen there: the port is taken or not allowed, or the
-    host is not this machine."""
+    """Raises InputError if no server can listen at this host and port."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
         family, kind, protocol, _, address = found[0]
@@ -178,8 +177,7 @@ class Viewer:
             )
 
     def _extent(self) -> tuple[np.ndarray, float]:
-        """Middle of the subject and its size: the radius that holds 95 % of the Gaussians, or of
-        the mesh or the cameras where there is no model."""
+        """Middle of the subject, and the radius that holds 95 % of it."""
         subject = self.subject
         points = subject.gaussians.means if subject.gaussians is not None else None
         if points is None or len(points) == 0:
@@ -343,8 +341,7 @@ class Viewer:
             client.splats.visible = bool(self.gaussians.value)
 
     def _draw(self, client: _Client) -> None:
-        """Draw the layer for a browser whose camera rests: its Gaussians, and the kernel's image in
-        their place."""
+        """Draw the layer for a browser whose camera rests: Gaussians, and the kernel's image."""
         asked, subject = (client.moved, self.version), self.subject
         known = layers.layers(subject)
         layer = self.layer.value if self.layer.value in known else known[0]

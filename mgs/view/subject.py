@@ -83,8 +83,7 @@ def read_subject(path: str | Path, follow: bool = False) -> Subject:
 
 
 def scaled(subject: Subject) -> Subject:
-    """Shrink all lengths such that nothing is farther than LARGEST from the middle; a smaller
-    subject is returned unchanged."""
+    """Shrink a subject until nothing is farther than LARGEST from the middle."""
     g, mesh = subject.gaussians, subject.mesh
     eyes = np.array([view.frame.camera.position for view in subject.views]).reshape(-1, 3)
     means = eyes[:0] if g is None else g.means

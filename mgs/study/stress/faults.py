@@ -281,6 +281,7 @@ SIZES_IN_WORDS = {
     "shifted prior": "{:g} m",
     "scaled prior": "factor {:g}",
     "turned prior": "{:g}°",
+    "another rock's prior": "draw {:g}",
 }
 """Sizes of faults with their units."""
 
@@ -349,8 +350,7 @@ def _spoiled(
 
 
 def _fit_faults(lab: Lab, run: str, taken: Sequence[int], turn: float, clean: Row) -> list[Row]:
-    """Fits of too few passes, fits with free means on few views beside clean ones, and fits with
-    one wrong pose."""
+    """Fits of too few passes, with free means on few views, and with one wrong pose."""
     rows = [_row(lab, run, "few passes", passes, clean, taken, passes) for passes in SHORT_FITS]
     for count in FREE_VIEWS:
         few = lab.even(count, turn)
@@ -429,8 +429,7 @@ def _alarm(row: Row) -> float:
 
 
 def false_alarms(rows: Sequence[Row]) -> list[float]:
-    """Alarms of clean runs, 1 or 0. Clean runs of both kinds of faults are the same and count
-    once."""
+    """Alarms of clean runs, 1 or 0; those of both kinds of faults count once."""
     clean = {(row["run"], row["size"]): row for row in rows if row["fault"] == "none"}
     return [_alarm(row) for row in clean.values()]
 

@@ -1,4 +1,4 @@
-"""Fit a run's views again, with no more parameters than they need: `mgs refit`."""
+"""Smaller models of a run, compared with the whole one on other views: `mgs prune`, `mgs refit`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from mgs.errors import InputError
 from mgs.files import check_writable
 from mgs.fit.settings import TrainSettings
-from mgs.policy.criteria import LEARN_LOSS
+from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
 from mgs.report.evaluation import compare_models
 from mgs.run import inputs
 from mgs.run.folder import open_run
@@ -19,6 +19,7 @@ from mgs.splat_ply import write_ply
 if TYPE_CHECKING:
     from mgs.report.evidence import LeanModel
 
+PRUNED = "gaussians_pruned.ply"
 REFITTED = "gaussians_refitted.ply"
 
 CHOICES = {"--learn": ("all", "auto"), "--sh": ("0", "auto")}
@@ -26,6 +27,46 @@ CHOICES = {"--learn": ("all", "auto"), "--sh": ("0", "auto")}
 
 LARGEST_LOSS = 10.0
 """Largest `loss` of `refit_run`, dB: with that next to nothing is learned but colours."""
+
+
+@dataclass(frozen=True)
+class PrunedRun:
+    """Result of `prune_run`.
+
+    before, after: number of Gaussians. predicted, actual: rms change of the training images
+    (`mgs.splat.pruning.Pruned`). views: "test" or "held-out". psnr: on these, before and after, dB;
+    None if there are none.
+    """
+
+    before: int
+    after: int
+    predicted: float
+    actual: float
+    views: str
+    psnr: list[float] | None
+
+
+def prune_run(
+    run: str | Path, noise: float = PRUNE_NOISE, say: Callable[[str], None] = lambda stage: None
+) -> PrunedRun:
+    """Prune the model of a run by its training views (`mgs.splat.pruning.prune`), and write
+    RUN/PRUNED.
+
+    Both models are compared on the test views of the dataset, or without them on the held-out
+    views. say(stage): called as a stage starts. Raises InputError as `open_run` and `prune`.
+    """
+    from mgs.splat.pruning import prune
+
+    opened = open_run(run)
+    gaussians, names = opened.state.gaussians, [frame.name for frame in opened.taken]
+    say("pruning")
+    cameras = [frame.camera for frame in opened.dataset.frames if frame.name in names]
+    found = prune(gaussians, cameras, noise)
+    smaller = gaussians[found.kept]
+    say("comparing")
+    views, psnr = compare_models([gaussians, smaller], opened.dataset, names)
+    write_ply(opened.folder / PRUNED, smaller)
+    return PrunedRun(len(gaussians), len(smaller), found.predicted, found.actual, views, psnr)
 
 
 @dataclass(frozen=True)

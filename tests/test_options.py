@@ -1,0 +1,197 @@
+"""Options that cannot be, through the real command line: one line, exit code 2, nothing written."""
+
+import shlex
+
+import pytest
+import synthetic
+import tiny
+from refusals import refused
+
+from mgs.splat_ply import write_ply
+
+KINDS = "must be a number for each of colour, scale, rotation, opacity"
+NO_MORE = "--resume takes its settings from"
+NO_GAUSSIANS = "--gaussians 'many': expected a whole number, or auto"
+UP = "expected auto, or three numbers"
+FEW_POSES = "allow 0 of its 12 poses, fewer than 3 seeds"
+OPTIONS: dict[str, list[tuple[str, str]]] = {
+    "": [
+        ("fly", "fly"),
+        ("nbv --fast", "--fast"),
+        ("bench --repeats many", "--repeats"),
+        ("bench --json .", "is a folder; name a file"),
+        ("survey {data} --poses guessed", "guessed"),
+        ("chart {out} --dataset {data}", "has no test views"),
+        ("dataset check {long}", "File name too long"),
+        ("import {long} --out {out}", "File name too long"),
+        ("survey {long}", "File name too long"),
+        ("report {long}", "File name too long"),
+        ("eval {long}", "File name too long"),
+        ("render {ply} --cameras {data} --out {out} --width 100000000", "100000000x"),
+        ("render {ply} --cameras {data} --out {out} --background 255 255 255", "from 0 to 1"),
+        ("video {run} --out {out}.avi", "films are written as .mp4, .gif, .png"),
+        ("demo {out} --random-seed -1", "--random-seed"),
+    ],
+    "view": [
+        ("{out}.ply", "no such run folder or PLY file"),
+        ("{root}", "holds no run"),
+        ("{run} --port 70000", "--port"),
+        ("{run} --port many", "--port"),
+        ("{ply} --follow", "--follow needs the folder of a run"),
+        ("{run} --host 192.0.2.1", "cannot be served there"),  # of an example network
+    ],
+    "report {run}": [
+        ("--figures eps", "--figures eps: unknown; choose one of png, pdf, svg"),
+        ("--html {out}.html --figures pdf", "--html alone writes no figures"),
+    ],
+    "diagnose {run} --views": [
+        ("kf_9999", "kf_9999"),
+        ("kf_0000,nothing", "nothing"),
+        (",", "--views"),
+        ("''", "--views"),
+    ],
+    "refit {run}": [
+        ("--learn some", "--learn some: is unknown; choose one of all, auto"),
+        ("--sh 1", "--sh 1: is unknown; choose one of 0, auto"),
+        ("--learn all --sh 0", "leaves nothing to choose; leave out one of them"),
+        ("--loss -1", "--loss -1.0: must be from 0 to 10 dB"),
+        ("--loss nan", "--loss nan: must be from 0 to 10 dB"),
+    ],
+    "nbv": [
+        ("", "--resume"),
+        ("{data}", "--resume"),
+        ("{data} --resume {run}", "--resume"),
+        ("--resume {run} --budget 9", f"nbv: --budget: {NO_MORE}"),
+        ("--resume {run} --exposure", f"nbv: --exposure: {NO_MORE}"),
+        ("--resume {run} --prior-std colour=1", f"nbv: --prior-std: {NO_MORE}"),
+        ("--resume {run} --capture boulder", f"--capture: {NO_MORE}"),
+        ("--resume {run} --policy random", "--policy random: is not the policy of"),
+        ("{data} --prior {prior} --out {run}", "--force; `mgs nbv --resume"),
+        ("{data} --capture boulder --out {out}", "give a DATASET or --capture"),
+        ("--capture nosuch --out {out}", "nosuch"),
+        ("--capture boulder --prior no --out {out}", "no such prior"),
+        ("{rock} --out {out} --gaussians many", NO_GAUSSIANS),
+    ],
+    "nbv {data} --prior {prior} --seed-views 3 --budget 1 --out {out}": [
+        ("--estimator block", "--estimator block: unknown; choose one of exact, hutchinson"),
+        ("--optimiser hope", "--optimiser 'hope': unknown; choose one of natural, adam"),
+        ("--lam 0", "--lam 0.0: must be at least"),
+        ("--rate colour", "--rate colour: expected KIND=NUMBER, as in --rate colour=0.01"),
+        ("--rate hue=1", f"--rate {{'hue': 1.0}}: {KINDS}"),
+        ("--prior-std scale=inf", "--prior-std scale=inf: Input should be a finite number"),
+        ("--pixel-noise 1e-200", "1e-200: must be at least 1e-06"),
+        ("--batch 0", "--batch 0: must be at least 1"),
+        ("--alpha-weight -1", "--alpha-weight -1.0: must be at least 0"),
+        ("--stop-gain 0", "--stop-gain 0.0: must be more than 0"),
+        ("--stop-uncertainty 1", "--stop-uncertainty 1.0: must be less than 1"),
+        ("--policy best", "--policy best: unknown; choose one of"),
+        ("--seed-views 13", "fewer than 13 seeds"),
+        ("--seed-views 0", "--seed-views"),
+        ("--budget -1", "--budget -1: must be at least 0"),
+        ("--random-seed -1", "--random-seed"),
+        ("--travel nan", "--travel"),
+        ("--nearest 0", "--nearest 0: must be at least 1"),
+        ("--means loose", "--means loose: Input should be 'frozen', 'normal' or 'free'"),
+        ("--means free --estimator hutchinson", "hutchinson has no information"),
+        ("--means free --policy paper", "--policy paper has no information about means"),
+        ("--means normal --prior-std mean=0", "--prior-std mean=0.0: must be at least"),
+        ("--flight-length -1", "--flight-length -1.0: must be at least 1e-06"),
+        ("--flight-time nan", "--flight-time nan"),
+        ("--hover -1", "--hover -1.0: must be at least 0"),
+        ("--speed 0", "--speed 0"),
+        ("--flight-length 9", "takes 15.2 m and 17 s; raise --flight-length"),
+        ("--no-fly 4", FEW_POSES),
+        ("--clearance 30", FEW_POSES),
+        ("--flight-length 30 --travel 2", "leave out --travel"),
+    ],
+    "synth-orbit {out}": [
+        ("--scene {long}.toml", "File name too long"),
+        ("--scene moon", "scene 'moon': unknown; choose one of boulder"),
+        ("--scene nowhere/x.toml", "x.toml"),
+        ("--scale huge", "scale 'huge': unknown; choose one of quick, paper"),
+        ("--orbit figure-eight", "--orbit 'figure-eight': unknown"),
+        ("--size 320", "expected WIDTHxHEIGHT"),
+        ("--size 0x12", "--size"),
+        ("--size 99999999x99999999", "--size"),
+        ("--size 3²x24", "--size"),
+        ("--mesh nowhere.glb", "no such mesh"),
+        ("--mesh-up y", "--mesh-up"),
+        ("--mesh-up x", "--mesh-up"),
+        ("--spp 100000000000", "GiB on disk; at most"),
+        ("--frames 1000000000 --size 1x1", "GiB on disk; at most"),
+        ("--pose-noise 1e300", "--pose-noise"),
+        ("--rotation-noise 1e9", "--rotation-noise"),
+    ],
+    "survey {rock} --out {out}": [
+        ("--sensor-noise -1", "factors of 0 or more"),
+        ("--sensor-noise 1e30", "--sensor-noise"),
+        ("--drift nan", "factors of 0 or more"),
+        ("--drift 1e30", "--drift"),
+    ],
+    "prior {rock} --out {out}": [
+        ("--gaussians 0", "0 Gaussians are too few"),
+        ("--gaussians -5", "-5 Gaussians are too few"),
+        ("--gaussians many", NO_GAUSSIANS),
+        ("--gaussians 50 --spacing 0.1", "give one of them"),
+        ("--spacing 0", "must be positive"),
+        ("--spacing 9", "samples are too few"),
+        ("--spacing nan", "must be positive"),
+        ("--prior-noise -1", "must be 0 or more"),
+        ("--prior-noise nan", "must be 0 or more"),
+        ("--holes 1.0", "0 to 0.9"),
+        ("--poisson-depth 0", "poisson-depth"),
+        ("--poisson-depth 30", "poisson-depth"),
+        ("--up skyward", f"--up 'skyward': {UP}"),
+        ("--up 0,0,0", f"--up '0,0,0': {UP}"),
+        ("--from dreams", "choose one of depth, mesh, points, hull, random"),
+        ("--from mesh", "give --mesh MESH"),
+        ("--from hull --mesh rock.glb", "give one of them"),
+        ("--from hull --prior-noise 0.1", "of a cloud, but a hull is carved"),
+        ("--points none.ply", "none.ply: no such point cloud"),
+    ],
+    "prior {rock} --out {out} --mesh {rock}/rock.glb": [
+        ("--spacing 1e-6", "samples take about"),
+        ("--spacing 1e-300", "samples take about"),
+        (f"--gaussians 1{30 * '0'}", "samples take about"),
+        ("--gaussians 100 --prior-noise 0.01", "--prior-noise"),
+        ("--gaussians 100 --holes 0.2", "--holes"),
+        ("--gaussians 100 --poisson-depth 0", "--poisson-depth"),
+    ],
+    "reproduce {out}": [
+        ("--scale huge", "--scale 'huge': unknown; choose one of quick, paper"),
+        ("--only table2", "unknown; choose some of table1,figures,setups,oracle"),
+        ("--only ,", "--only '': unknown"),
+        ("--rocks 13", "--rocks 13: setups can have 1 to 12"),
+        ("--workers 2 --scheduler tcp://x:1", "give one of them"),
+        ("--policy best", "--policy best: unknown; choose one of"),
+        ("--policy uniform", "--policy uniform: is compared anyway"),
+        ("--policy angle --policy angle", "angle: there is one of this name already"),
+        ("--policy block-d --only table1", "is for setups and oracle, and --only leaves both out"),
+        ("--policy none.py:f", "none.py"),
+        ("--mesh none.glb", "none.glb: cannot be read (No such file or directory)"),
+        ("--mesh a.glb --only table1", "is for results over many rocks, and --only leaves them"),
+        ("--batch 0", "should be greater than or equal to 1"),
+        ("--batch 5 --only setups", "is for table1 and figures, and --only leaves both out"),
+    ],
+}
+"""Beginning of a command -> its options, and words of the line."""
+ROWS = [(f"{begin} {end}", words) for begin, rows in OPTIONS.items() for end, words in rows]
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    root = tmp_path_factory.mktemp("options")
+    data, prior = tiny.write_dataset(root / "data"), tiny.write_prior(root / "prior")
+    run = tiny.write_run(root / "run", data, prior)
+    write_ply(root / "splats.ply", tiny.initial([]))
+    rock = synthetic.write_dataset(root / "rock").root
+    made = {"root": root, "data": data, "prior": prior, "run": run, "ply": root / "splats.ply"}
+    return made | {"rock": rock, "out": root / "out", "long": "a" * 5000}
+
+
+@pytest.mark.parametrize(("arguments", "words"), ROWS, ids=[row[0] for row in ROWS])
+def test_options_that_cannot_be_are_one_line(capsys, places, arguments, words):
+    given = shlex.split(arguments.format(**places))
+    line = refused(capsys, given, places["root"])
+    assert words in line
+    assert len(line) < 600
