@@ -66,7 +66,7 @@ COMMANDS = {
 
 WRITERS = {name: COMMANDS[name] for name in COMMANDS if name != "study"} | {
     "prior": "prior {data} --mesh {data}/rock.glb --gaussians 150 --out {out}",
-    "survey": "survey {data} --out {out}",
+    "survey": "survey {data} --poses exact --out {out}",
     "masks": "dataset masks {out} --prior {prior}",
     "eval": "eval {out}",
     "diagnose": "diagnose {out}",

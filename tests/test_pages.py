@@ -67,10 +67,11 @@ def test_the_tutorial_prints_what_it_shows(pages, tmp_path):
     assert set(keys) <= documented
 
 
-def test_the_notebook_is_the_tutorial(pages):
-    """Its code cells are the blocks that the tutorial's test executes."""
-    made = pages.notebook(pages.TUTORIAL.read_text())
-    assert pages.NOTEBOOK.read_text() == made, "run python tools/pages.py --write"
+def test_the_notebooks_are_their_pages(pages):
+    """Their code cells are the blocks that the tests of the pages execute."""
+    for page in pages.NOTEBOOKS:
+        made = pages.notebook(page.read_text())
+        assert page.with_suffix(".ipynb").read_text() == made, "run python tools/pages.py --write"
 
 
 @pytest.mark.parametrize("page", HOWTO, ids=lambda page: page.stem)

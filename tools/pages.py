@@ -1,7 +1,7 @@
 """Run what a page of docs/ shows its readers, and compare the printed output with the page.
 
     python tools/pages.py            # run docs/tutorial.md; exit code 1 where its output differs
-    python tools/pages.py --write    # and write output, pictures and docs/tutorial.ipynb
+    python tools/pages.py --write    # and write output, pictures and the notebooks
 
 Python blocks run in order, in one program and one folder. A block with a title is a file of that
 name. In a block marked `sh`, each line is a command, `mgs ...` or `python FILE ...`. A block marked
@@ -26,7 +26,8 @@ from typing import Any
 
 ROOT = Path(__file__).parent.parent
 TUTORIAL = ROOT / "docs/tutorial.md"
-NOTEBOOK = TUTORIAL.with_suffix(".ipynb")
+NOTEBOOKS = (TUTORIAL, ROOT / "docs/howto/policy.md")
+"""Pages that are notebooks too."""
 
 PICTURES = {
     "out/report/orbit.png": "tutorial_orbit.png",
@@ -121,7 +122,8 @@ def alike(shown: str, printed: str) -> bool:
 
 
 def notebook(page: str) -> str:
-    """Return a page as a Jupyter notebook: its Python blocks are code cells with their output."""
+    """Return a page as a Jupyter notebook: its blocks are code cells with their output. A file is
+    written by `%%writefile`, a command runs after `!`."""
     cells: list[dict[str, Any]] = []
 
     def add(kind: str, source: str, **more: Any) -> None:
@@ -137,7 +139,12 @@ def notebook(page: str) -> str:
             lines = match["body"].splitlines(keepends=True)
             cells[-1]["outputs"] = [{"name": "stdout", "output_type": "stream", "text": lines}]
         else:
-            add("code", match["body"], execution_count=None, outputs=[])
+            body = match["body"]
+            if match["title"] is not None:
+                body = f"%%writefile {match['title']}\n{body}"
+            elif match["language"] == "sh":
+                body = re.sub(r"^(?=\S)", "!", body, flags=re.MULTILINE)
+            add("code", body, execution_count=None, outputs=[])
         end = match.end()
     add("markdown", page[end:])
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
@@ -151,7 +158,9 @@ def main(arguments: list[str]) -> int:
         page, differences = run_page(TUTORIAL, Path(folder))
         if "--write" in arguments:
             TUTORIAL.write_text(page, encoding="utf-8")
-            NOTEBOOK.write_text(notebook(page), encoding="utf-8")
+            for made in NOTEBOOKS:
+                text = notebook(made.read_text(encoding="utf-8"))
+                made.with_suffix(".ipynb").write_text(text, encoding="utf-8")
             for source, name in PICTURES.items():
                 shutil.copyfile(Path(folder) / source, ROOT / "docs/images" / name)
             return 0
