@@ -82,7 +82,8 @@ def synth_orbit(
     image of a frame is rendered when a run of `mgs nbv` takes it.
     """
     runtime.start()
-    from mgs.synth.rendering import PRESETS, PoseNoise, synthesise
+    from mgs.synth.orbit import PoseNoise
+    from mgs.synth.rendering import PRESETS, synthesise
 
     settings = load_scene_file(scene)
     if orbit is not None:

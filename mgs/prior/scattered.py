@@ -6,7 +6,6 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-import trimesh
 from scipy.spatial import cKDTree
 
 from mgs.data.dataset import Dataset
@@ -38,6 +37,8 @@ def scattered(
     as background. The mesh is the ball; normals point outwards. Raises InputError if the settings
     shape a surface, or the masks share no point of the ball.
     """
+    import trimesh  # here, because it takes 0.2 s and no other prior needs it
+
     settings.refuse_shaping("a random start has no surface")
     count = settings.gaussians if isinstance(settings.gaussians, int) else GAUSSIANS
     middle, rng = focus(dataset.frames).point, generator(settings.seed, "prior/random")

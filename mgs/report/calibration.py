@@ -13,9 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
-from scipy.special import ndtr
-from scipy.stats import norm, spearmanr
+from scipy.special import ndtr, ndtri
 
 Array = NDArray[np.floating]
 
@@ -28,7 +26,7 @@ STEPS = 100
 BINS = 20
 """Bins of the histogram of the probability integral transform."""
 
-NORMAL = {level: float(norm.ppf(0.5 + level / 2)) for level in LEVELS}
+NORMAL = {level: float(ndtri(0.5 + level / 2)) for level in LEVELS}
 """Half-widths of intervals of a normal distribution, standard deviations."""
 
 
@@ -82,6 +80,8 @@ def fit_calibration(terms: Mapping[str, Array], errors: Array) -> Calibration:
     terms: name -> [n], variances; errors: [n], signed. Widths are quantiles of |error| / sigma, so
     tails need not be normal.
     """
+    from scipy.optimize import minimize  # here, as spearmanr below
+
     columns = np.stack([*terms.values(), np.ones(len(errors))], axis=1).astype(np.float64)
     scale = np.maximum(columns.mean(axis=0), np.finfo(np.float32).tiny)
     columns, squares = columns / scale, np.square(errors, dtype=np.float64)
@@ -114,6 +114,8 @@ def judged(
     - crps, crps_constant: mean, of sigma and of one sigma for all.
     - pit: shares of the probability integral transform in BINS bins.
     """
+    from scipy.stats import spearmanr  # here, because it takes 0.2 s
+
     size, drawn = np.abs(errors), np.abs(sigma * rng.standard_normal(len(sigma)))
     area = {"ause": ause(size, sigma), "constant": ause_of_constant(size)}
     z, order = errors / sigma, np.argsort(sigma, kind="stable")
@@ -138,4 +140,5 @@ def judged(
 def crps(errors: Array, sigma: Array) -> float:
     """Mean continuous ranked probability score of normal distributions around 0."""
     z = errors / sigma
-    return float((sigma * (z * (2 * ndtr(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))).mean())
+    density = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi)
+    return float((sigma * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi))).mean())

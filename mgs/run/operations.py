@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -148,9 +149,8 @@ def psnr_over(
 
     truth = kept_within(IMAGE_BYTES, read, lambda parts: sum(part.nbytes for part in parts))
 
-    def values(gaussians: Gaussians, index: int) -> list[float]:
+    def compared(index: int, rendered: np.ndarray) -> list[float]:
         image, known, rock = truth(index)
-        rendered = np.asarray(render(gaussians, as_captured(frames[index]).camera, cache=cache).rgb)
         shown = [rendered]
         if exposure:
             shown.append(colour_corrected(linear_from_srgb(image), rendered, rock))
@@ -158,7 +158,13 @@ def psnr_over(
         return [psnr(one, image, mask) for one in srgb for mask in (known, rock)]
 
     def measured(gaussians: Gaussians, chosen: Sequence[int]) -> dict[str, np.ndarray]:
-        table = np.array([values(gaussians, i) for i in chosen]).reshape(-1, len(names))
+        with ThreadPoolExecutor(1) as beside:  # compares a view while the next one is rendered
+            rows = []
+            for i in chosen:
+                drawn = render(gaussians, as_captured(frames[i]).camera, cache=cache).rgb
+                # A copy: another thread must not free memory of Dr.Jit (`evaluate_model`).
+                rows.append(beside.submit(compared, i, np.array(drawn)))
+        table = np.array([row.result() for row in rows]).reshape(-1, len(names))
         return dict(zip(names, table.T, strict=True))
 
     return measured

@@ -197,7 +197,7 @@ def _from_poses(problem: Problem) -> list[int]:
     unused = np.zeros_like(surface)  # information about a model that there is not
     state = Fitted(problem.start, unused, surface, problem.seeds)
     while not finished(problem, state):
-        frame, _ = choose(problem, state)
+        frame, _ = choose(problem, state, lambda _: unused)
         state = with_view(problem, state, frame, unused)
     return state.taken
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,28 @@ if TYPE_CHECKING:
 
 EVALUATION_ELEVATIONS = (5.0, 75.0)
 """Elevations of the test views above the rock's middle, degrees."""
+
+
+MOST_NOISE = 1000.0
+"""Largest error of positions, metres: far beyond any orbit."""
+
+
+@dataclass(frozen=True)
+class PoseNoise:
+    """Standard deviations of the pose errors in transforms.json, per axis: metres and degrees.
+
+    Raises InputError if one is negative, NaN or absurdly large.
+    """
+
+    position: float = 0.0
+    rotation: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.position <= MOST_NOISE and 0 <= self.rotation <= 180):
+            raise InputError(
+                f"synth-orbit: --pose-noise {self.position:g} must be 0 to {MOST_NOISE:g} metres, "
+                f"and --rotation-noise {self.rotation:g} 0 to 180 degrees"
+            )
 
 
 def intrinsics(fov: float, width: int, height: int) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import shutil
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,9 +35,9 @@ from mgs.images import write_exr, write_png
 from mgs.memory import check_room
 from mgs.provenance import versions
 from mgs.seeds import derive_seed, generator
-from mgs.synth.orbit import evaluation_cameras, perturb, rock_cameras
+from mgs.synth.orbit import PoseNoise, evaluation_cameras, perturb, rock_cameras
 from mgs.synth.rock import load_rock, make_rock, up_axis
-from mgs.synth.scene import GUIDES_PER_SAMPLE, MitsubaScene
+from mgs.synth.scene import GUIDES_PER_SAMPLE, MitsubaScene, Traced
 from mgs.synth.scene_file import SceneFile, load_scene_file
 
 NOISY_FACTOR = 8
@@ -73,28 +74,6 @@ class RenderPreset:
     height: int
     frames: int
     spp: int
-
-
-MOST_NOISE = 1000.0
-"""Largest error of positions, metres: far beyond any orbit."""
-
-
-@dataclass(frozen=True)
-class PoseNoise:
-    """Standard deviations of the pose errors in transforms.json, per axis: metres and degrees.
-
-    Raises InputError if one is negative, NaN or absurdly large.
-    """
-
-    position: float = 0.0
-    rotation: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.position <= MOST_NOISE and 0 <= self.rotation <= 180):
-            raise InputError(
-                f"synth-orbit: --pose-noise {self.position:g} must be 0 to {MOST_NOISE:g} metres, "
-                f"and --rotation-noise {self.rotation:g} 0 to 180 degrees"
-            )
 
 
 PRESETS = {"quick": RenderPreset(320, 240, 32, 8), "paper": RenderPreset(640, 480, 100, 16)}
@@ -278,8 +257,16 @@ class Photographer:
 
     def take(self, frame: Frame) -> None:
         """Render a frame and write its files, which depend on its name and camera alone."""
+        self.develop(frame, self.expose(frame))
+
+    def expose(self, frame: Frame) -> Traced:
+        """Trace a frame."""
         seed = derive_seed(self.seed, frame.name)
-        rendered = self.scene.render(frame.camera, self.spp, seed, self.denoise)
+        return self.scene.trace(frame.camera, self.spp, seed, self.denoise)
+
+    def develop(self, frame: Frame, traced: Traced) -> None:
+        """Denoise a traced frame and write its files."""
+        rendered = traced.developed()
         assert frame.depth_path
         assert frame.mask_path
         assert frame.rock_path
@@ -309,11 +296,17 @@ def _write_survey(
 def _render_frames(
     photographer: Photographer, frames: list[Frame], progress: Callable[[int, int], None]
 ) -> None:
-    """Render the frames that are not done."""
-    for index, frame in enumerate(frames):
-        if not is_done(frame):
-            photographer.take(frame)
-        progress(index + 1, len(frames))
+    """Render the frames that are not done, each while the one before is denoised and written."""
+    with ThreadPoolExecutor(1) as developer:
+        last = developer.submit(lambda: None)
+        for index, frame in enumerate(frames):
+            traced = None if is_done(frame) else photographer.expose(frame)
+            last.result()
+            progress(index, len(frames))
+            if traced:
+                last = developer.submit(photographer.develop, frame, traced)
+        last.result()
+    progress(len(frames), len(frames))
 
 
 def write_contact_sheet(path: str | Path, frames: list[Frame]) -> None:

@@ -54,6 +54,45 @@ class Rendered:
     mask: np.ndarray
 
 
+Layers = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Result of `mgs.synth.rock_layer.render_layers`."""
+
+
+@dataclass(frozen=True)
+class Traced:
+    """One frame before it is denoised.
+
+    light: RGB; guides: RGB (unused), albedo and normal, None if nothing is to be denoised. alpha:
+    float32 [H,W], share of the pixel that the rock covers. depth, mask: as in `Rendered`.
+    """
+
+    light: Layers
+    guides: Layers | None
+    alpha: np.ndarray
+    depth: np.ndarray
+    mask: np.ndarray
+
+    def developed(self) -> Rendered:
+        """Denoise and compose, without Dr.Jit, so that another frame may be traced meanwhile."""
+        from mgs.synth.rock_layer import continued, with_coverage
+
+        rgb, rock, share = self.light
+        alpha = self.alpha
+        rock = with_coverage(rock, share, alpha)
+        if self.guides is not None:
+            guides, rock_guides, share = self.guides
+            rgb = _denoise(rgb, guides)
+            if alpha.any():
+                box = _around(alpha > 0)  # black pixels would cost the denoiser as much as others
+                noisy = continued(rock[box], alpha[box])
+                rock_guides = with_coverage(rock_guides, share, alpha)
+                clean = _denoise(noisy, continued(rock_guides[box], alpha[box]))
+                rock[box] = np.maximum(rock[box] + clean - noisy, 0)
+        inside, outside = alpha[..., None] == 1, alpha[..., None] == 0
+        rock = np.where(inside, rgb, np.where(outside, 0, rock))
+        return Rendered(rgb, np.dstack([rock, alpha]), self.depth, self.mask)
+
+
 class MitsubaScene:
     """A rock on its arena under sun and sky. All cameras have one size and K."""
 
@@ -92,28 +131,21 @@ class MitsubaScene:
         alone. At the outline the latter is denoised on its own, guided by albedo and normals of the
         rock alone.
         """
-        from mgs.synth.rock_layer import continued, render_layers, with_coverage
+        return self.trace(camera, spp, seed, denoise).developed()
+
+    def trace(self, camera: Camera, spp: int, seed: int, denoise: bool) -> Traced:
+        """The part of `render` that Mitsuba computes."""
+        from mgs.synth.rock_layer import render_layers
 
         self.params["sensor.to_world"] = mi.Transform4f(_to_world(camera))
         self.params.update()
-        rgb, rock, share = render_layers(self.scene, self.path, spp, seed)
+        light = render_layers(self.scene, self.path, spp, seed)
         depth, mask = self.cast(camera)
-        alpha = self.coverage(camera, mask, share)
-        rock = with_coverage(rock, share, alpha)
+        alpha = self.coverage(camera, mask, light[2])
+        guides = None
         if denoise:
-            guides, rock_guides, share = render_layers(
-                self.scene, self.guides, GUIDES_PER_SAMPLE * spp, seed
-            )
-            rgb = _denoise(rgb, guides)
-            if alpha.any():
-                box = _around(alpha > 0)  # black pixels would cost the denoiser as much as others
-                noisy = continued(rock[box], alpha[box])
-                rock_guides = with_coverage(rock_guides, share, alpha)
-                clean = _denoise(noisy, continued(rock_guides[box], alpha[box]))
-                rock[box] = np.maximum(rock[box] + clean - noisy, 0)
-        inside, outside = alpha[..., None] == 1, alpha[..., None] == 0
-        rock = np.where(inside, rgb, np.where(outside, 0, rock))
-        return Rendered(rgb, np.dstack([rock, alpha]), depth, mask)
+            guides = render_layers(self.scene, self.guides, GUIDES_PER_SAMPLE * spp, seed)
+        return Traced(light, guides, alpha, depth, mask)
 
     def cast(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """z-depth, float32 [H,W], metres, 0 = sky, and rock mask, bool, at pixel centres."""
