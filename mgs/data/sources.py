@@ -165,6 +165,7 @@ def read_source(
     recognised, no image exists, a frame is listed twice, or a camera model is not supported.
     """
     source = Path(source)
+    source.exists()  # an OSError of the source itself is not one of a file that it names
     try:
         result = _recognised(source, images, split, keyframes, unpack)
     except OSError as error:
