@@ -50,6 +50,11 @@ def thumbnails(paths: Sequence[Path]) -> list[Image.Image]:
     return pictures
 
 
+def picture(rgb: np.ndarray) -> Image.Image:
+    """Picture of linear RGB [H,W,3]."""
+    return Image.fromarray(np.round(255 * srgb_from_linear(np.clip(rgb, 0, 1))).astype(np.uint8))
+
+
 def cloud(points: np.ndarray, colours: np.ndarray) -> Image.Image:
     """Picture of points [N,3], +Z up, seen from above one side; nearer points hide others.
 

@@ -168,11 +168,22 @@ def of_png(data: bytes) -> st.SearchStrategy[bytes]:
     return damages(data).map(checked)
 
 
+@st.composite
+def of_words(draw: st.DrawFn, data: bytes) -> bytes:
+    """Texts with other numbers and names in the places of some."""
+    parts = re.split(rb"([\w.+-]+)", data)
+    for _ in range(draw(st.integers(1, 4))):
+        one, other = (2 * draw(st.integers(0, len(parts) // 2 - 1)) + 1 for _ in range(2))
+        parts[one] = draw(st.sampled_from([*WORDS, b"1e300", b"0.5", b"-7", parts[other]]))
+    return b"".join(parts)
+
+
 GRAMMARS: dict[str, Callable[[bytes], st.SearchStrategy[bytes]]] = {
     ".json": of_json,
     ".jsonl": of_lines,
     ".toml": of_toml,
     ".glb": of_glb,
     ".png": of_png,
+    **dict.fromkeys((".txt", ".log", ".csv", ".yaml", ".xml"), of_words),
 }
 """Suffix -> strategy for files near a sound one."""

@@ -12,6 +12,7 @@ from mgs.colour import SH_C0
 from mgs.data.dataset import load_dataset
 from mgs.policy import criteria, directional
 from mgs.policy.directional import Views, gains
+from mgs.run import folder as run_folder
 from mgs.run import loop
 from mgs.run.problem import Problem
 from mgs.splat import reference
@@ -172,3 +173,20 @@ def test_what_poses_see_is_measured_once_and_again_when_it_is_forgotten(dataset,
         loop.choose(problem, state)
         counts.append(len(looked))
     assert counts[1] == 0 < counts[0] == counts[2] == counts[3]
+
+
+def test_a_run_takes_the_views_of_its_plan(loaded, tmp_path):
+    """Whatever order; after another view a new plan is made, and where reach is limited none."""
+    state = tiny.run(tmp_path / "run", loaded, policy="directional-d", budget=4)
+    settings = run_folder.open_run(tmp_path / "run").settings
+    problem = Problem(loaded, settings, tiny.operations())
+    seeds, chosen = state.taken[:3], state.taken[3:]
+    left = problem.reachable(seeds)
+    assert sorted(chosen) == problem.planned(seeds, left)
+    first = [*seeds, chosen[0]]
+    assert problem.planned(first, problem.reachable(first)) == sorted(chosen[1:])
+    other = [*seeds, next(i for i in left if i not in chosen)]
+    new = problem.planned(other, problem.reachable(other))
+    assert len(new) == 3
+    for changes in ({"nearest": 5}, {"travel": 1.0}, {"policy": "directional-i"}):
+        assert problem.with_settings(**changes).planned(seeds, left) == left

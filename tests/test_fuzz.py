@@ -21,11 +21,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import synthetic
 import tiny
 import trimesh
 from grammars import GRAMMARS, damages
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from PIL import Image
+from test_recordings import WRITERS
 
 from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
 from mgs.data.dataset import load_dataset
@@ -43,9 +45,11 @@ from mgs.images import (
     write_exr,
     write_png,
 )
+from mgs.prior.build import load_prior
 from mgs.report.evaluation import evaluate_run
 from mgs.report.page import write_page
 from mgs.report.runs import read_run
+from mgs.run.candidates import Site, read_poses, refusals
 from mgs.run.folder import open_run
 from mgs.splat_ply import read_ply, write_ply
 from mgs.study.sweep import Cell, found
@@ -138,6 +142,41 @@ def of_folder(path: Path) -> None:
     read_source(path.parent)
 
 
+def recording(kind: str, file: str) -> Callable[[Path], None]:
+    """Writer of a recording of three frames, of which `file` is one."""
+
+    def write(path: Path) -> None:
+        root = path.parents[file.count("/")]
+        WRITERS[kind](
+            root, synthetic.write_dataset(root / "data", synthetic.orbit_cameras(3, 16, 12))
+        )
+
+    return write
+
+
+def of_recording(path: Path) -> None:
+    """Read the recording of which a file is one, as far as the sizes of its images."""
+    alone, deep = path.suffix in (".bag", ".xml"), path.parent.name == "rtabmap_calib"
+    root = path if alone else path.parents[deep]
+    for shot in read_source(root, unpack=root.parent / "unpacked").shots:
+        image_size(shot.image)
+
+
+def poses(path: Path) -> None:
+    path.write_text(
+        "name,x,y,z,target_x,target_y,target_z,qw,qx,qy,qz\na,3,0,1,0,0,0,1,0,0,0\n"
+        'b,0,3,1,0,0,0.5,.5,.5,-.5,.5\n"c d",2,2,1,0,0,0,1,0,0,0\n'
+    )
+    tiny.write_prior(path.parent / "prior")
+
+
+def of_poses(path: Path) -> None:
+    """Read candidates, and tell which can be flown."""
+    camera = tiny.orbit()[0]
+    site = Site(load_prior(path.parent / "prior"), camera)
+    refusals(read_poses(path, site), [camera], site)
+
+
 def run(path: Path) -> None:
     """A finished run of the seeds alone, with its dataset and prior beside it."""
     root = path.parent.parent
@@ -167,6 +206,22 @@ def result(path: Path) -> None:
     """Read the record of a study's cell."""
     found(path.parents[2], Cell(path.parent.name, "a:b", {"a": 1}))
 
+
+ROBOTS = (
+    ("ROS bag 1", "one.bag"),
+    ("ROS bag 2", "bag/bag.db3"),
+    ("ROS bag 2", "bag/metadata.yaml"),
+    ("ROS bag MCAP", "bag/bag.mcap"),
+    ("TUM RGB-D", "tum/rgb.txt"),
+    ("TUM RGB-D", "tum/groundtruth.txt"),
+    ("TUM RGB-D", "tum/calibration.txt"),
+    ("Open3D", "open3d/trajectory.log"),
+    ("Open3D", "open3d/camera_intrinsic.json"),
+    ("RTAB-Map", "rtabmap/rtabmap_camera_poses.txt"),
+    ("RTAB-Map", "rtabmap/rtabmap_calib/1.yaml"),
+    ("Metashape", "metashape/cameras.xml"),
+)
+"""Recordings that robots and scanners make, and files of theirs."""
 
 RUN = ("config.json", "steps.jsonl", "metrics.json")
 
@@ -198,6 +253,11 @@ LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]]
         for kind, end in (("text", "txt"), ("binary", "bin"))
         for name in (f"{n}.{end}" for n in ("cameras", "images", "points3D", "frames", "rigs"))
     },
+    **{
+        f"{kind} {Path(file).stem}": (file, recording(kind, file), of_recording)
+        for kind, file in ROBOTS
+    },
+    "poses": ("poses.csv", poses, of_poses),
 }
 """Loader -> name of its file, function that writes a sound one, function that reads it."""
 

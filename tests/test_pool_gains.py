@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mgs.policy import pool_gains as module
 from mgs.policy.directional import Views, gains
-from mgs.policy.pool_gains import pool_gains
+from mgs.policy.pool_gains import PoolGains, planned_views, pool_gains
 
 LAM = (0.02 / 1.0) ** 2
 POSES = 7
@@ -106,3 +106,51 @@ def test_memory_is_what_the_constants_say():
     pairs, entries = np.count_nonzero(pool.seen), 16 * 17 // 2
     expected = module.BYTES_OF_ENTRY * 3000 * entries + module.BYTES_OF_PAIR * pairs
     assert sum(np.asarray(a).nbytes for a in arrays) == pytest.approx(expected, rel=0.01)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 10_000), st.integers(0, 2), st.booleans(), st.permutations(range(POSES)))
+def test_gains_after_a_view_is_dropped_are_those_without_it(seed, degree, over_dome, order):
+    points, pool, dome = scene(seed)
+    around = dome if over_dome else None
+    held = PoolGains(points, pool, LAM, degree, 0.3, around)
+    held.take(order[:3])
+    held.drop(order[1])
+    asked = [order[0], order[2]], order[3:], degree, 0.3, over_dome
+    expected = reference(points, pool, dome, *asked)
+    assert held.of_poses(order[3:]) == pytest.approx(expected, rel=1e-5, abs=1e-7 * expected.max())
+
+
+def circle(count, radius):
+    angles = 2 * np.pi * np.arange(count) / count
+    return radius * np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
+
+
+@pytest.mark.parametrize(("taken", "count"), [([0], 2), ([0, 1], 4), ([0, 3, 9], 5)])
+def test_no_exchange_betters_a_plan_which_greedy_choice_misses(taken, count):
+    """Around a disc, where two views after the first are best at thirds of the circle."""
+    points, positions = circle(24, 1), circle(16, 4)
+    towards = positions[:, None] - points
+    cosine = (towards * points).sum(2) / np.linalg.norm(towards, axis=2)
+    pool = Views(positions, np.maximum(cosine, 0).astype(np.float32) ** 2)
+    free = [view for view in range(16) if view not in taken]
+
+    def gains_of(before, views):
+        return reference(points, pool, None, taken + before, views, 1, 0.3, False)
+
+    def gain(views):
+        return sum(gains_of(views[:k], [view])[0] for k, view in enumerate(views))
+
+    greedy = []
+    for _ in range(count):
+        left = [view for view in free if view not in greedy]
+        greedy.append(left[int(gains_of(greedy, left).argmax())])
+    held = PoolGains(points, pool, LAM, 1, 0.3)
+    held.take(taken)
+    plan = planned_views(held, free, count)
+    assert gain(plan) > 1.0001 * gain(greedy)
+    for k in range(count):
+        for other in set(free) - set(plan):
+            assert gain([*plan[:k], other, *plan[k + 1 :]]) < 1.0001 * gain(plan)
+    if taken == [0]:
+        assert sorted(plan) == [5, 11]

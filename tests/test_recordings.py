@@ -36,8 +36,9 @@ def millimetres(frame) -> np.ndarray:
 class Bag:
     """A bag in which a robot records the frames of a dataset, two a second."""
 
-    def __init__(self, path: Path, version: int) -> None:
+    def __init__(self, path: Path, version: int, storage: str = "SQLITE3") -> None:
         from rosbags.rosbag1 import Writer as Writer1
+        from rosbags.rosbag2 import StoragePlugin
         from rosbags.rosbag2 import Writer as Writer2
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -47,7 +48,10 @@ class Bag:
         if version == 1:
             text = "geometry_msgs/TransformStamped[] transforms"
             self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
-        self.writer = Writer1(path) if version == 1 else Writer2(path, version=9)
+        plugin = StoragePlugin[storage]
+        self.writer = (
+            Writer1(path) if version == 1 else Writer2(path, version=9, storage_plugin=plugin)
+        )
 
     def make(self, kind: str, *values):
         return self.store.types[kind](*values)
@@ -102,10 +106,15 @@ class Bag:
 
 
 def write_bag(
-    path: Path, dataset, version: int = 2, leave_out: str = "", poses: str = "tf"
+    path: Path,
+    dataset,
+    version: int = 2,
+    leave_out: str = "",
+    poses: str = "tf",
+    storage: str = "SQLITE3",
 ) -> Path:
     """Write a bag without the topics whose names contain `leave_out`."""
-    bag = Bag(path, version)
+    bag = Bag(path, version, storage)
     with bag.writer:
         for k, frame in enumerate(dataset.frames):
             time, camera = 100 + 0.5 * k, frame.camera
@@ -212,6 +221,7 @@ def write_metashape(root: Path, dataset, more: str = "") -> Path:
 
 WRITERS = {
     "ROS bag 2": lambda root, data: write_bag(root / "bag", data),
+    "ROS bag MCAP": lambda root, data: write_bag(root / "bag", data, storage="MCAP"),
     "ROS bag 1": lambda root, data: write_bag(root / "one.bag", data, 1),
     "ROS bag poses": lambda root, data: write_bag(root / "bag", data, poses="stamped"),
     "TUM RGB-D": lambda root, data: write_tum(root / "tum", data),

@@ -5,6 +5,7 @@ Each reader returns keyframes as fields of `mgs.data.sources.Shot`, in metres.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -48,8 +49,11 @@ def numbers(path: Path, words: list[str]) -> list[float]:
 
 
 def poses(path: Path) -> list[list[float]]:
-    """Lines (time, x, y, z, qx, qy, qz, qw, ...) of a trajectory."""
-    return [numbers(path, words) for words in rows(path, 8)]
+    """Lines (time, x, y, z, qx, qy, qz, qw, ...) of a trajectory. Raises InputError if none is."""
+    found = [numbers(path, words) for words in rows(path, 8)]
+    if not found:
+        raise InputError(f"{path}: lists no poses; record or export it again")
+    return found
 
 
 def calibration(folder: Path, image: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -60,7 +64,7 @@ def calibration(folder: Path, image: Path) -> tuple[np.ndarray, np.ndarray]:
         record: Any = read_json(path)
         try:
             K = np.array(record["intrinsic_matrix"], np.float64).reshape(3, 3).T.copy()
-        except (TypeError, KeyError, ValueError):
+        except (TypeError, KeyError, ValueError, OverflowError):
             raise InputError(f"{path}: has no intrinsic_matrix of 9 numbers; correct it") from None
         K[:2, 2] += 0.5
         return K, np.zeros(5)
@@ -165,17 +169,20 @@ def read_rtabmap(folder: Path, spacing: Spacing) -> list[dict[str, Any]]:
 
 
 def _opencv_yaml(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """K and distortion of a camera as OpenCV's FileStorage writes them."""
-    import cv2
-
+    """K and distortion of a camera as OpenCV's FileStorage writes them, which aborts the process
+    where it reads some damaged files."""
     with reading(path):
-        path.stat()
-    try:
-        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        K = np.array(file.getNode("camera_matrix").mat(), np.float64).reshape(3, 3)
-        D = np.array(file.getNode("distortion_coefficients").mat(), np.float64).ravel()
-    except (cv2.error, ValueError, TypeError, SystemError):
-        raise InputError(f"{path}: has no camera_matrix and distortion_coefficients") from None
+        text = path.read_text(errors="replace")
+    found = []
+    for key in ("camera_matrix", "distortion_coefficients"):
+        data = re.search(rf"^{key}:[^\[]*\bdata:\s*\[([^\]]*)\]", text, re.MULTILINE)
+        if data is None:
+            raise InputError(f"{path}: has no {key}; export it again")
+        found.append(np.array(numbers(path, data[1].replace(",", " ").split())))
+    K, D = found
+    if K.size != 9 or D.size not in (0, 4, 5, 8):
+        raise InputError(f"{path}: has {K.size} and {D.size} numbers, not 9 and 4, 5 or 8")
+    K = K.reshape(3, 3)
     K[:2, 2] += 0.5
     return K, np.concatenate([D, np.zeros(max(0, 5 - len(D)))])
 
@@ -185,7 +192,9 @@ def _pose(path: Path, row: list[float]) -> np.ndarray:
     try:
         return rigid(row[:3], row[3:])
     except ValueError:
-        raise InputError(f"{path}: has a quaternion of zeros; correct the line") from None
+        raise InputError(
+            f"{path}: has a quaternion whose length is not 1; correct the line"
+        ) from None
 
 
 def _shot(

@@ -165,6 +165,28 @@ def read_source(
     recognised, no image exists, a frame is listed twice, or a camera model is not supported.
     """
     source = Path(source)
+    source.exists()  # an OSError of the source itself is not one of a file that it names
+    try:
+        result = _recognised(source, images, split, keyframes, unpack)
+    except OSError as error:
+        raise InputError(
+            f"{source}: a file of it cannot be read ({error.strerror or error}); correct its name"
+        ) from None
+    if not result.shots:
+        raise InputError(
+            f"{source}: none of the {result.missing} images it lists exists; "
+            "restore them or give --images"
+        )
+    for name, count in Counter(shot.name for shot in result.shots).items():
+        if count > 1:
+            raise InputError(f"{source}: lists {name} more than once; remove the duplicate frames")
+    return result
+
+
+def _recognised(
+    source: Path, images: Path | None, split: str, keyframes: str, unpack: Path | None
+) -> Source:
+    """`read_source` without checks of the shots. Raises OSError for names that are too long."""
     if not source.exists():
         raise InputError(
             f"{source}: no such file or folder; "
@@ -179,26 +201,16 @@ def read_source(
         reader = RECORDINGS[recording][1]
         fields, unit = reader(source, images, Spacing.parse(keyframes), folder)
         shots = [Shot(**each) for each in fields if each["image"].is_file()]
-        result = Source(recording, shots, len(fields) - len(shots), unit=unit)
-    elif path.is_file() or split_path.is_file():
-        result = _read_transforms(path if path.is_file() else split_path)
-    elif model := next((folder for folder in folders if is_model(folder)), None):
-        result = _read_colmap(model, images if images is not None else source / "images")
-    else:
-        raise InputError(
-            f"{source}: holds no transforms.json, transforms_{split}.json or COLMAP model "
-            "(cameras, images and points3D, .bin or .txt, in sparse/0, sparse or the folder "
-            f"itself), and is no {', '.join(RECORDINGS)}"
-        )
-    if not result.shots:
-        raise InputError(
-            f"{source}: none of the {result.missing} images it lists exists; "
-            "restore them or give --images"
-        )
-    for name, count in Counter(shot.name for shot in result.shots).items():
-        if count > 1:
-            raise InputError(f"{source}: lists {name} more than once; remove the duplicate frames")
-    return result
+        return Source(recording, shots, len(fields) - len(shots), unit=unit)
+    if path.is_file() or split_path.is_file():
+        return _read_transforms(path if path.is_file() else split_path)
+    if model := next((folder for folder in folders if is_model(folder)), None):
+        return _read_colmap(model, images if images is not None else source / "images")
+    raise InputError(
+        f"{source}: holds no transforms.json, transforms_{split}.json or COLMAP model "
+        "(cameras, images and points3D, .bin or .txt, in sparse/0, sparse or the folder "
+        f"itself), and is no {', '.join(RECORDINGS)}"
+    )
 
 
 def find_image(folder: Path, name: str) -> Path | None:

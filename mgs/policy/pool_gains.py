@@ -38,6 +38,9 @@ BYTES_OF_ENTRY, BYTES_OF_PAIR = 16, 40
 """Bytes of one entry of both matrices for a Gaussian, and of a pair of a pose and a Gaussian. S, g
 and q exist twice during an update."""
 
+BETTER = 1 + 1e-6
+"""Least ratio of gains for which views are exchanged: above rounding errors. A chosen constant."""
+
 
 def pool_gains(
     points: Array, lam: float, pool: Callable[[], Views], dome: Callable[[], Views]
@@ -51,14 +54,13 @@ def pool_gains(
     poses of the dome, and what they see.
     """
     known: dict[tuple[int, float, bool], PoolGains] = {}
-    pairs = cache(lambda: int(np.count_nonzero(pool().seen)))
+    fitting = cache(lambda degree: fits(points, pool(), degree))
 
     def found(
         taken: Sequence[int], candidates: Sequence[int], degree: int, tau: float, over_dome: bool
     ) -> NDArray[np.float64]:
         key, views, around = (degree, tau, over_dome), pool(), dome() if over_dome else None
-        entries = len(points) * len(_upper((degree + 1) ** 2))
-        if not pairs() or BYTES_OF_ENTRY * entries + BYTES_OF_PAIR * pairs() > IMAGE_BYTES:
+        if not fitting(degree):
             before, after = (
                 Views(views.positions[list(some)], views.seen[list(some)])
                 for some in (taken, candidates)
@@ -71,6 +73,38 @@ def pool_gains(
         return kept.of_poses(candidates)
 
     return found
+
+
+def fits(points: Array, pool: Views, degree: int) -> bool:
+    """Whether `PoolGains` takes at most IMAGE_BYTES, and some view sees something."""
+    pairs = int(np.count_nonzero(pool.seen))
+    entries = len(points) * len(_upper((degree + 1) ** 2))
+    return pairs > 0 and BYTES_OF_ENTRY * entries + BYTES_OF_PAIR * pairs <= IMAGE_BYTES
+
+
+def planned_views(gains: PoolGains, candidates: Sequence[int], count: int) -> list[int]:
+    """Views to take next, as a set: greedily, then exchanged one by one until no exchange has a
+    larger gain (V. V. Fedorov, Theory of Optimal Experiments, 1972).
+
+    gains: after the views taken; changed. candidates: poses, more than `count`.
+    """
+    chosen: list[int] = []
+    for _ in range(count):
+        free = [view for view in candidates if view not in chosen]
+        chosen.append(free[int(gains.of_poses(free).argmax())])
+        gains.take(chosen[-1:])
+    improved = True
+    while improved:
+        improved = False
+        for k, view in enumerate(chosen):
+            gains.drop(view)
+            free = [view] + [other for other in candidates if other not in chosen]
+            found = gains.of_poses(free)
+            best = int(found.argmax())
+            if found[best] > BETTER * found[0]:
+                chosen[k], improved = free[best], True
+            gains.take([chosen[k]])
+    return chosen
 
 
 class PoolGains:
@@ -135,9 +169,15 @@ class PoolGains:
             self.taken.append(view)
             self._take(view)
 
-    def _take(self, view: int) -> None:
+    @one_at_a_time
+    def drop(self, view: int) -> None:
+        """Undo the update of a view taken: it adds -W y y^T."""
+        self.taken.remove(view)
+        self._take(view, sign=-1.0)
+
+    def _take(self, view: int, sign: float = 1.0) -> None:
         n = len(self.points) // 3
-        weights = mi.Float64(padded(self.pool.seen[view], np.float64))
+        weights = sign * mi.Float64(padded(self.pool.seen[view], np.float64))
         y = self._harmonics(dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, view, n))
         u = _times(self.S, y)
         w = None if self.M is None else _times(self.S, _times(self.M, u))
@@ -164,7 +204,7 @@ class PoolGains:
         # A loop of at most one round: neighbouring lanes mostly belong to one Gaussian, and skip
         # the round if the view misses it.
         before = _at(k, self.of), self.g, mi.Float64(0) if w is None else self.q
-        _, self.g, q = dr.while_loop(before, lambda k_of, g, q: k_of > 0, change)
+        _, self.g, q = dr.while_loop(before, lambda k_of, g, q: k_of != 0, change)
         self.q = None if w is None else q
         dr.eval(self.g, self.q)
 

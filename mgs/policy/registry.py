@@ -29,11 +29,17 @@ from mgs.policy.criteria import (
 from mgs.policy.criteria import i_optimal as i_optimality
 from mgs.policy.poses import POSE_POLICIES
 
+DIRECTIONAL_D = 1, 0.3
+"""SH degree and tau of `directional-d`, chosen on five rocks that judge nothing."""
+
+PLANNED = {"directional-d": DIRECTIONAL_D}
+"""Policies that choose among the views of a plan for the whole budget (`Problem.planned`), with
+degree and tau of its directional gains."""
+
 
 def directional_d(context: PolicyContext) -> Array:
-    """Directional D-optimality, nats, with colours of SH degree 1 and tau 0.3: degree and tau were
-    chosen on five rocks that judge nothing (`mgs.policy.directional`)."""
-    return context.gains(context.taken_frames, context.candidate_frames, 1, 0.3, False)
+    """Directional D-optimality, nats (`mgs.policy.directional`)."""
+    return context.gains(context.taken_frames, context.candidate_frames, *DIRECTIONAL_D, False)
 
 
 def directional_i(context: PolicyContext) -> Array:

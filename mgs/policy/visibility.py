@@ -42,6 +42,7 @@ class Visibility:
         self.turn = np.eye(3) if turn is None else turn
         self.positions = np.array([camera.position for camera in cameras]) @ self.turn.T
         self.seen, self.pool, self.dome = cache(self._seen), cache(self._pool), cache(self._dome)
+        self.planned = cache(self._planned)
         # (frame) -> `exact` of its camera: a copy, because the kernel returns part of a larger
         # array.
         self.information = kept_within(
@@ -54,6 +55,24 @@ class Visibility:
         from mgs.policy.pool_gains import pool_gains  # imported here because it loads Dr.Jit
 
         return pool_gains(self.points, self.lam, self.pool, self.dome)
+
+    def _planned(
+        self,
+        taken: tuple[int, ...],
+        candidates: tuple[int, ...],
+        count: int,
+        degree: int,
+        tau: float,
+    ) -> Sequence[int]:
+        """Candidates to take next, as a set of at most `count` (`planned_views`); all where the
+        gains of the pool do not fit into the memory."""
+        from mgs.policy.pool_gains import PoolGains, fits, planned_views
+
+        if count >= len(candidates) or not fits(self.points, self.pool(), degree):
+            return candidates
+        gains = PoolGains(self.points, self.pool(), self.lam, degree, tau)
+        gains.take(taken)
+        return planned_views(gains, candidates, count)
 
     def _seen(self, frame: int) -> Array:
         """Squared blending weights of the Gaussians in one view [N]."""

@@ -157,7 +157,8 @@ def write_preview(
     window = crop(visible)
     height, width = visible[window].shape
     with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure = new_figure(8.4, 3 * (2.3 * height / width + 0.35), dpi=130)
+        figure = new_figure(8.4, 3 * (2.3 * height / width + 0.35) + 0.4, dpi=130)
+        figure.suptitle("What the images taken determine")
         axes = figure.subplots(3, 3).flat
         axes[0].imshow(srgb_from_linear(rgb)[window], interpolation="nearest")
         axes[0].set_title(literal(title))

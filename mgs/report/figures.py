@@ -279,7 +279,8 @@ def comparison_figure(
     limit = max(float(np.quantile(d, 0.995)) for d in differences.values()) or 1.0
     columns, aspect = 1 + len(images), shown.shape[0] / shown.shape[1]
     with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure = new_figure(2.7 * columns, 2.7 * aspect * 2 + 0.9, dpi=150)
+        figure = new_figure(2.7 * columns, 2.7 * aspect * 2 + 1.2, dpi=150)
+        figure.suptitle("One view: truth, renders, errors")
         axes = figure.subplots(2, columns)
         axes[0, 0].imshow(shown, interpolation="nearest")
         axes[0, 0].set_title(f"truth\n{_in_lines(title)}")
@@ -321,7 +322,8 @@ def uncertainty_figure(
     shown = [row for row in rows if row["views"] == judged_on]
     coloured = list(zip(shown, PREDICTION_COLOURS, strict=False))
     with matplotlib.rc_context(STYLE):
-        figure = new_figure(8.4, 6.4)
+        figure = new_figure(8.4, 6.7)
+        figure.suptitle("Predicted errors beside the true ones")
         above, below = figure.subfigures(2, 1, height_ratios=(1.15, 1))
         _draw_maps(above, maps)
         area, held, pit = below.subplots(1, 3)

@@ -167,12 +167,14 @@ def choose(
 ) -> tuple[int, float]:
     """Choose the next view: (frame, score) of the view in reach of largest score / travel cost.
 
-    A tie goes to the pose farthest from those taken. Where the flight has a limit, it is the first
-    stop of `plan_flight`. fisher(frame) -> [N,P]: information of a view at the model, computed by
-    default. Raises InputError if the policy returns no valid score.
+    With a policy that plans, it is a view of the plan (`Problem.planned`). A tie goes to the pose
+    farthest from those taken. Where the flight has a limit, it is the first stop of `plan_flight`.
+    fisher(frame) -> [N,P]: information of a view at the model, computed by default. Raises
+    InputError if the policy returns no valid score.
     """
     fisher = fisher or problem.view_information(state.gaussians)
     if problem.settings.flies:
         return plan_flight(problem, state, fisher)[0]
-    context = problem.context(state, problem.reachable(state.taken), fisher)
+    left = problem.planned(state.taken, problem.reachable(state.taken))
+    context = problem.context(state, left, fisher)
     return rated(problem, context, problem.travel_cost(context))[0]

@@ -20,7 +20,7 @@ from mgs.memory import IMAGE_BYTES, VIEW_BYTES, Deferred, kept_within
 from mgs.policy import criteria, poses, tour
 from mgs.policy.context import Policy, PolicyContext
 from mgs.policy.from_file import label
-from mgs.policy.registry import policy_named
+from mgs.policy.registry import PLANNED, policy_named
 from mgs.policy.visibility import Visibility
 from mgs.prior.exposure import without_gain
 from mgs.run.flight import Flight, allowed_poses
@@ -222,6 +222,26 @@ class Problem:
         here = self.positions[taken[-1]]
         near = poses.nearest_poses(self.positions[left], here, self.settings.nearest)
         return [left[k] for k in near]
+
+    def planned(self, taken: Sequence[int], left: list[int]) -> list[int]:
+        """Frames in `left` that a policy of PLANNED takes with what the budget has left.
+
+        They are those of the plan made after the seeds; after views that are not in it, of a new
+        plan. All of `left` for other policies, and where candidates differ in reach or travel cost.
+        """
+        settings = self.settings
+        model = PLANNED.get(settings.policy)
+        if model is None or settings.nearest or settings.travel or settings.flies:
+            return left
+        for start in (taken[: settings.seeds], taken):
+            count = settings.budget - (len(start) - settings.seeds)
+            plan = self.visibility.planned(
+                tuple(start), tuple(self.reachable(start)), count, *model
+            )
+            rest = [i for i in left if i in plan]
+            if rest and set(taken[len(start) :]) <= set(plan):
+                return rest
+        return left
 
     def travel_cost(self, context: PolicyContext) -> np.ndarray:
         """Travel cost of each candidate [C]; ones without the setting `travel`."""

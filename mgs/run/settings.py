@@ -89,7 +89,7 @@ class NbvSettings(BaseModel):
     stop_uncertainty: Annotated[float, Field(gt=0, lt=1)] | None = None
     """End the run when at most this share (0 to 1) of the prior's variance is left."""
     seeds: Annotated[int, Field(ge=1)] = 4
-    """Number of views, evenly spaced in azimuth, that start the model."""
+    """Number of views, spread over the directions of the poses, that start the model."""
     seed: Annotated[int, Field(ge=0)] = 0
     """Root of every random draw."""
     lam: Annotated[float, Field(ge=1e-30, le=1e30, allow_inf_nan=False)] | None = None

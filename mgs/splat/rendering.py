@@ -16,6 +16,7 @@ from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.gaussians import SH_MAX, Gaussians
 from mgs.memory import padded
+from mgs.notebook import html, picture
 from mgs.splat import blocks, kernels
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
 from mgs.splat.projection import Splats, camera_array, project
@@ -38,6 +39,13 @@ class Image:
     rgb: Any
     alpha: Any
     depth: Any
+
+    def __repr__(self) -> str:
+        height, width = self.alpha.shape
+        return f"Image({width}x{height})"
+
+    def _repr_html_(self) -> str:
+        return html(repr(self), [picture(np.asarray(self.rgb))])
 
 
 REMEMBERED = 1 << 10
