@@ -15,11 +15,18 @@ import ctypes
 import glob
 import os
 import re
+import signal
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Thread
+from typing import TYPE_CHECKING
 
 from mgs.errors import InputError
+
+if TYPE_CHECKING:
+    from concurrent.futures import ProcessPoolExecutor
 
 VARIANT = "llvm_ad_rgb"
 """Default variant: compiled by LLVM, differentiable, RGB, single precision."""
@@ -207,6 +214,43 @@ def _check_variant() -> None:
         )
     if dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
         _check_libllvm()
+
+
+def processes(count: int, threads: int | None = None) -> ProcessPoolExecutor:
+    """Executor of new processes, for work of many small kernels: two threads take twice the time
+    of one to wait for each other.
+
+    They end silently at Ctrl-C and when this process has ended. threads: of Dr.Jit in each; by
+    default as many as there are cores.
+    """
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    return ProcessPoolExecutor(
+        count, get_context("spawn"), initializer=_begin_process, initargs=(threads,)
+    )
+
+
+def _begin_process(threads: int | None) -> None:
+    """Begin a process of `processes`."""
+    from multiprocessing import parent_process
+
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # as `mgs.__main__`
+    parent = parent_process()
+    assert parent
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=wait, daemon=True).start()
+    if threads:
+        start()
+        import drjit as dr
+
+        dr.set_thread_count(threads)
 
 
 def processor() -> dict[str, str | int]:

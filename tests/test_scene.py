@@ -88,9 +88,10 @@ def ball():
 
 def test_the_image_is_that_of_the_inner_integrator_and_the_rock_a_part_of_it(ball):
     scene, _ = ball
-    for integrator, spp in ((scene.path, 5), (scene.guides, 8)):
+    aov = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
+    for integrator, inner, spp in ((scene.path, scene.path.inner, 5), (scene.guides, aov, 8)):
         image, rock, share = render_layers(scene.scene, integrator, spp, seed=4)
-        alone = np.array(mi.render(scene.scene, integrator=integrator.inner, spp=spp, seed=4))
+        alone = np.array(mi.render(scene.scene, integrator=inner, spp=spp, seed=4))
         np.testing.assert_array_equal(image[..., -alone.shape[-1] :], alone)
         np.testing.assert_array_equal(rock[share == 1], image[share == 1])
         assert not rock[share == 0].any()

@@ -78,6 +78,8 @@ def test_a_coarse_model_keeps_the_best(run, site, monkeypatch):
     monkeypatch.setattr(coarse_prior, "__defaults__", (100,))
     coarse = suggest(opened, dome).ranking
     assert whole[coarse[0].name] > 0.9 * max(whole.values())
+    ranks = np.argsort(np.argsort([whole[view.name] for view in coarse]))
+    assert np.corrcoef(ranks, np.arange(20)[::-1])[0, 1] > 0.9
 
 
 def test_a_dataset_is_one_command_and_its_flight_plan_is_read_by_pymavlink(run, tmp_path, capsys):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import time
-from functools import partial
+from collections.abc import Iterator
+from concurrent.futures import wait
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +18,7 @@ from mgs.cli.nbv import resume_and_print, start_and_print
 from mgs.cli.options import Seed, argument
 from mgs.cli.printing import print_quality
 from mgs.cli.prior import prior
+from mgs.cli.progress import progress_bar
 from mgs.cli.synth_orbit import synth_orbit
 from mgs.errors import InputError
 from mgs.files import check_new_folder, check_writable, read_json
@@ -67,16 +71,16 @@ def demo(
     if not (folder / "prior.json").is_file():
         prior(dataset, out=folder, gaussians=str(GAUSSIANS), seed=seed)
     opened: list[Run] = []
-    share = partial(share_seeds, runs)
     for policy, run in zip(POLICIES, runs, strict=True):
         if (run / "config.json").is_file():
             opened.append(open_run(run))
             continue
         settings: Any = {"policy": policy, "budget": BUDGET, "seed": seed, "evaluate_every": 1}
         opened.append(start_and_print(dataset, run, console, prior=folder, **settings))
-    for policy, started_run in zip(POLICIES, opened, strict=True):
-        heading(f"3/5 next best views: {policy}, 4 seeds and {BUDGET} views")
-        resume_and_print(started_run, console, pictures=True, on_state=share)
+    heading(f"3/5 next best views by {len(runs)} policies, 4 seeds and {BUDGET} views each")
+    for done in completed(opened, console):
+        heading(f"3/5 {done.label}")
+        resume_and_print(done, console, pictures=True)
     heading("4/5 what the views say about each Gaussian")
     diagnose(runs[:1], force=True)
     heading("5/5 the report")
@@ -88,13 +92,52 @@ def demo(
         console.print(f"  {picture}", soft_wrap=True)
 
 
-def share_seeds(runs: list[Path], state: State) -> None:
-    """Give the fit to the seeds, the same for every policy, to the runs that have none yet."""
-    from mgs.run.folder import write_checkpoint
+def completed(runs: list[Run], console: Console) -> Iterator[Run]:
+    """Complete runs, as many at once as there are cores, each in a process; yield them in order.
 
-    for run in runs:
-        if len(state.steps) == 1 and not (run / "checkpoint.npz").is_file():
-            write_checkpoint(run, state)
+    Raises InputError as `resume_nbv`, and if a process is killed.
+    """
+    left = [run.folder for run in runs if not (run.folder / "metrics.json").is_file()]
+    cores = len(os.sched_getaffinity(0))
+    count = max(1, min(len(left), cores))
+    with runtime.processes(count, cores // count) as pool:
+        working = {folder: pool.submit(complete, folder, left[count:]) for folder in left}
+        try:
+            for run in runs:
+                with progress_bar("steps", console) as progress:
+                    while run.folder in working and not wait([working[run.folder]], 1).done:
+                        progress("steps", sum(map(steps_done, left)), len(left) * (1 + BUDGET))
+                if run.folder in working:
+                    working[run.folder].result()
+                yield run
+        except BrokenProcessPool:
+            raise InputError(
+                "demo: a process was killed (is there too little memory?); give the command again"
+            ) from None
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def complete(run: Path, others: list[Path]) -> None:
+    """Run or resume a run, and evaluate it. others: get the fit to the seeds, the same for every
+    policy, if they have none yet."""
+    from mgs.report.evaluation import evaluate_run
+    from mgs.run.folder import write_checkpoint
+    from mgs.run.nbv import resume_nbv
+
+    def share(state: State) -> None:
+        for other in others:
+            if len(state.steps) == 1 and not (other / "checkpoint.npz").is_file():
+                write_checkpoint(other, state)
+
+    resume_nbv(run, share)
+    evaluate_run(run)
+
+
+def steps_done(run: Path) -> int:
+    """Number of finished steps of a run."""
+    lines = run / "steps.jsonl"
+    return len(lines.read_bytes().splitlines()) if lines.is_file() else 0
 
 
 def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:

@@ -40,7 +40,7 @@ def read_metashape(path: Path, images: Path) -> tuple[list[dict[str, Any]], str 
         ]
     except InputError:
         raise
-    except (ElementTree.ParseError, AssertionError, KeyError, ValueError, TypeError) as error:
+    except (ElementTree.ParseError, AssertionError, LookupError, ValueError, TypeError) as error:
         reason = str(error) or "no chunk"
         raise InputError(
             f"{path}: is no XML of Metashape's cameras ({reason}); export it again"

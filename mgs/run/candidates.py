@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import load_cameras
@@ -175,12 +174,9 @@ def inside(mesh: Mesh, points: np.ndarray) -> NDArray[np.bool_]:
     Strackee 1983), so a mesh with holes has an inside too.
     """
     found = np.zeros(len(points), bool)
-    try:
-        planes = ConvexHull(mesh.vertices).equations
-    except QhullError:  # flat
-        return found
     corners = mesh.vertices[mesh.faces]
-    for k in np.flatnonzero((points @ planes[:, :3].T + planes[:, 3] <= 0).all(1)):
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    for k in np.flatnonzero(((points > low) & (points < high)).all(axis=1)):
         a, b, c = np.moveaxis(corners - points[k], 1, 0)
         la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
         volume = np.einsum("fk,fk->f", a, np.cross(b, c))
@@ -209,7 +205,9 @@ def refusals(
     rise = np.degrees(np.arcsin(np.clip(offset[:, 2] / np.maximum(far, 1e-12), -1, 1)))
     low, high = elevations or (-90.0, 90.0)
     beyond = (rise < low - 1e-6) | (rise > high + 1e-6)
-    near = distances_to_mesh(eyes, mesh.vertices, mesh.faces) < safe_distance
+    near = np.zeros(len(poses), bool)
+    if safe_distance > 0:  # measuring takes seconds
+        near = distances_to_mesh(eyes, mesh.vertices, mesh.faces) < safe_distance
     within = inside(mesh, eyes)
     reasons = {
         "inside the object": within,

@@ -12,6 +12,9 @@ from mgs.policy.context import PolicyContext
 from mgs.run.problem import Problem
 from mgs.run.state import Fitted
 
+ROUNDING = 1e-9
+"""Share of the limits: a stop in reach fits, though its metres are summed in another order."""
+
 
 def surface_information(
     problem: Problem, new: Sequence[int], before: Fitted | None = None
@@ -75,7 +78,7 @@ def plan_flight(
         metres, count = before + tour.tour_length(flight.legs, way), pictures + len(scores)
         added, places = tour.insertions(flight.legs, way, pool)
         shares = flight.share(metres + added, count + 1)
-        fits = [k for k in range(len(pool)) if shares[k] <= 1]
+        fits = [k for k in range(len(pool)) if shares[k] <= 1 + ROUNDING]
         if not fits:
             break
         context = problem.context(planned, [pool[k] for k in fits], fisher)

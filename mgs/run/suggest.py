@@ -17,17 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mgs.camera import Camera
+from mgs.colour import SH_C0
 from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
+from mgs.memory import VIEW_BYTES, kept_within
 from mgs.policy import criteria, tour
 from mgs.policy.context import Policy
 from mgs.policy.directional import squared_weights
 from mgs.policy.from_file import in_file, is_function, name_of
 from mgs.policy.registry import policy_of
 from mgs.prior.build import Prior
-from mgs.prior.initial import initial_gaussians
 from mgs.run.candidates import Named, Site, refusals
 from mgs.run.folder import Run
 from mgs.run.loop import Chooser, choose, choose_batch, information
@@ -266,7 +267,7 @@ def _problem(
     """
     prior, rows = coarse_prior(run.prior)
     thinning = len(prior.points) / len(run.prior.points)
-    model, start = _coarse(run.state.gaussians, rows, thinning, run.prior), _start(prior)
+    model = _coarse(run.state.gaussians, rows, thinning)
     width = max(round(images[0].camera.width * thinning**0.5), 1)
 
     def small(camera: Camera) -> Camera:
@@ -277,7 +278,7 @@ def _problem(
     dataset = Dataset(run.dataset.root, tuple(frames), run.dataset.up, run.dataset.unit)
     count, ratio = len(images), images[0].camera.width / frames[0].camera.width
     usual = operations_of(dataset, prior, settings)
-    operations = _scaled(replace(usual, initial=lambda frames: start), ratio**2 * thinning)
+    operations = _of_model(usual, model, settings.estimator, ratio**2 * thinning)
     problem = Problem(dataset, settings, operations, progress, policy, seeds=range(count))
     problem.skipped = count
     taken = [*range(1, count), 0]
@@ -297,8 +298,10 @@ def coarse_prior(prior: Prior, most: int = COARSE) -> tuple[Prior, NDArray[np.in
     rows = np.arange(count)
     while len(rows) > most or high / low > 1.05:
         cell = np.sqrt(low * high)
-        cells = np.floor(prior.points / cell).astype(np.int64)
-        rows = np.sort(np.unique(cells, axis=0, return_index=True)[1])
+        cells = np.floor((prior.points - prior.points.min(axis=0)) / cell).astype(np.int64)
+        x, y, z = cells.T
+        _, y_size, z_size = cells.max(axis=0) + 1
+        rows = np.sort(np.unique((x * y_size + y) * z_size + z, return_index=True)[1])
         low, high = (cell, high) if len(rows) > most else (low, cell)
     thinned = replace(
         prior,
@@ -310,26 +313,31 @@ def coarse_prior(prior: Prior, most: int = COARSE) -> tuple[Prior, NDArray[np.in
     return thinned, rows
 
 
-def _coarse(model: Gaussians, rows: np.ndarray, thinning: float, prior: Prior) -> Gaussians:
-    """Gaussians of a fitted model for the samples of a coarse prior: fewer and larger."""
-    if thinning == 1:
-        return model
-    some = model[rows]
-    return replace(some, log_scales=some.log_scales - np.float32(0.5 * np.log(thinning)))
+def _coarse(model: Gaussians, rows: np.ndarray, thinning: float) -> Gaussians:
+    """Gaussians of a fitted model for the samples of a coarse prior: fewer and larger.
+
+    None is black, since the information about a colour that is clamped at 0 would be 0.
+    """
+    some = model if thinning == 1 else model[rows]
+    grown = some.log_scales - np.float32(0.5 * np.log(thinning))
+    return replace(some, log_scales=grown, sh=np.maximum(some.sh, np.float32(-0.49 / SH_C0)))
 
 
-def _start(prior: Prior) -> Gaussians:
-    """Gaussians before training, grey: no image is read."""
-    return initial_gaussians(prior, [])[0]
+def _of_model(usual: Operations, model: Gaussians, estimator: str, factor: float) -> Operations:
+    """Operations of which all information is about one model, and measured once for each view.
 
+    No image is read: the model is that before training, too. factor: from the information of a
+    view to that of an image at its own size.
+    """
 
-def _scaled(operations: Operations, factor: float) -> Operations:
-    """Operations whose information is that of the images at their own size."""
-    fisher, estimate = operations.fisher, operations.estimate
-    exact = operations.exact or fisher
+    def measured(key: tuple[Camera, str]) -> NDArray[np.float32]:
+        return np.asarray(usual.estimate(model, *key) * np.float32(factor))
+
+    kept = kept_within(VIEW_BYTES, measured, lambda F: F.nbytes)
     return replace(
-        operations,
-        fisher=lambda model, camera: fisher(model, camera) * np.float32(factor),
-        exact=lambda model, camera: exact(model, camera) * np.float32(factor),
-        estimate=lambda model, camera, name: estimate(model, camera, name) * np.float32(factor),
+        usual,
+        initial=lambda frames: model,
+        fisher=lambda _, camera: kept((camera, estimator)),
+        exact=lambda _, camera: kept((camera, "exact")),
+        estimate=lambda _, camera, name: kept((camera, name)),
     )

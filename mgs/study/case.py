@@ -7,18 +7,14 @@ study's folder, or absolute. All tasks continue after an interruption.
 
 from __future__ import annotations
 
-import os
 import shutil
-import signal
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field
-from multiprocessing import get_context, parent_process
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
+from mgs import runtime
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError
 from mgs.files import atomic_folder
@@ -215,7 +211,7 @@ def in_new_process(
 
     Raises InputError if that process is killed, and what the function raises.
     """
-    with ProcessPoolExecutor(1, get_context("spawn"), initializer=_end_with_parent) as pool:
+    with runtime.processes(1) as pool:
         try:
             return pool.submit(task, *arguments).result()
         except BrokenProcessPool:
@@ -223,19 +219,6 @@ def in_new_process(
                 f"{out}: its process was killed (is there too little memory?); "
                 "give the command again"
             ) from None
-
-
-def _end_with_parent() -> None:
-    """End this process silently at Ctrl-C, and when the process that started it has ended."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    parent = parent_process()
-    assert parent
-
-    def wait() -> None:
-        parent.join()
-        os._exit(1)
-
-    Thread(target=wait, daemon=True).start()
 
 
 def peak_megabytes() -> float:

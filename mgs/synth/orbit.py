@@ -119,11 +119,13 @@ def _aimed(
 ) -> list[Camera]:
     target = np.array([0, 0, rock.bounds[1, 2] / 2])
     cameras = orbit_cameras(orbit, frames, target, scene.camera.fov, *size)
-    visible = rock.vertices[rock.vertices[:, 2] > 0]
+    visible = np.asarray(rock.vertices[rock.vertices[:, 2] > 0]).T
+    width, height = size
+    # Times (u z, v z, z): z times the distances from the borders of the image less a pixel, and z.
+    borders = np.array([[1, 0, -1], [-1, 0, width - 1], [0, 1, -1], [0, -1, height - 1], [0, 0, 1]])
     for index, camera in enumerate(cameras):
-        pixels, z = camera.project(visible)
-        beyond = (pixels < 1).any() or (pixels > np.array(size) - 1).any()
-        if beyond or (z <= 0).any():
+        planes = borders @ camera.K @ camera.world_to_camera[:3]
+        if ((planes[:, :3] @ visible).min(1) + planes[:, 3] < [0, 0, 0, 0, 1e-9]).any():
             raise InputError(
                 f"scene: the rock is not wholly in {what} {index}; raise orbit.radius or camera.fov"
             )

@@ -23,6 +23,10 @@ WEIGHT_MIN = 1e-4
 """Least divisor in place of a sum of Gaussian weights."""
 
 
+GUIDES = 6
+"""Channels of albedo and normal."""
+
+
 class RockLayer(mi.SamplingIntegrator):
     """Integrator that repeats another one's channels for the rock alone.
 
@@ -46,14 +50,43 @@ class RockLayer(mi.SamplingIntegrator):
     ) -> tuple[Any, Any, list[Any]]:
         """RGB along a camera ray, whether it meets anything, and the other channels."""
         hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-        on_rock = hit.shape == self.rock
         rgb, valid, aovs = self.inner.sample(scene, sampler, ray, medium, active)
-        layer = (dr.select(on_rock, value, 0) for value in (*rgb, *aovs, mi.Float(1)))
-        return rgb, valid, [*aovs, *layer]
+        return rgb, valid, [*aovs, *_layer(hit.shape == self.rock, rgb, aovs)]
+
+
+class Guides(mi.SamplingIntegrator):
+    """Integrator of the denoiser's guides: channels of a `RockLayer` whose inner integrator gives
+    black, albedo and shading normal.
+
+    The same numbers as with Mitsuba's `aov` integrator inside, with half the rays.
+    """
+
+    def __init__(self, rock: Any) -> None:
+        super().__init__(mi.Properties())
+        self.rock = mi.ShapePtr(rock)
+
+    def aov_names(self) -> list[str]:
+        """Names of the channels after the first RGB."""
+        return [f"guide.{k}" for k in range(GUIDES)] + [f"rock.{k}" for k in range(GUIDES + 4)]
+
+    def sample(
+        self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
+    ) -> tuple[Any, Any, list[Any]]:
+        """Black, whether a camera ray meets anything, and the other channels."""
+        hit = scene.ray_intersect(ray, mi.RayFlags.All, coherent=True, active=active)
+        valid, black = hit.is_valid(), mi.Color3f(0)
+        albedo = dr.select(valid, hit.bsdf(ray).eval_diffuse_reflectance(hit, valid), 0)
+        aovs = [*albedo, *dr.select(valid, hit.sh_frame.n, 0)]
+        return black, valid, [*aovs, *_layer(valid & (hit.shape == self.rock), black, aovs)]
+
+
+def _layer(on_rock: Any, rgb: Any, aovs: list[Any]) -> list[Any]:
+    """Channels of a sample that count for the rock alone, and their share."""
+    return [dr.select(on_rock, value, 0) for value in (*rgb, *aovs, mi.Float(1))]
 
 
 def render_layers(
-    scene: Any, integrator: RockLayer, spp: int, seed: int
+    scene: Any, integrator: RockLayer | Guides, spp: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Render once: channels of the inner integrator [H,W,C], the same for the rock alone, and the
     share of samples [H,W]."""

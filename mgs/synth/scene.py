@@ -99,7 +99,7 @@ class MitsubaScene:
     def __init__(
         self, settings: SceneFile, rock: trimesh.Trimesh, camera: Camera, seed: int
     ) -> None:
-        from mgs.synth.rock_layer import RockLayer  # needs the variant that is set by now
+        from mgs.synth.rock_layer import Guides, RockLayer  # needs the variant that is set by now
 
         ground = make_ground(settings.arena, rock, generator(seed, "ground"))
         stones = make_stones(settings.arena, rock, ground, generator(seed, "stones"))
@@ -120,9 +120,7 @@ class MitsubaScene:
         self.params.keep(["sensor.to_world"])
         self.rock = next(shape for shape in self.scene.shapes() if shape.id() == "rock")
         self.path = RockLayer(mi.load_dict({"type": "path", "max_depth": MAX_DEPTH}), self.rock)
-        self.guides = RockLayer(
-            mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}), self.rock
-        )
+        self.guides = Guides(self.rock)
 
     def render(self, camera: Camera, spp: int, seed: int, denoise: bool) -> Rendered:
         """Path-trace one frame with `spp` samples per pixel; denoise: by Open Image Denoise.
