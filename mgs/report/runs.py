@@ -46,6 +46,8 @@ class _View(BaseModel):
     trained: bool
     psnr: float
     ssim: float
+    psnr_mask: float | None = None
+    ssim_mask: float | None = None
 
 
 class _Fit(BaseModel):
