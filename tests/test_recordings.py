@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 from pathlib import Path
 
 import cv2
@@ -75,6 +76,15 @@ class Bag:
         shape = height, width, encoding, 0, len(data) // height
         self.write(topic, "sensor_msgs/msg/Image", time, self.header(time, OPTICAL), *shape, data)
 
+    def compressed_depth(self, topic: str, time: float, encoding: str, metres: np.ndarray) -> None:
+        """An image of compressed_depth_image_transport; of 32FC1 with a = 60000 and b = -10."""
+        steps = np.where(metres > 0, 60000 / np.maximum(metres, 1e-3) - 10, 0)
+        steps = 1000 * metres if encoding == "16UC1" else steps
+        png = cv2.imencode(".png", np.round(steps).astype(np.uint16))[1]
+        data = np.frombuffer(struct.pack("<iff", 0, 60000, -10) + png.tobytes(), np.uint8)
+        head, form = self.header(time, OPTICAL), f"{encoding}; compressedDepth png"
+        self.write(topic, "sensor_msgs/msg/CompressedImage", time, head, form, data)
+
     def lens(self, topic: str, time: float, camera) -> None:
         K = camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         numbers = np.zeros(5), K.ravel(), np.eye(3).ravel(), np.eye(3, 4).ravel()
@@ -112,8 +122,10 @@ def write_bag(
     leave_out: str = "",
     poses: str = "tf",
     storage: str = "SQLITE3",
+    compressed: str = "",
 ) -> Path:
-    """Write a bag without the topics whose names contain `leave_out`."""
+    """Write a bag without the topics whose names contain `leave_out`. compressed: encoding of
+    compressed depth."""
     bag = Bag(path, version, storage)
     with bag.writer:
         for k, frame in enumerate(dataset.frames):
@@ -130,7 +142,12 @@ def write_bag(
                 bag.image("/camera/color/image_raw", time + 0.2, "bgr8", 0 * rgb)  # no keyframe
             if leave_out != "camera_info":
                 bag.lens("/camera/color/camera_info", time, camera)
-            bag.image("/camera/aligned_depth/image_raw", time + 0.01, "16UC1", millimetres(frame))
+            topic = "/camera/aligned_depth/image_raw"
+            if compressed:
+                topic = f"{topic}/compressedDepth"
+                bag.compressed_depth(topic, time + 0.01, compressed, frame.depth())
+            else:
+                bag.image(topic, time + 0.01, "16UC1", millimetres(frame))
     return path
 
 
@@ -224,6 +241,8 @@ WRITERS = {
     "ROS bag MCAP": lambda root, data: write_bag(root / "bag", data, storage="MCAP"),
     "ROS bag 1": lambda root, data: write_bag(root / "one.bag", data, 1),
     "ROS bag poses": lambda root, data: write_bag(root / "bag", data, poses="stamped"),
+    "ROS bag 16UC1": lambda root, data: write_bag(root / "bag", data, compressed="16UC1"),
+    "ROS bag 32FC1": lambda root, data: write_bag(root / "one.bag", data, 1, compressed="32FC1"),
     "TUM RGB-D": lambda root, data: write_tum(root / "tum", data),
     "Open3D": lambda root, data: write_open3d(root / "open3d", data),
     "RTAB-Map": lambda root, data: write_rtabmap(root / "rtabmap", data),

@@ -18,7 +18,7 @@ from mgs.camera import Camera
 from mgs.data.tracks import Spacing, Track, rigid
 from mgs.errors import InputError
 from mgs.files import atomic_path
-from mgs.images import write_png
+from mgs.images import read_values, write_png
 
 KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 
@@ -34,6 +34,9 @@ COLOURS = {
 
 DEPTHS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
 """Encoding of a depth image -> type of its numbers, and metres in a step (REP 118)."""
+
+DEPTH_HEADER = 12
+"""Bytes before the PNG of a compressedDepth image: a number, and a and b as float32."""
 
 LENSES = ("plumb_bob", "rational_polynomial", "")
 
@@ -236,6 +239,32 @@ def _rows(message: Any, kind: str) -> np.ndarray:
     return used.view(kind).reshape(message.height, message.width, channels)
 
 
+def _metres(message: Any, scratch: Path) -> np.ndarray | None:
+    """Depth of an image [H,W] float32, metres; None for an encoding that is not supported.
+
+    A compressedDepth image has a PNG of millimetres, or of 32FC1 depth as a / depth + b, 0 where
+    there is none (compressed_depth_image_transport). scratch: file to use. Raises InputError if the
+    PNG is damaged.
+    """
+    if not hasattr(message, "format"):
+        if message.encoding not in DEPTHS:
+            return None
+        kind, unit = DEPTHS[message.encoding]
+        return _rows(message, kind)[..., 0].astype(np.float32) * np.float32(unit)
+    encoding, _, how = message.format.replace(" ", "").partition(";")
+    if encoding not in DEPTHS or how not in ("compressedDepth", "compressedDepthpng"):
+        return None
+    data = bytes(message.data)
+    scratch.write_bytes(data[DEPTH_HEADER:])
+    steps = read_values(scratch).astype(np.float32)
+    scratch.unlink()
+    if DEPTHS[encoding][0] == "u2":
+        return steps * np.float32(DEPTHS[encoding][1])
+    a, b = np.frombuffer(data[4:DEPTH_HEADER], "<f4")
+    with np.errstate(divide="ignore"):
+        return np.where(steps > 0, a / (steps - b), np.float32(0))
+
+
 def _unpack_depth(
     reader: Any, unpack: Path, frame: str, shots: dict[float, dict[str, Any]]
 ) -> None:
@@ -246,14 +275,15 @@ def _unpack_depth(
     from mgs.images import write_exr
 
     times, gaps = np.array(list(shots)), dict.fromkeys(shots, SYNCHRONOUS)
-    for topic, message in messages(reader, "Image"):
+    for topic, message in messages(reader, *KINDS):
         if "depth" not in topic.lower() or frame_of(message) != frame:
             continue
         time = float(times[np.argmin(np.abs(times - seconds(message)))])
         gap = abs(time - seconds(message))
-        if message.encoding in DEPTHS and gap < gaps[time]:
-            kind, unit = DEPTHS[message.encoding]
-            file = unpack / f"{shots[time]['name']}.exr"
-            metres = _rows(message, kind)[..., 0].astype(np.float32) * np.float32(unit)
+        file = unpack / f"{shots[time]['name']}.exr"
+        if (
+            gap < gaps[time]
+            and (metres := _metres(message, file.with_suffix(".depth"))) is not None
+        ):
             write_exr(file, {"Z": np.nan_to_num(metres, posinf=0, neginf=0)})
             gaps[time], shots[time]["depth"] = gap, file
