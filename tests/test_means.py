@@ -17,7 +17,7 @@ from mgs.fit.fitting import fit
 from mgs.fit.objective import objective
 from mgs.fit.settings import MEAN_RATE, TrainSettings
 from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
-from mgs.policy.criteria import MEAN_STD
+from mgs.policy.criteria import DIRECTIONAL_STD, MEAN_STD
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_normals
 from mgs.report.convergence import remaining_decrease
@@ -149,6 +149,10 @@ def test_a_rate_that_is_missing_is_named(cameras, targets):
         wanted.regularisation(groups(0, "free"))
 
 
+DEGREE = {"frozen": 0, "normal": 0, "free": 1}
+"""SH degree of the runs with these means."""
+
+
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     """A dataset and a prior on disk."""
@@ -158,7 +162,8 @@ def files(tmp_path_factory):
 
 def options(files, means: str, **values):
     train = {"means": means, "passes": 3}
-    return {"prior": files[1], "budget": 2, "seeds": 3, "train": train} | values
+    start = {"prior": files[1], "budget": 2, "seeds": 3, "sh": DEGREE[means]}
+    return start | {"train": train} | values
 
 
 @pytest.fixture(scope="module", params=MOVING)
@@ -191,11 +196,13 @@ def test_criteria_see_the_means_and_coverage_does_not(files, whole):
         for frame in frames
     )
     np.testing.assert_array_equal(state.H, H)
-    assert state.H.shape[1] == 11 + MEANS[means]
-    assert made.regularisation(groups(0, means))[11:] == pytest.approx(
-        (0.02 / (MEAN_STD * prior.spacing)) ** 2
-    )
-    assert state.surface.shape == (len(prior.points), 11)
+    flat = 8 + 3 * (DEGREE[means] + 1) ** 2
+    assert state.H.shape[1] == flat + MEANS[means]
+    lam = made.regularisation(groups(DEGREE[means], means))
+    assert lam[flat:] == pytest.approx((0.02 / (MEAN_STD * prior.spacing)) ** 2)
+    assert lam[3 : flat - 8] == pytest.approx((0.02 / DIRECTIONAL_STD) ** 2)
+    assert state.surface.shape == (len(prior.points), flat)
+    assert state.gaussians.sh[:, 1:].any() == (means == "free")
     frozen = run_nbv(files[0], out.parent / "frozen", **options(files, "frozen", budget=0)).state
     assert frozen.steps[0]["coverage"] == state.steps[0]["coverage"]
     moved = state.gaussians.means - prior.points
@@ -253,7 +260,7 @@ def test_diagnostics_and_viewer_read_such_a_run(files, whole):
     assert out / "diagnostics/information.ply" in written
     found = read_subject(out)
     assert set(found.scalars) == set(SCALARS)
-    lam = run_folder.open_run(out).settings.regularisation(groups(0, means))
+    lam = run_folder.open_run(out).settings.regularisation(groups(DEGREE[means], means))
     assert found.scalars["information"] == pytest.approx(0.5 * np.log1p(state.H / lam).sum(1))
     for name in LEARNED:
         assert getattr(found.gaussians, name).shape == getattr(state.gaussians, name).shape

@@ -9,7 +9,9 @@ from mgs.cli.nbv import resume_and_print, settings_of, start_and_print, with_set
 from mgs.cli.options import DatasetFolder, Force, option, parse_gaussians
 
 PANELS = {
-    "Fitting": ("passes", "means", "density", "exposure", "alpha_weight", "optimiser", "rates"),
+    "Fitting": (
+        *("passes", "means", "sh", "density", "exposure", "alpha_weight", "optimiser", "rates"),
+    ),
     "Advanced": ("pixel_noise", "prior_std", "seed"),
 }
 """Settings with an option of the same name, as `mgs.cli.nbv.PANELS`."""
@@ -31,9 +33,10 @@ def fit(
 ) -> None:
     """Fit a model to all images of a dataset, and measure it.
 
-    Means are free by default where the prior comes from photographs (points, masks or random), and
-    frozen where it comes from depth or a mesh. Test views are never fitted. The folder is a run of
-    `mgs nbv` that chooses no view, so every command for runs takes it.
+    By default means are free and colours are of degree 1 where the prior comes from photographs
+    (points, masks or random). Means are frozen and colours of degree 0 where it comes from depth or
+    a mesh. Test views are never fitted. The folder is a run of `mgs nbv` that chooses no view, so
+    every command for runs takes it.
     """
     from rich.console import Console
 

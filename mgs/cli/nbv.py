@@ -27,7 +27,9 @@ PANELS = {
     "Main options": ("policy", "budget", "seeds"),
     "Choosing": ("batch", "nearest", "travel", "stop_gain", "stop_uncertainty"),
     "Flight": ("flight_length", "flight_time", "speed", "hover", "no_fly", "clearance"),
-    "Fitting": ("passes", "warm_passes", "means", "exposure", "alpha_weight", "optimiser", "rates"),
+    "Fitting": (
+        *("passes", "warm_passes", "means", "sh", "exposure", "alpha_weight", "optimiser", "rates"),
+    ),
     "Advanced": ("estimator", "lam", "pixel_noise", "prior_std", "evaluate_every", "seed"),
 }
 """Settings with an option of the same name (`rates`: --rate), by panel of the help."""

@@ -64,17 +64,22 @@ def regularisation(
     = (H + lam) / sigma_e^2. So with this lam, Eq. 7 is 2/l times the mutual information of the
     parameters and the new image, in nats (diagonal, linearised).
 
-    groups: columns of each kind of parameter (`mgs.splat.groups`). prior_std: tau of each kind.
+    groups: columns of each kind of parameter (`mgs.splat.groups`). prior_std: tau of each kind;
+    that of colour is for degree 0. Higher degrees have DIRECTIONAL_STD.
     """
     lam = np.empty(max(columns.stop for columns in groups.values()))
     for name, columns in groups.items():
         lam[columns] = (pixel_noise / prior_std[name]) ** 2
+    lam[groups["colour"]][3:] = (pixel_noise / DIRECTIONAL_STD) ** 2
     return lam
 
 
-def lam_by_kind(lam: Array, groups: dict[str, slice]) -> dict[str, float]:
-    """lam [P] as one number for each kind of parameter. groups: as in `regularisation`."""
-    return {kind: float(lam[columns][0]) for kind, columns in groups.items()}
+def lam_by_kind(lam: Array, groups: dict[str, slice]) -> dict[str, float | Array]:
+    """lam [P] by kind of parameter, as `mgs.fit.fitting.fit` takes it: a number; for colours of
+    degrees above 0 an array [1,K,3]. groups: as in `regularisation`."""
+    by_kind: dict[str, float | Array] = {kind: float(lam[of][0]) for kind, of in groups.items()}
+    colour = lam[groups["colour"]].reshape(1, -1, 3)
+    return by_kind if colour.shape[1] == 1 else by_kind | {"colour": colour}
 
 
 def observed(H: Array, lam: Array) -> NDArray[np.bool_]:

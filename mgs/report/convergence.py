@@ -47,9 +47,10 @@ def remaining_decrease(
             "leave it out, or fit with --density fixed"
         )
     images, train = last_images(settings, prior, frames), settings.train
-    kinds = groups(0, train.means)
+    kinds = groups(settings.sh, train.means)
     by_kind = lam_by_kind(settings.regularisation(kinds), kinds)
-    given = images.cameras, images.targets, images.start(range(len(images))), by_kind
+    start = images.start(range(len(images))).with_degree(settings.sh)
+    given = images.cameras, images.targets, start, by_kind
     goal = objective(gaussians, *given, None, train.means, images.normals, train.alpha_weight)
     model = as_drjit(gaussians)
     phi = goal.phi(model)

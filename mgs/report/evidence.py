@@ -34,7 +34,7 @@ from mgs.fit.stopping import StopReason
 from mgs.gaussians import Gaussians
 from mgs.memory import Deferred
 from mgs.metrics import masked_squares
-from mgs.policy.criteria import DIRECTIONAL_STD, LEARN_LOSS
+from mgs.policy.criteria import LEARN_LOSS, lam_by_kind
 from mgs.policy.poses import azimuths
 from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of, without_gain
@@ -138,22 +138,8 @@ def kinds(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
 
 def regularisation(settings: NbvSettings, sh_degree: int) -> NDArray[np.float64]:
     """lam [P] of a run's settings, in the columns of `kinds`, rounded to float32 as in the fit."""
-    of = kinds(sh_degree, settings.train.means)
     lam = settings.regularisation(groups(sh_degree, settings.train.means))
-    if DIRECTIONAL in of:
-        lam[of[DIRECTIONAL]] = lam[0] / DIRECTIONAL_STD**2
     return lam.astype(np.float32).astype(np.float64)
-
-
-def fit_lam(lam: Array, sh_degree: int, means: str = "frozen") -> dict[str, float | np.ndarray]:
-    """lam [P] in the columns of `kinds`, as `mgs.fit.fitting.fit` takes it."""
-    columns = groups(sh_degree, means)
-    by_kind: dict[str, float | np.ndarray] = {
-        kind: float(lam[of][0]) for kind, of in columns.items()
-    }
-    if sh_degree:
-        by_kind["colour"] = lam[columns["colour"]].reshape(1, -1, 3)
-    return by_kind
 
 
 @dataclass(frozen=True)
@@ -286,7 +272,7 @@ def _worth(model: Gaussians, images: Images, settings: NbvSettings, cache: ListC
         images.cameras,
         images.targets,
         images.start(range(len(images))).with_degree(degree),
-        fit_lam(lam, degree, train.means),
+        lam_by_kind(lam, groups(degree, train.means)),
         cache,
         train.means,
         images.normals,
@@ -324,7 +310,7 @@ def fitted(
         train,
         cache=cache,
         start=start,
-        lam=fit_lam(regularisation(settings, degree), degree, train.means),
+        lam=lam_by_kind(regularisation(settings, degree), groups(degree, train.means)),
         normals=images.normals,
         learns=None if kept is None else _masks(kept, start.sh.shape[1], train.means),
     )

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Literal
 
 from mgs.errors import InputError
 from mgs.files import check_writable
-from mgs.fit.settings import TrainSettings
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
 from mgs.report.evaluation import compare_models
 from mgs.run import inputs
 from mgs.run.folder import open_run
+from mgs.run.settings import NbvSettings
 from mgs.splat_ply import write_ply
 
 if TYPE_CHECKING:
@@ -123,12 +123,12 @@ def refit_run(
     views, psnr = compare_models(models, opened.dataset, taken)
     marks = {f"learned_{kind}": mask for kind, mask in found.learned.items()}
     write_ply(path, found.gaussians, marks)
-    return RefittedRun(len(own) * parameters_of_each(settings.train), found, views, psnr)
+    return RefittedRun(len(own) * parameters_of_each(settings), found, views, psnr)
 
 
-def parameters_of_each(train: TrainSettings) -> int:
+def parameters_of_each(settings: NbvSettings) -> int:
     """Number of learned parameters of a Gaussian in a run: kinds whose rate is not 0."""
     from mgs.splat import groups
 
-    columns = groups(0, train.means)
-    return sum(of.stop - of.start for kind, of in columns.items() if train.rates[kind] > 0)
+    columns, rates = groups(settings.sh, settings.train.means), settings.train.rates
+    return sum(of.stop - of.start for kind, of in columns.items() if rates[kind] > 0)

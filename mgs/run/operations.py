@@ -36,14 +36,15 @@ def operations_of(
     live: how images of an on-demand dataset are captured that is not rendered.
     """
     cache, means = ListCache(), settings.train.means
-    columns, normals = groups(0, means), initial_normals(prior)
+    columns, normals = groups(settings.sh, means), initial_normals(prior)
     lam = lam_by_kind(settings.regularisation(columns), columns)
     exposure = exposure_of(prior) if settings.exposure else None
     colours = kept_colours(prior)
 
     def initial(frames: Sequence[Frame]) -> Gaussians:
         gains = exposure(frames) if exposure else None
-        return initial_gaussians(prior, frames, gains=gains, colours=colours)[0]
+        start = initial_gaussians(prior, frames, gains=gains, colours=colours)[0]
+        return start.with_degree(settings.sh)
 
     def run_fit(
         gaussians: Gaussians,

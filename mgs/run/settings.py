@@ -106,6 +106,8 @@ class NbvSettings(BaseModel):
     """Learning rates of the fits after the first, over those of the first."""
     exposure: bool = False
     """Estimate a gain per image and channel, where exposure or white balance differ."""
+    sh: Annotated[int, Field(ge=0, le=3)] = 0
+    """Degree of colours as functions of direction, 0 (one colour) to 3 (spherical harmonics)."""
     train: TrainSettings = TrainSettings()
     """Settings of each fit."""
 

@@ -10,21 +10,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mgs.data.dataset import load_dataset
-from mgs.data.frames import Frame
-from mgs.fit.fitting import Fit, fit
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.policy.poses import seed_views
 from mgs.prior.build import load_prior
-from mgs.report.evidence import fit_lam, last_images, lean_fit, regularisation
+from mgs.report.evidence import last_images, lean_fit
 from mgs.run.loop import fit_views
 from mgs.run.operations import operations_of
 from mgs.run.problem import Problem
@@ -153,8 +151,12 @@ def fit_and_judge(
     pruned at each of `noises`."""
     rates = {kind: rate if kind in LEARNED[learned] else 0.0 for kind, rate in RATES.items()}
     train = TrainSettings(rates=rates)
-    settings = NbvSettings(dataset=root / dataset, prior=root / prior, seeds=seeds, train=train)
-    problem, spent = _problem(settings, degree, ListCache()), list[float]()
+    settings = NbvSettings(
+        dataset=root / dataset, prior=root / prior, seeds=seeds, sh=degree, train=train
+    )
+    data = load_dataset(settings.dataset)
+    problem = Problem(data, settings, operations_of(data, load_prior(settings.prior), settings))
+    spent = list[float]()
     order = views_in_order(problem.positions, problem.centre, views, seeds)
     problem.seeds = order[:seeds]
     for i in order:
@@ -183,23 +185,6 @@ def fit_and_judge(
         "passes": passes,
         "pruned": pruned,
     }
-
-
-def _problem(settings: NbvSettings, degree: int, cache: ListCache) -> Problem:
-    """Problem of a run whose colours have this SH degree."""
-    data, prior = load_dataset(settings.dataset), load_prior(settings.prior)
-    usual = operations_of(data, prior, settings)
-    lam = fit_lam(regularisation(settings, degree), degree)
-
-    def fit_degree(
-        model: Gaussians, start: Gaussians, cameras: Any, targets: Any, train: Any, on_pass: Any
-    ) -> Fit:
-        return fit(model, cameras, targets, train, on_pass, cache, start, lam)
-
-    def initial(frames: list[Frame]) -> Gaussians:
-        return usual.initial(frames).with_degree(degree)
-
-    return Problem(data, settings, replace(usual, initial=initial, fit=fit_degree))
 
 
 def fit_lean_and_judge(
