@@ -53,8 +53,11 @@ class InputError(ValueError):
 
     @property
     def line(self) -> str:
-        """The message for the command line."""
-        return str(self.args[0])
+        """The message for the command line; control characters of a stranger's names escaped."""
+        shown = (
+            c if c.isprintable() else c.encode("unicode_escape").decode() for c in self.args[0]
+        )
+        return "".join(shown)
 
     def __str__(self) -> str:
         return in_python(self.line)

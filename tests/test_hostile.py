@@ -414,3 +414,10 @@ def test_the_text_files_of_a_stranger(capsys, stranger, file):
     if file == "metrics.json":
         with pytest.raises(InputError, match=r"metrics\.json"):
             read_subject(stranger)
+
+
+def test_control_characters_of_a_name_do_not_reach_the_terminal(tmp_path, capsys):
+    name = tmp_path / "a\n\x1b[2J"
+    line = refused(capsys, ["nbv", name, "--out", tmp_path / "run"], tmp_path / "run")
+    assert "a\\n\\x1b[2J" in line
+    assert str(InputError("\udcff ä")) == "\\udcff ä"
