@@ -53,11 +53,10 @@ class InputError(ValueError):
 
     @property
     def line(self) -> str:
-        """The message for the command line; control characters of a stranger's names escaped."""
-        shown = (
-            c if c.isprintable() else c.encode("unicode_escape").decode() for c in self.args[0]
-        )
-        return "".join(shown)
+        """The message for the command line. Control characters in names are escaped."""
+        message = str(self.args[0])
+        escaped = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
+        return "".join(escaped)
 
     def __str__(self) -> str:
         return in_python(self.line)

@@ -52,7 +52,7 @@ def thumbnails(paths: Sequence[Path]) -> list[Image.Image]:
 
 def picture(rgb: np.ndarray) -> Image.Image:
     """Picture of linear RGB [H,W,3]."""
-    return Image.fromarray(np.round(255 * srgb_from_linear(np.clip(rgb, 0, 1))).astype(np.uint8))
+    return Image.fromarray(np.round(255 * srgb_from_linear(rgb)).astype(np.uint8))
 
 
 def cloud(points: np.ndarray, colours: np.ndarray) -> Image.Image:

@@ -217,11 +217,10 @@ def _check_variant() -> None:
 
 
 def processes(count: int, threads: int | None = None) -> ProcessPoolExecutor:
-    """Executor of new processes, for work of many small kernels: two threads take twice the time
-    of one to wait for each other.
+    """Executor of `count` new processes, which end silently at Ctrl-C and with this process.
 
-    They end silently at Ctrl-C and when this process has ended. threads: of Dr.Jit in each; by
-    default as many as there are cores.
+    Several runs of small kernels are faster in a process each than on several threads, which mostly
+    wait. threads: Dr.Jit's in each process; by default as many as there are cores.
     """
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context

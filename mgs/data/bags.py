@@ -242,9 +242,9 @@ def _rows(message: Any, kind: str) -> np.ndarray:
 def _metres(message: Any, scratch: Path) -> np.ndarray | None:
     """Depth of an image [H,W] float32, metres; None for an encoding that is not supported.
 
-    A compressedDepth image has a PNG of millimetres, or of 32FC1 depth as a / depth + b, 0 where
-    there is none (compressed_depth_image_transport). scratch: file to use. Raises InputError if the
-    PNG is damaged.
+    A compressedDepth image holds a PNG. Its numbers are millimetres, or for 32FC1 a / depth + b,
+    with 0 for no depth (compressed_depth_image_transport). scratch: temporary file. Raises
+    InputError if the PNG is damaged.
     """
     if not hasattr(message, "format"):
         if message.encoding not in DEPTHS:
@@ -280,10 +280,10 @@ def _unpack_depth(
             continue
         time = float(times[np.argmin(np.abs(times - seconds(message)))])
         gap = abs(time - seconds(message))
+        if gap >= gaps[time]:
+            continue
         file = unpack / f"{shots[time]['name']}.exr"
-        if (
-            gap < gaps[time]
-            and (metres := _metres(message, file.with_suffix(".depth"))) is not None
-        ):
+        metres = _metres(message, file.with_suffix(".depth"))
+        if metres is not None:
             write_exr(file, {"Z": np.nan_to_num(metres, posinf=0, neginf=0)})
             gaps[time], shots[time]["depth"] = gap, file

@@ -169,8 +169,10 @@ def read_rtabmap(folder: Path, spacing: Spacing) -> list[dict[str, Any]]:
 
 
 def _opencv_yaml(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """K and distortion of a camera as OpenCV's FileStorage writes them, which aborts the process
-    where it reads some damaged files."""
+    """K and distortion of a camera in a file of OpenCV's FileStorage.
+
+    It is not read by OpenCV, which aborts the process on some damaged files.
+    """
     with reading(path):
         text = path.read_text(errors="replace")
     found = []

@@ -33,8 +33,8 @@ DIRECTIONAL_D = 1, 0.3
 """SH degree and tau of `directional-d`, chosen on five rocks that judge nothing."""
 
 PLANNED = {"directional-d": DIRECTIONAL_D}
-"""Policies that choose among the views of a plan for the whole budget (`Problem.planned`), with
-degree and tau of its directional gains."""
+"""Policies that plan the whole budget (`Problem.planned`) -> degree and tau of the gains that the
+plan maximises."""
 
 
 def directional_d(context: PolicyContext) -> Array:

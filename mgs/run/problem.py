@@ -224,10 +224,11 @@ class Problem:
         return [left[k] for k in near]
 
     def planned(self, taken: Sequence[int], left: list[int]) -> list[int]:
-        """Frames in `left` that a policy of PLANNED takes with what the budget has left.
+        """Frames in `left` among which a policy of PLANNED chooses: the rest of its plan.
 
-        They are those of the plan made after the seeds; after views that are not in it, of a new
-        plan. All of `left` for other policies, and where candidates differ in reach or travel cost.
+        The plan is made after the seeds. If a view outside it was taken, a new plan is made after
+        all views taken. Returns all of `left` for other policies, and where reach or travel cost
+        of a candidate depends on the last view.
         """
         settings = self.settings
         model = PLANNED.get(settings.policy)

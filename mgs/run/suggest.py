@@ -324,10 +324,10 @@ def _coarse(model: Gaussians, rows: np.ndarray, thinning: float) -> Gaussians:
 
 
 def _of_model(usual: Operations, model: Gaussians, estimator: str, factor: float) -> Operations:
-    """Operations of which all information is about one model, and measured once for each view.
+    """Operations whose information is about one model, measured once for each view.
 
-    No image is read: the model is that before training, too. factor: from the information of a
-    view to that of an image at its own size.
+    The model also stands for the Gaussians before training, so no image is read. factor: ratio of
+    the information of an image at its own size to that of a view.
     """
 
     def measured(key: tuple[Camera, str]) -> NDArray[np.float32]:

@@ -121,7 +121,7 @@ def _aimed(
     cameras = orbit_cameras(orbit, frames, target, scene.camera.fov, *size)
     visible = np.asarray(rock.vertices[rock.vertices[:, 2] > 0]).T
     width, height = size
-    # Times (u z, v z, z): z times the distances from the borders of the image less a pixel, and z.
+    # Rows times (u z, v z, z): z times the distance from each border, a pixel inside; last row z.
     borders = np.array([[1, 0, -1], [-1, 0, width - 1], [0, 1, -1], [0, -1, height - 1], [0, 0, 1]])
     for index, camera in enumerate(cameras):
         planes = borders @ camera.K @ camera.world_to_camera[:3]
