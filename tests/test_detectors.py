@@ -34,8 +34,8 @@ from mgs.run.detectors import (
 from mgs.run.nbv import run_nbv, start_run
 from mgs.splat import render
 
-FITS = Before(outline=0.001, offset=0.01, exposure=0.01)
-GOOD = ViewIndicators(FITS, unexplained=0.05, error=0.02)
+FITS = Before(outline=0.001, offset=0.01)
+GOOD = ViewIndicators(FITS, unexplained=0.05, error=0.02, ratios=(-0.08, 0.0, 0.08))
 FALLING = (1.0, 0.5, 0.3, 0.25, 0.249, 0.248)
 
 
@@ -53,7 +53,10 @@ BAD = {
     "worse": ({"losses": (1.0, 1.3, 1.2, 1.2, 1.2)}, "at least 20 % above"),
     "prior": ({"views": one_bad(outline=0.6)[3:] * 4}, "60.0 % of the covered pixels"),
     "residual": ({"views": (replace(GOOD, unexplained=0.9),) * 4}, "90 % of the images' variance"),
-    "exposure": ({"views": one_bad(exposure=0.01 + np.log(2))}, "2.00 times"),
+    "exposure": (
+        {"views": (GOOD, GOOD, GOOD, replace(GOOD, ratios=(-0.21, -0.13, -0.05)))},
+        "by 50 % of",
+    ),
     "pose": ({"views": one_bad(offset=0.2)}, "20.0 % of the rock's size"),
     "outlier": ({"views": (GOOD, GOOD, GOOD, replace(GOOD, error=0.2))}, "10.0 times"),
     "means": ({"drift": 4.0}, "4.0 standard deviations"),
@@ -94,29 +97,35 @@ def test_coverage_is_expected_of_four_views_and_more(views):
     assert bool(alarms(indicators(views=(GOOD,) * views, coverage=0.7))) == (views == 4)
 
 
-def seen(mask, alpha, margin=1, rendered=0.5, truth=0.5):
-    target = np.ones((*mask.shape, 4), np.float32) * [truth, truth, truth, 1]
-    return before_fit(target, mask, np.broadcast_to(rendered, (*mask.shape, 3)), alpha, margin)
-
-
 def test_the_outline_is_the_share_of_pixels_that_disagree_by_more_than_the_margin():
     mask, columns = np.zeros((8, 20), bool), np.arange(20)
     mask[:, 5:15] = True
     shifted = (columns >= 8) & (columns < 18)  # 3 pixels to the right
     alpha = np.where(shifted, 0.9, 0.2) * np.ones((8, 1))
     for margin, share in {1: 4 / 13, 2: 2 / 13, 3: 0}.items():
-        assert seen(mask, alpha, margin).outline == pytest.approx(share)
-    assert seen(mask, alpha).offset == pytest.approx(3 / np.sqrt(80))
-    assert seen(mask, 0 * alpha).offset == 1
+        assert before_fit(mask, alpha, margin).outline == pytest.approx(share)
+    assert before_fit(mask, alpha, 1).offset == pytest.approx(3 / np.sqrt(80))
+    assert before_fit(mask, 0 * alpha, 1).offset == 1
 
 
-def test_the_exposure_is_the_factor_between_prior_and_image():
-    whole = np.ones((4, 5))
-    brighter = seen(whole > 0, whole, rendered=0.25, truth=0.5).exposure
-    assert brighter == pytest.approx(np.log(0.501 / 0.251))
-    half_grey = np.where(np.arange(5) < 2, 0.9, 0.5)[None, :, None] * np.ones((4, 1, 3))
-    assert seen(whole > 0, whole, rendered=half_grey).exposure == 0
-    assert seen(whole > 0, 0 * whole).exposure == 0
+def test_an_exposure_shifts_all_pixels_and_a_highlight_some():
+    rng = np.random.default_rng(0)
+    model = rng.uniform(0.1, 0.5, (30, 40, 1)) * np.ones(3)
+    whole, weight = np.ones((30, 40), bool), np.ones((30, 40, 1))
+
+    def exposure(factor):
+        """Indicator of five views with noise of 10 %, the last one times a factor."""
+        images = [model * np.exp(0.1 * rng.normal(size=(30, 40, 1))) for _ in range(5)]
+        images[-1] = images[-1] * factor
+        views = [view_indicators(np.dstack([i, weight]), whole, model, FITS) for i in images]
+        return indicators(views)["exposure"]
+
+    limit, highlight = DETECTORS["exposure"].limit, np.ones((30, 40, 1))
+    assert exposure(1.0) < limit / 2
+    assert exposure(1.1) > limit
+    assert exposure(1 / 1.1) > limit
+    highlight[:, :18] = 1.5
+    assert exposure(highlight) < limit
 
 
 def test_the_margin_is_a_pixel_and_the_size_of_a_gaussian():

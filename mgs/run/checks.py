@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -49,13 +48,10 @@ class Checks:
         problem, gains, fit = self.problem, learned.gains, learned.fit
         views = []
         shown = problem.targets(learned.taken, gains)
-        for k, (i, target) in enumerate(zip(learned.taken, shown, strict=True)):
+        for i, target in zip(learned.taken, shown, strict=True):
             packed, before = self.before_fit(i)
             size = target.shape[0] * target.shape[1]
             mask = np.unpackbits(packed, count=size).astype(bool).reshape(target.shape[:2])
-            if gains is not None:  # the estimated gain explains this part
-                exposure = before.exposure - float(np.log(gains[k].mean()))
-                before = replace(before, exposure=exposure)
             rendered = self.render(fit.gaussians, problem.cameras[i])[0]
             views.append(detectors.view_indicators(target, mask, rendered, before))
         scores = [
@@ -73,17 +69,9 @@ class Checks:
         return {"indicators": indicators, "warnings": said} if said else {"indicators": indicators}
 
     def _before_fit(self, frame: int) -> tuple[np.ndarray, detectors.Before]:
-        """Mask of a frame taken, one bit a pixel, and its indicators before any training.
-
-        Gaussians that no seed saw get the frame's own colours: grey would look like a change of
-        exposure.
-        """
+        """Mask of a frame taken, one bit a pixel, and its indicators before any training."""
         problem = self.problem
         mask, camera = problem.frames[frame].mask(), problem.cameras[frame]
         margin = detectors.outline_margin(problem.start, camera)
-        grey = ~problem.start.sh.any(axis=(1, 2), keepdims=True)
-        own = problem.coloured((frame,)).sh
-        start = replace(problem.start, sh=np.where(grey, own, problem.start.sh))
-        rendered, alpha = self.render(start, camera)
-        indicators = detectors.before_fit(problem.image(frame), mask, rendered, alpha, margin)
-        return np.packbits(mask), indicators
+        alpha = self.render(problem.start, camera)[1]
+        return np.packbits(mask), detectors.before_fit(mask, alpha, margin)

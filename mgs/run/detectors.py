@@ -21,6 +21,13 @@ from mgs.metrics import masked_squares
 DARK = 1e-3
 """Linear RGB, added to brightnesses before their ratio is taken."""
 
+RATIO_QUANTILES = (0.25, 0.5, 0.75)
+"""Quantiles of a view's log ratios."""
+
+LEAST_SPREAD = 0.1
+"""Added to the range of these quantiles before a shift is divided by it, so that a fit without any
+residual has no exposure to report."""
+
 COVERING_VIEWS = 4
 """Fewest views of which a good coverage can be expected."""
 
@@ -31,12 +38,11 @@ class Before:
 
     outline: share of the pixels covered by mask or Gaussians where the two disagree, without the
     rim (`outline_margin`). offset: distance of the centres of the two areas, over the square root
-    of the mask's area. exposure: median log ratio of the image's brightness to the render's.
+    of the mask's area.
     """
 
     outline: float
     offset: float
-    exposure: float
 
 
 @dataclass(frozen=True)
@@ -44,34 +50,28 @@ class ViewIndicators:
     """A captured image compared with the Gaussians before training, and with the fitted model.
 
     unexplained: mean squared error in the mask over the variance of the image there: 0 is a perfect
-    fit, 1 a single colour. error: root of that mean squared error, linear RGB.
+    fit, 1 a single colour. error: root of that mean squared error, linear RGB. ratios: quantiles
+    (RATIO_QUANTILES) of the log ratio of the image's brightness to the render's, over the mask.
     """
 
     before: Before
     unexplained: float
     error: float
+    ratios: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
-def before_fit(
-    target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, alpha: np.ndarray, margin: int
-) -> Before:
+def before_fit(mask: np.ndarray, alpha: np.ndarray, margin: int) -> Before:
     """Compare a view with the Gaussians before training.
 
-    target: [H,W,4 or more], colour and weight (`mgs.data.dataset.target_of`). mask: bool [H,W].
-    rendered: [H,W,3] linear RGB. alpha: [H,W], drawn from 0.5 up. margin: pixels; a pixel
-    disagrees where it is drawn farther outside the mask, or not drawn farther inside.
+    mask: bool [H,W]. alpha: [H,W], drawn from 0.5 up. margin: pixels; a pixel disagrees where it is
+    drawn farther outside the mask, or not drawn farther inside.
     """
     drawn = alpha >= 0.5
     either = int((mask | drawn).sum())
     outside = ~binary_dilation(mask, iterations=margin)
     inside = binary_erosion(mask, iterations=margin, border_value=1)
     wrong = int(((drawn & outside) | (inside & ~drawn)).sum())
-    both = mask & drawn & (target[..., 3] > 0)
-    truth = target[both][:, :3].astype(np.float64).mean(axis=1)
-    colour = rendered[both][:, :3].astype(np.float64).mean(axis=1)
-    ratios = np.log(truth + DARK) - np.log(colour + DARK)
-    exposure = float(np.median(ratios)) if len(ratios) else 0.0
-    return Before(wrong / max(either, 1), _distance(mask, drawn), exposure)
+    return Before(wrong / max(either, 1), _distance(mask, drawn))
 
 
 def _distance(one: np.ndarray, other: np.ndarray) -> float:
@@ -98,13 +98,30 @@ def outline_margin(start: Gaussians, camera: Camera) -> int:
 def view_indicators(
     target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, before: Before
 ) -> ViewIndicators:
-    """Compare a fitted view with a render of the model; arguments as `before_fit`."""
+    """Compare a fitted view with a render of the model.
+
+    target: [H,W,4 or more], colour and weight (`mgs.data.dataset.target_of`). mask: bool [H,W].
+    rendered: [H,W,3] linear RGB.
+    """
     counted = mask & (target[..., 3] > 0)
     if not counted.any():
         return ViewIndicators(before, 0.0, 0.0)
     truth, drawn = target[counted][:, :3].astype(np.float64), rendered[counted].astype(np.float64)
     squared, variance = float(np.mean((truth - drawn) ** 2)), float(truth.var(axis=0).mean())
-    return ViewIndicators(before, squared / max(variance, 1e-12), squared**0.5)
+    brightness = np.log(truth.mean(axis=1) + DARK) - np.log(drawn.mean(axis=1) + DARK)
+    ratios = tuple(np.quantile(brightness, RATIO_QUANTILES).tolist())
+    return ViewIndicators(before, squared / max(variance, 1e-12), squared**0.5, ratios)
+
+
+def _exposure(ratios: np.ndarray) -> float:
+    """Largest common shift of a view's quantiles from those of the median view, over their range.
+
+    ratios: [V,3] of `ViewIndicators`. A change of exposure shifts all quantiles alike. A highlight
+    or a shadow moves some, so the smallest shift counts, or 0 where the signs differ.
+    """
+    shifts = ratios - np.median(ratios, axis=0)
+    common = np.where(np.abs(np.sign(shifts).sum(axis=1)) == 3, np.abs(shifts).min(axis=1), 0.0)
+    return float((common / (ratios[:, 2] - ratios[:, 0] + LEAST_SPREAD)).max())
 
 
 def residual(views: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> float | None:
@@ -136,10 +153,9 @@ def step_indicators(
         indicators["worse"] = min(losses[1:]) / losses[0] - 1
     if views:
         errors = np.array([view.error for view in views])
-        exposures = np.array([view.before.exposure for view in views])
         indicators["residual"] = float(np.median([view.unexplained for view in views]))
         indicators["prior"] = float(np.median([view.before.outline for view in views]))
-        indicators["exposure"] = float(np.abs(exposures - np.median(exposures)).max())
+        indicators["exposure"] = _exposure(np.array([view.ratios for view in views]))
         indicators["pose"] = max(view.before.offset for view in views)
         if len(views) >= COVERING_VIEWS:
             indicators["coverage"] = 1 - coverage
@@ -202,10 +218,11 @@ DETECTORS: dict[str, Detector] = {
         ),
     ),
     "exposure": Detector(
-        0.15,
+        0.22,
         lambda v, limit: (
-            f"exposure drifts: one image is {np.exp(v):.2f} times brighter or darker than the "
-            f"others, judged by the prior's colours (limit {np.exp(limit):.2f}); try --exposure"
+            "exposure drifts: one image as a whole is brighter or darker than the model fitted to "
+            f"all, by {percent(v)} of the spread of its pixels (limit {percent(limit)}); "
+            "try --exposure"
         ),
     ),
     "pose": Detector(
