@@ -8,6 +8,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import synthetic
@@ -20,6 +21,7 @@ from mgs.files import write_json
 from mgs.run.folder import read_checkpoint
 from mgs.study import case, free_fit, reproduce, setups
 from mgs.study.case import Case, Scene, Size
+from mgs.study.oracle import foretold
 from mgs.study.reproduce import FREE_FIT, ReproduceSize, Run, RunSize
 from mgs.study.rocks import Rock
 from mgs.study.setups import SetupSize
@@ -359,6 +361,27 @@ def test_an_oracle_that_sees_the_truth_is_best_in_its_first_choice(quick, tmp_pa
     others = [r["test"] for name, r in found.items() if "/ring-" in name and "/random-" in name]
     assert len(others) == setups.DRAWS
     assert next(iter(ring.values())) >= max(others) - 0.1, "its fit is warm, the judge's is not"
+    cells = setups.cells_of(size, rocks, ("oracle", "random"))
+    predicted = setups.foretold_of(found, cells, rocks)
+    assert {row["policy"] for row in predicted} == set(setups.SCORED)
+    assert all(-1 <= row["spearman"] <= 1 <= 1 + row["regret"] for row in predicted)
+    text = setups.text_of(setups.rows_of(found, cells, rocks), [], predicted)
+    assert "| rank correlation of the score with the gain | ring |" in text
+
+
+def test_scores_equal_to_the_gains_foretell_them(monkeypatch):
+    psnr = [20.0, 22.0, 21.0]
+    scores = {"right": psnr, "wrong": [3, 1, 2], "same": [1, 1, 1]}
+
+    def asked(policy):
+        return SimpleNamespace(policy=lambda _: scores[policy], context=lambda *_: None)
+
+    problem = SimpleNamespace(view_information=lambda _: None, with_settings=asked)
+    state = SimpleNamespace(gaussians=None)
+    found = foretold(tuple(scores), problem, state, [0, 1, 2], psnr)
+    assert found["right"] == {"spearman": 1, "regret": 0}
+    assert found["wrong"] == {"spearman": -1, "regret": 2}
+    assert found["same"] == {"spearman": 0, "regret": 2}
 
 
 def test_views_are_chosen_without_a_fit_where_no_model_is_needed(quick, tmp_path, monkeypatch):

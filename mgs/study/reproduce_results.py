@@ -114,20 +114,25 @@ def write_figures(work: Work) -> list[Path]:
 
 
 def write_setups(work: Work) -> list[Path]:
-    """setups.csv, .json, .md and .png; leads.csv; with the oracle where it is done."""
+    """setups.csv, .json, .md and .png; leads.csv; where it is done, the oracle and foretold.csv."""
     size, rocks = work.size, work.size.some_rocks(work.count)
     cells = reproduce.oracle_cells(size, work.count)
     known = dict(work.results)
     for cell in cells:
         if cell.name not in known and (result := found(work.root, cell)) is not None:
             known[cell.name] = result
-    rows = setups.rows_of(known, [cell for cell in cells if cell.name in known], rocks)
+    done = [cell for cell in cells if cell.name in known]
+    rows, predicted = setups.rows_of(known, done, rocks), setups.foretold_of(known, done, rocks)
     leads = [lead for key in setups.MEASURES for lead in setups.leads_of(rows, setups.LEADER, key)]
     write_csv(work.out / "leads.csv", leads)
     setups.draw(work.out / "setups.png", rows)
-    text = setups.text_of(rows, leads)
+    text = setups.text_of(rows, leads, predicted)
     written = write_table(work.out, "setups", rows, text, work.command, rocks=work.count)
-    return [*written, work.out / "leads.csv", work.out / "setups.png"]
+    written += [work.out / "leads.csv", work.out / "setups.png"]
+    if predicted:
+        write_csv(work.out / "foretold.csv", predicted)
+        written.append(work.out / "foretold.csv")
+    return written
 
 
 WRITERS: dict[str, Callable[[Work], list[Path]]] = {
