@@ -26,6 +26,8 @@ from mgs.study.reproduce import FREE_FIT, ReproduceSize, Run, RunSize
 from mgs.study.rocks import Rock
 from mgs.study.setups import SetupSize
 from mgs.study.sweep import cell_folder, run_cells
+from mgs.survey import flight
+from mgs.survey.flight import SurveySettings, fly
 
 ONE = RunSize(Size(48, 36, 8, 3, spp=1), 200, 2)
 FEW = SetupSize(48, 36, 3, 1, 6, fewer=4, gaussians=200)
@@ -90,6 +92,23 @@ def test_setups_are_made_once_and_hold_what_the_policies_found(quick, tmp_path, 
     again = done(capsys, out, "--only", "setups", "--rocks", 2)
     assert "setup/" not in again, "a cell was done twice"
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_survey_without_errors_changes_nothing(quick, tmp_path, capsys, monkeypatch):
+    exact, surveyed = SurveySettings(sensor=0, exact_poses=True), []
+
+    def without_errors(dataset, settings):
+        surveyed.append(dataset.root)
+        return fly(dataset, exact)
+
+    monkeypatch.setattr(flight, "fly", without_errors)
+    out = tmp_path / "out"
+    done(capsys, out, "--only", "survey,setups", "--rocks", 1)
+    assert len(surveyed) == 1
+    assert (out / "results/survey-leads.csv").is_file()
+    rows, without = (rows_of(out / f"results/{name}.csv") for name in ("survey", "setups"))
+    ring = {row["policy"]: float(row["test"]) for row in without if row["setup"] == "ring"}
+    assert {row["policy"]: float(row["test"]) for row in rows} == pytest.approx(ring)
 
 
 def test_a_policy_of_ones_own_is_compared(quick, tmp_path, capsys):

@@ -14,7 +14,7 @@ from mgs.files import Ours, atomic_folder
 
 FILES = [
     *("survey.json", "cloud.ply", "survey.png", "transforms.json", "rock.glb"),
-    *("images", "masks", "rock", "depth"),
+    *("images", "masks", "rock", "depth", "test"),
 ]
 """Names in a folder of this command."""
 

@@ -17,7 +17,7 @@ from mgs.policy.registry import policy_named
 from mgs.run.inputs import file_digest, policy_record
 from mgs.study.case import Case, Size
 from mgs.study.rocks import FRESH, Rock
-from mgs.study.setups import DRAWS, ORACLE, POLICIES, SetupSize, cells_of
+from mgs.study.setups import DRAWS, ORACLE, POLICIES, SURVEYED, SetupSize, cells_of
 from mgs.study.statistics import MOST_ROCKS
 from mgs.study.sweep import Cell, names_of
 
@@ -177,6 +177,11 @@ def setup_cells(size: ReproduceSize, count: int) -> list[Cell]:
     return cells_of(size.setups, size.some_rocks(count), size.policies)
 
 
+def survey_cells(size: ReproduceSize, count: int) -> list[Cell]:
+    """Every policy with poses and priors of a survey."""
+    return cells_of(size.setups, size.some_rocks(count), size.policies, SURVEYED)
+
+
 def oracle_cells(size: ReproduceSize, count: int) -> list[Cell]:
     """The set-ups, and the oracle in each on the first rocks."""
     rocks = size.some_rocks(count)
@@ -209,6 +214,7 @@ RESULTS = {
     "table1": Result(lambda size, _: _runs_cells(table_runs(size).values())),
     "figures": Result(lambda size, _: _runs_cells(figure_runs(size))),
     "setups": Result(setup_cells, "setup_rocks", most=len(FRESH)),
+    "survey": Result(survey_cells, "setup_rocks", optional=True, most=len(FRESH)),
     "oracle": Result(oracle_cells, "oracle_rocks", optional=True, most=len(FRESH)),
 }
 """Every result by name, in the order in which they are made."""
@@ -255,7 +261,7 @@ def with_options(
     """
     labels = list(POLICIES)
     for policy in policies:
-        _check_used(f"--policy {policy}", names, "setups", "oracle")
+        _check_used(f"--policy {policy}", names, "setups", "survey", "oracle")
         if policy in POLICIES:
             raise InputError(f"--policy {policy}: is compared anyway")
         if policy_file.label(policy) in labels:

@@ -84,7 +84,7 @@ class Setup:
 
     orbit: values of the scene's orbit. frames: number of poses. seeds: views to start with. every:
     take only the first half of the frames, and one in so many of the others. settings: more of
-    `mgs nbv`.
+    `mgs nbv`. survey: poses, depth and prior are those of `mgs survey`, with its noise and drift.
     """
 
     orbit: Mapping[str, Any]
@@ -92,6 +92,7 @@ class Setup:
     seeds: int = 4
     every: int | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    survey: bool = False
 
 
 RING = {"kind": "circle", "distances": [1]}
@@ -106,6 +107,9 @@ SETUPS = {
     "mixed distances": Setup({"kind": "hemisphere", "distances": [1, 2, 3]}, 36),
 }
 """The ring is the paper's; in the others the choice matters more."""
+
+SURVEYED = {"surveyed ring": Setup(RING, 48, survey=True)}
+"""Set-ups apart, as a robot measures: their poses and priors are wrong."""
 
 
 @dataclass(frozen=True)
@@ -130,13 +134,19 @@ def case_of(rock: Rock, setup: Setup, size: SetupSize) -> Case:
     return Case(rock.at(dict(setup.orbit)), images, number | {"seed": 0})
 
 
-def cells_of(size: SetupSize, rocks: Iterable[Rock], policies: Sequence[str]) -> list[Cell]:
+def cells_of(
+    size: SetupSize,
+    rocks: Iterable[Rock],
+    policies: Sequence[str],
+    setups: Mapping[str, Setup] = SETUPS,
+) -> list[Cell]:
     """Cells of every policy in every set-up on every rock, with datasets and priors."""
     cells: dict[str, Cell] = {}
     for rock in rocks:
         ring = case_of(rock, SETUPS["ring"], size)
-        for name, setup in SETUPS.items():
+        for name, setup in setups.items():
             case = case_of(rock, setup, size)
+            case, data = case.surveyed(rock.index) if setup.survey else (case, case.cells())
             common = {"seeds": setup.seeds, "budget": size.images - setup.seeds, **setup.settings}
             for policy in policies:
                 for draw in range(DRAWS if policy == RANDOM else 1):
@@ -152,8 +162,9 @@ def cells_of(size: SetupSize, rocks: Iterable[Rock], policies: Sequence[str]) ->
                         every=setup.every,
                         settings=settings,
                     )
-                    last = replace(made[-1], needs=(*made[-1].needs, ring.cells()[0].name))
-                    for cell in (*ring.cells()[:1], *made[:-1], last):
+                    needs = (ring.cells()[0].name, *(cell.name for cell in data))
+                    last = replace(made[-1], needs=needs)
+                    for cell in (*ring.cells()[:1], *data, last):
                         cells[cell.name] = cell
     return list(cells.values())
 
@@ -297,7 +308,8 @@ def foretold_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) ->
 def _place(cell: Cell) -> tuple[str, str]:
     """Rock and set-up of a cell of `choose_and_judge`."""
     _, rock, where, _ = cell.name.split("/")
-    return rock, next(s for s in SETUPS if where.startswith(s.replace(" ", "-") + "-"))
+    names = {name.replace(" ", "-"): name for name in (*SETUPS, *SURVEYED)}
+    return rock, names[where.rpartition("-")[0]]
 
 
 def by_scene(rows: Sequence[Row], setup: str, policy: str, key: str) -> dict[str, float]:
