@@ -258,7 +258,7 @@ def test_files_of_one_name_in_different_folders_stay_apart(tmp_path):
         frame.mask_path.rename(mask)
         frames.append(replace(frame, mask_path=mask, rock_path=rock))
     write_transforms(dataset.root, frames)
-    write_transforms(dataset.root / TEST_FOLDER, frames[:2])
+    synthetic.write_dataset(dataset.root / TEST_FOLDER)
     dataset = load_dataset(dataset.root)
     flight = fly(dataset, SurveySettings(exact_poses=True))
     result = write_survey(tmp_path / "survey", dataset, flight)
@@ -266,9 +266,12 @@ def test_files_of_one_name_in_different_folders_stay_apart(tmp_path):
         assert np.array_equal(surveyed.mask(), flown.mask())
         assert np.array_equal(surveyed.rgb(), flown.rgb())
         assert np.array_equal(surveyed.target()[0], flown.target()[0])
-    tests = result.test_views().frames
-    assert [frame.camera for frame in tests] == [frame.camera for frame in frames[:2]]
-    assert all(tmp_path / "survey/test" in frame.image_path.parents for frame in tests)
+    tests, exact = result.test_views(), dataset.test_views()
+    assert tests.root == tmp_path / "survey" / TEST_FOLDER
+    for surveyed, flown in zip(tests.frames, exact.frames, strict=True):
+        poses = (one.camera.world_to_camera for one in (surveyed, flown))
+        assert np.allclose(*poses, atol=1e-12)
+        assert np.array_equal(surveyed.rgb(), flown.rgb())
 
 
 def test_command_writes_a_dataset_with_its_figure(tmp_path, capsys):

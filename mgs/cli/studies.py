@@ -66,13 +66,16 @@ def reproduce(
     only: Annotated[
         str | None,
         option(
-            "Results to make, separated by commas: table1, figures, setups, survey, "
-            "oracle. Default: all but survey and oracle."
+            "Results to make, separated by commas: table1, figures, setups, flights, survey, "
+            "oracle. Default: table1, figures and setups."
         ),
     ] = None,
     rocks: Annotated[
         int | None,
-        option("Number of rocks for setups, survey and oracle. Default: as --scale says.", min=1),
+        option(
+            "Number of rocks for setups, flights, survey and oracle. Default: as --scale says.",
+            min=1,
+        ),
     ] = None,
     policy: Annotated[
         list[str] | None,

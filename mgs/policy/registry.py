@@ -38,7 +38,7 @@ plan maximises."""
 
 FLOWN = {"directional-d": (1, 0.1, True)}
 """Policies that plan a whole flight (`mgs.policy.tour.planned_tour`) -> degree, tau and over_dome
-of the gains that its plan maximises. Chosen on three rocks that judge nothing."""
+of the gains that its plan maximises. Chosen on two rocks that judge nothing."""
 
 
 def directional_d(context: PolicyContext) -> Array:
