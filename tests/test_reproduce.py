@@ -19,7 +19,7 @@ from mgs.data.dataset import TEST_FOLDER
 from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.run.folder import read_checkpoint
-from mgs.study import case, free_fit, reproduce, setups
+from mgs.study import case, flights, free_fit, reproduce, setups
 from mgs.study.case import Case, Scene, Size
 from mgs.study.oracle import foretold
 from mgs.study.reproduce import FREE_FIT, ReproduceSize, Run, RunSize
@@ -29,7 +29,7 @@ from mgs.study.sweep import cell_folder, run_cells
 
 ONE = RunSize(Size(48, 36, 8, 3, spp=1), 200, 2)
 FEW = SetupSize(48, 36, 3, 1, 6, fewer=4, gaussians=200)
-TINY = ReproduceSize(ONE, FEW, setup_rocks=2, oracle_rocks=1)
+TINY = ReproduceSize(ONE, FEW, FEW, setup_rocks=2, oracle_rocks=1)
 
 
 def silent(name, done, total):
@@ -90,6 +90,31 @@ def test_setups_are_made_once_and_hold_what_the_policies_found(quick, tmp_path, 
     again = done(capsys, out, "--only", "setups", "--rocks", 2)
     assert "setup/" not in again, "a cell was done twice"
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_flights_keep_their_length_and_are_compared_with_even_spacing(quick, tmp_path, capsys):
+    out = tmp_path / "out"
+    done(capsys, out, "--only", "flights", "--rocks", 1)
+    rows = rows_of(out / "results/flights.csv")
+    kinds = len(flights.FLIERS) * len(flights.LENGTHS)
+    even = [row for row in rows if row["policy"] == flights.EVEN]
+    assert len(rows) - len(even) == kinds * len(flights.POOLS)
+    assert len(even) == 6 * len(flights.POOLS), "9 candidates"
+    cell = next((out / "cells/flights").glob("*/dome-*/result.json"))
+    found = json.loads(cell.read_text())["found"]
+    for row in found["flights"]:
+        assert row["metres"] <= (row["length"] or 1) * found["whole"] * 1.000001
+        assert len(set(row["taken"])) == row["images"]
+    assert "| dome | 20% | planned tour |" in (out / "results/flights.md").read_text()
+
+
+def test_metres_are_compared_at_the_same_psnr():
+    cell = SimpleNamespace(name="flights/boulder-11/dome-128x96")
+    even = [(10, 20), (20, 24), (30, 23.5), (40, 28)]
+    flown = [{"policy": flights.EVEN, "length": None, "metres": m, "psnr": p} for m, p in even]
+    flown += [{"policy": "mine", "length": 0.5, "metres": 15, "psnr": 26}]
+    found = flights.rows_of({cell.name: {"flights": flown}}, [cell], [Rock("boulder", 11)])[-1]
+    assert (found["ratio"], found["gain"]) == (pytest.approx(15 / 35), pytest.approx(4))
 
 
 def test_a_policy_of_ones_own_is_compared(quick, tmp_path, capsys):

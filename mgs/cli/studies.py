@@ -66,13 +66,13 @@ def reproduce(
     only: Annotated[
         str | None,
         option(
-            "Results to make, separated by commas: table1, figures, setups, oracle. "
-            "Default: all but oracle."
+            "Results to make, separated by commas: table1, figures, setups, flights, oracle. "
+            "Default: all but flights and oracle."
         ),
     ] = None,
     rocks: Annotated[
         int | None,
-        option("Number of rocks for setups and oracle. Default: as --scale says.", min=1),
+        option("Number of rocks for setups, flights and oracle. Default: as --scale says.", min=1),
     ] = None,
     policy: Annotated[
         list[str] | None,

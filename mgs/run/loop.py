@@ -178,7 +178,7 @@ def choose(
     """
     fisher = fisher or problem.view_information(state.gaussians)
     if problem.settings.flies:
-        return plan_flight(problem, state, fisher)[0]
+        return next(plan_flight(problem, state, fisher))
     left = problem.planned(state.taken, problem.reachable(state.taken))
     context = problem.context(state, left, fisher)
     return rated(problem, context, problem.travel_cost(context))[0]

@@ -12,7 +12,7 @@ import numpy as np
 from mgs.files import write_csv
 from mgs.report.evaluation import evaluate_run
 from mgs.report.writing import write_report
-from mgs.study import reproduce, setups
+from mgs.study import flights, reproduce, setups
 from mgs.study.output import table, write_table
 from mgs.study.reproduce import ReproduceSize, Run
 from mgs.study.setups import Found
@@ -135,10 +135,22 @@ def write_setups(work: Work) -> list[Path]:
     return written
 
 
+def write_flights(work: Work) -> list[Path]:
+    """flights.csv, .json, .md and .png."""
+    rocks = work.size.some_rocks(work.count)
+    cells = reproduce.flight_cells(work.size, work.count)
+    rows = flights.rows_of(work.results, cells, rocks)
+    flights.draw(work.out / "flights.png", rows)
+    text = flights.text_of(rows)
+    written = write_table(work.out, "flights", rows, text, work.command, rocks=work.count)
+    return [*written, work.out / "flights.png"]
+
+
 WRITERS: dict[str, Callable[[Work], list[Path]]] = {
     "table1": write_table1,
     "figures": write_figures,
     "setups": write_setups,
+    "flights": write_flights,
     "oracle": write_setups,
 }
 """Writers of results, which return the files written."""

@@ -173,7 +173,7 @@ def choose_and_judge(
     the views taken). The oracle's has "foretold": means of `foretold` over its choices.
     """
     policy = settings["policy"]
-    shared, tests, pool, on_ring = _shared(
+    shared, tests, pool, on_ring = shared_problem(
         root / dataset, root / prior, root / ring, every, settings["seeds"], settings["budget"]
     )
     chosen_by = RANDOM if policy == ORACLE else policy
@@ -228,7 +228,7 @@ Measure = Callable[..., dict[str, np.ndarray]]
 
 
 @lru_cache(maxsize=1)
-def _shared(
+def shared_problem(
     dataset: Path, prior: Path, ring: Path, every: int | None, seeds: int, budget: int
 ) -> tuple[Problem, Measure, Measure, Measure]:
     """Problem of a set-up on one rock, and PSNR over test views, candidates and the ring.
