@@ -159,7 +159,7 @@ OPTIONS: dict[str, list[tuple[str, str]]] = {
     ],
     "reproduce {out}": [
         ("--scale huge", "--scale 'huge': unknown; choose one of quick, paper"),
-        ("--only table2", "unknown; choose some of table1,figures,setups,oracle"),
+        ("--only table2", "unknown; choose some of table1,figures,setups,flights,oracle"),
         ("--only ,", "--only '': unknown"),
         ("--rocks 13", "--rocks 13: setups can have 1 to 12"),
         ("--workers 2 --scheduler tcp://x:1", "give one of them"),

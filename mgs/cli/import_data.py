@@ -122,7 +122,7 @@ def import_data(
             on_frame=partial(progress, "importing"),
         )
     if mesh is not None and mesh.suffix.lower() in GLTF:
-        console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
+        console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
     if found.missing:
         notes.print(f"mgs: {found.missing} of {listed} listed images do not exist; skipped them")
     if found.no_cloud:
@@ -157,7 +157,7 @@ def import_data(
     )
     if tests is not None:
         console.print(
-            f"test views: {len(tests.shots)} images, which are no candidates; "
+            f"test views: {len(tests.shots)} images, which are never candidates; "
             f"wrote {out / TEST_FOLDER}"
         )
     _tidy([*found.shots, *(tests.shots if tests else ())], unpacked)

@@ -62,7 +62,9 @@ def evaluate(
             )
             if subject.is_dir():
                 if dataset is not None:
-                    raise InputError(f"--dataset: is for a PLY; {subject} has a dataset of its own")
+                    raise InputError(
+                        f"--dataset: is for a PLY, and {subject} has its own dataset; leave it out"
+                    )
                 options = {"pictures": pictures, "convergence": convergence, "progress": progress}
                 rows += _measured_run(subject, len(subjects) == 1, said, options)
             for path in others:

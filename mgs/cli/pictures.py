@@ -120,7 +120,7 @@ def view(
     try:
         token = viewer.access.token
         if token:
-            typer.echo(f"--host {host}: whoever has the address below, with its token, can look")
+            typer.echo(f"--host {host}: anyone who has the address below, with its token, can look")
         shown = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         query = f"/?token={token}" if token else ""
         typer.echo(f"open http://{shown}:{viewer.port}{query} in a browser; Ctrl-C ends it")

@@ -123,7 +123,7 @@ def prior(
             cameras = [frame.camera for frame in loaded.frames]
             result = prior_from_mesh(mesh, settings, axis or loaded.up, loaded.unit, cameras)
             if mesh.suffix.lower() in GLTF:
-                console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
+                console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
         else:
             upward: Any = "auto" if up == "auto" else axis
             chosen = source_of(loaded, source, points)
@@ -143,8 +143,8 @@ def prior(
     agreed = result.numbers.get("colour_agreement", 1.0)
     if agreed < AGREEMENT:
         console.print(
-            f"the photographs agree on {agreed:.0%} of the surface's colours, and on a right "
-            f"surface on {AGREEMENT:.0%} or more: it may be wrong; fit with `--means free`",
+            f"the photographs agree on only {agreed:.0%} of the surface's colours (on a correct "
+            f"surface on {AGREEMENT:.0%} or more), so it may be wrong; fit with `--means free`",
             soft_wrap=True,
         )
     if "resolution" in result.numbers:

@@ -79,8 +79,7 @@ def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
         typer.echo(f"wrote {file}")
     if not any(file.stem == "psnr" for file in written):
         typer.echo(
-            "PSNR against images is left out: "
-            "it needs that all runs were made with --evaluate-every"
+            "PSNR against images is left out: make all runs with --evaluate-every to have it"
         )
 
 

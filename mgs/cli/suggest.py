@@ -162,7 +162,9 @@ def suggest(
         )
         crossed = _crossed(run, found)
         if crossed and plan:
-            raise InputError(f"suggest: {crossed}, so no flight plan is written; give --no-fly")
+            raise InputError(
+                f"suggest: {crossed}, so no flight plan is written; give --no-fly METRES"
+            )
         if out is not None:
             from mgs.report.suggestion import write_suggestion
 
@@ -291,7 +293,7 @@ def _print(console: Console, found: Suggestion, views: int, run: Run, crossed: s
     from mgs.policy.criteria import GAIN_UNIT
 
     for reason, count in found.dropped.items():
-        console.print(f"dropped: {count} {reason}")
+        console.print(f"candidates left out: {count} {reason}")
     rows = found.plan if views > 1 else found.ranking[:SHOWN]
     table = Table(box=None)
     numbers = ("score", "gain", "distance", "azimuth", "elevation", "unseen", "unknown")
@@ -303,12 +305,12 @@ def _print(console: Console, found: Suggestion, views: int, run: Run, crossed: s
     unit = run.dataset.unit
     plan = f"{len(found.plan)} view{'s' if len(found.plan) > 1 else ''}"
     console.print(
-        f"gain: Eq. 7, {GAIN_UNIT}; unseen, unknown: of what the picture shows\n"
+        f"gain: Eq. 7, {GAIN_UNIT}; unseen, unknown: shares of what the picture shows\n"
         f"flight: {found.metres:.1f} {unit} and {found.seconds:.0f} s from the first image through "
         f"{plan} and back"
     )
     if crossed:
-        console.print(f"{crossed}; --no-fly METRES plans around it")
+        console.print(f"{crossed}; give --no-fly METRES to plan around it")
 
 
 def _cells(view: View, unit: str) -> tuple[str, ...]:

@@ -248,7 +248,7 @@ def prior_from_mesh(
     mesh = read_mesh(path)
     if settings.density is not None:
         raise InputError(
-            f"{path}: a density counts by the voxels of a cloud, which a mesh has not; "
+            f"{path}: a density is relative to the voxels of a cloud, and a mesh has none; "
             "give a number or a spacing"
         )
     points, normals, spacing, sampled = _samples(mesh, settings, cameras, 0.0)

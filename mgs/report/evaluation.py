@@ -362,7 +362,7 @@ def evaluate(
             run = open_run(path.parent)
             dataset, trained = run.dataset, [frame.name for frame in run.taken]
     if dataset is None:
-        raise InputError(f"{path or 'the model'}: is of no run here; give a dataset with --dataset")
+        raise InputError(f"{path or 'the model'}: is in no run folder; give its --dataset")
     views = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     names, tests = list(trained), views.test_views()
     metrics = evaluate_model(

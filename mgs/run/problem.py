@@ -280,7 +280,10 @@ class Problem:
             failed = next(i for i in self.seeds if self.frames[i].given_up)
             others = self.reachable(self.seeds)
             if not others:
-                raise InputError(f"{self.dataset.root}: too few poses are left for the seeds")
+                raise InputError(
+                    f"{self.dataset.root}: too few poses are left for the seeds; "
+                    "lower --seed-views, or give more poses"
+                )
             nearest = poses.nearest_poses(self.positions[others], self.positions[failed], 1)[0]
             self.seeds = [others[nearest] if i == failed else i for i in self.seeds]
 

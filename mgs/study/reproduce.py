@@ -268,7 +268,7 @@ def with_options(
     for policy in policies:
         _check_used(f"--policy {policy}", names, "setups", "oracle")
         if policy in POLICIES:
-            raise InputError(f"--policy {policy}: is compared anyway")
+            raise InputError(f"--policy {policy}: is compared anyway; leave it out")
         if policy_file.label(policy) in labels:
             raise InputError(f"--policy {policy}: {NAMESAKE}")
         labels.append(policy_file.label(policy))
@@ -283,7 +283,10 @@ def with_options(
 def _check_used(option: str, names: Sequence[str], *results: str) -> None:
     """Raise InputError if an option is for none of the results to make."""
     if not set(results) & set(names):
-        raise InputError(f"{option}: is for {' and '.join(results)}, and --only leaves both out")
+        raise InputError(
+            f"{option}: is for {' and '.join(results)}, and --only leaves both out; "
+            "leave out the option, or name one of them"
+        )
 
 
 def _with_meshes(

@@ -217,12 +217,12 @@ def rock_of(
     extents = " x ".join(f"{x:.2f}" for x in rock.extents)
     up, suffix = mesh_up or up_axis(mesh), Path(mesh).suffix.lower()
     if mesh_up:
-        reason = "is up, as told"
+        reason = "is up, as --mesh-up says"
     elif suffix in GLTF:
         reason = f"is up, as in all {suffix[1:].upper()} files"
     else:
         other = "y" if up == "z" else "z"
-        reason = f"taken as up, its format has no rule (--mesh-up {other} turns it)"
+        reason = f"taken as up, since its format does not say (--mesh-up {other} turns it)"
     say(
         f"{mesh}: +{up.upper()} {reason}; scaled {scale:.4g} times to the scene's rock size, "
         f"now {extents} m"
@@ -381,7 +381,7 @@ def _meter(
     if exposure >= wanted:
         return wanted
     say(
-        f"exposure: {wanted / exposure:.3g} times lower than a rock so dark asks for: "
-        f"about {MAX_CLIPPED:.0%} of rock and ground clips"
+        f"exposure: {wanted / exposure:.3g} times lower than so dark a rock needs, so that about "
+        f"{MAX_CLIPPED:.0%} of rock and ground clips, not more"
     )
     return exposure
