@@ -290,8 +290,8 @@ def _check_used(option: str, names: Sequence[str], *results: str) -> None:
     """Raise InputError if an option is for none of the results to make."""
     if not set(results) & set(names):
         raise InputError(
-            f"{option}: is for {' and '.join(results)}, and --only leaves both out; "
-            "leave out the option, or name one of them"
+            f"{option}: is for {', '.join(results)}, of which --only names none; "
+            "leave out the option, or name one of these"
         )
 
 
