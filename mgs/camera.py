@@ -30,11 +30,12 @@ _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Pinhole camera. Two cameras are equal if all their numbers are.
+    """Pinhole camera. Two cameras are equal if all their numbers are equal.
 
     - K: [3,3] float64, intrinsics in pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
     - width, height: of the image, pixels.
-    - world_to_camera: [4,4] float64, rigid transform in metres, to OpenCV axes.
+    - world_to_camera: [4,4] float64, rigid transform in metres, to OpenCV axes (x right, y down,
+      z forward).
 
     Raises InputError if K or the pose is not finite, K has skew or a focal length that is not
     positive, an entry exceeds FURTHEST, the width or height is not a whole number of at least 1,
@@ -161,7 +162,7 @@ class Camera:
 def look_at(
     eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)
 ) -> NDArray[np.float64]:
-    """world_to_camera [4,4] of a camera at `eye` [3], metres, that looks at `target` [3].
+    """Return world_to_camera [4,4] of a camera at `eye` [3], metres, that looks at `target` [3].
 
     up: direction [3] that points upwards in the image; +Y replaces it if the camera looks along it.
     Raises InputError if eye and target are the same point.

@@ -306,7 +306,7 @@ def test_images_are_set_apart_as_test_views(dataset, tmp_path, capsys):
     command(*arguments, out)
     (out / "transforms.json").unlink()  # as if it had been interrupted before its end
     command(*arguments, out)
-    assert said(capsys)[0].count("images, which are no candidates; wrote") == 2
+    assert said(capsys)[0].count("images, which are never candidates; wrote") == 2
     made = load_dataset(out)
     tests = made.test_views()
     names = [frame.name for frame in dataset.frames]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 import sys
@@ -261,8 +262,10 @@ def test_heading_is_clockwise_from_y(target, heading):
 
 
 def test_a_watched_folder(flight, data, whole, tmp_path, monkeypatch):
-    """Somebody puts pictures there, one of them in two halves."""
+    """Somebody puts pictures there, one of them in two halves, while the clock jumps by days."""
     monkeypatch.setattr(transports, "POLL", 0.02)
+    days = itertools.cycle([0.0, 9e5, -9e5])
+    monkeypatch.setattr(transports.time, "time", lambda: next(days))
     folder, end = tmp_path / "sync", threading.Event()
     folder.mkdir()
 

@@ -159,19 +159,19 @@ OPTIONS: dict[str, list[tuple[str, str]]] = {
     ],
     "reproduce {out}": [
         ("--scale huge", "--scale 'huge': unknown; choose one of quick, paper"),
-        ("--only table2", "unknown; choose some of table1,figures,setups,oracle"),
+        ("--only table2", "unknown; choose some of table1,figures,setups,flights,survey,oracle"),
         ("--only ,", "--only '': unknown"),
         ("--rocks 13", "--rocks 13: setups can have 1 to 12"),
         ("--workers 2 --scheduler tcp://x:1", "give one of them"),
         ("--policy best", "--policy best: unknown; choose one of"),
         ("--policy uniform", "--policy uniform: is compared anyway"),
         ("--policy angle --policy angle", "angle: there is one of this name already"),
-        ("--policy block-d --only table1", "is for setups and oracle, and --only leaves both out"),
+        ("--policy block-d --only table1", "is for setups, survey, oracle, of which --only names none"),
         ("--policy none.py:f", "none.py"),
         ("--mesh none.glb", "none.glb: cannot be read (No such file or directory)"),
         ("--mesh a.glb --only table1", "is for results over many rocks, and --only leaves them"),
         ("--batch 0", "should be greater than or equal to 1"),
-        ("--batch 5 --only setups", "is for table1 and figures, and --only leaves both out"),
+        ("--batch 5 --only setups", "is for table1, figures, of which --only names none"),
     ],
 }
 """Beginning of a command -> its options, and words of the line."""

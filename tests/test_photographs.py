@@ -134,13 +134,15 @@ def test_masks_that_do_not_fit_are_one_line_that_names_a_frame(tmp_path):
     wrong = np.zeros((72, 96), bool)
     wrong[:5, :5] = True
     write_png(dataset.frames[7].mask_path, wrong)
-    message = r"share no point of space \(at best 1 of 12 frames, such as kf_0007"
+    message = r"share no point in space \(the best lies outside 1 of 12, such as kf_0007"
     with pytest.raises(InputError, match=message):
         visual_hull(dataset.frames)
     # With scattered pixels the grid reaches beyond all images, where no mask is against a point.
     for k, frame in enumerate(dataset.frames):
         write_png(frame.mask_path, np.random.default_rng(k).random((72, 96)) < 0.01)
-    with pytest.raises(InputError, match=r"share no point of space \(at best \d+ of 12 frames"):
+    with pytest.raises(
+        InputError, match=r"share no point in space \(the best lies outside \d+ of 12"
+    ):
         visual_hull(dataset.frames)
 
 

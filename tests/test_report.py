@@ -183,7 +183,7 @@ def test_figures_are_written_as_asked_for(runs, tmp_path, capsys):
 def test_a_figure_that_is_left_out_is_named(runs, tmp_path, capsys):
     copies = [changed(run, tmp_path / run.name, steps=without("psnr")) for run in runs]
     command("report", *copies, "--out", tmp_path / "report")
-    left_out = "PSNR against images is left out: it needs that all runs were made with --evaluate"
+    left_out = "PSNR against images is left out: make all runs with --evaluate-every to have it"
     assert left_out in capsys.readouterr().out
     assert not (tmp_path / "report/psnr.png").exists()
 

@@ -8,6 +8,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import synthetic
@@ -18,16 +19,19 @@ from mgs.data.dataset import TEST_FOLDER
 from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.run.folder import read_checkpoint
-from mgs.study import case, free_fit, reproduce, setups
+from mgs.study import case, flights, free_fit, reproduce, setups
 from mgs.study.case import Case, Scene, Size
+from mgs.study.oracle import foretold
 from mgs.study.reproduce import FREE_FIT, ReproduceSize, Run, RunSize
 from mgs.study.rocks import Rock
 from mgs.study.setups import SetupSize
 from mgs.study.sweep import cell_folder, run_cells
+from mgs.survey import flight
+from mgs.survey.flight import SurveySettings, fly
 
 ONE = RunSize(Size(48, 36, 8, 3, spp=1), 200, 2)
 FEW = SetupSize(48, 36, 3, 1, 6, fewer=4, gaussians=200)
-TINY = ReproduceSize(ONE, FEW, setup_rocks=2, oracle_rocks=1)
+TINY = ReproduceSize(ONE, FEW, FEW, setup_rocks=2, oracle_rocks=1)
 
 
 def silent(name, done, total):
@@ -88,6 +92,48 @@ def test_setups_are_made_once_and_hold_what_the_policies_found(quick, tmp_path, 
     again = done(capsys, out, "--only", "setups", "--rocks", 2)
     assert "setup/" not in again, "a cell was done twice"
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_flights_keep_their_length_and_are_compared_with_even_spacing(quick, tmp_path, capsys):
+    out = tmp_path / "out"
+    done(capsys, out, "--only", "flights", "--rocks", 1)
+    rows = rows_of(out / "results/flights.csv")
+    kinds = len(flights.FLIERS) * len(flights.LENGTHS)
+    even = [row for row in rows if row["policy"] == flights.EVEN]
+    assert len(rows) - len(even) == kinds * len(flights.POOLS)
+    assert len(even) == 6 * len(flights.POOLS), "9 candidates"
+    cell = next((out / "cells/flights").glob("*/dome-*/result.json"))
+    found = json.loads(cell.read_text())["found"]
+    for row in found["flights"]:
+        assert row["metres"] <= (row["length"] or 1) * found["whole"] * 1.000001
+        assert len(set(row["taken"])) == row["images"]
+    assert "| dome | 20% | planned tour |" in (out / "results/flights.md").read_text()
+
+
+def test_metres_are_compared_at_the_same_psnr():
+    cell = SimpleNamespace(name="flights/boulder-11/dome-128x96")
+    even = [(10, 20), (20, 24), (30, 23.5), (40, 28)]
+    flown = [{"policy": flights.EVEN, "length": None, "metres": m, "psnr": p} for m, p in even]
+    flown += [{"policy": "mine", "length": 0.5, "metres": 15, "psnr": 26}]
+    found = flights.rows_of({cell.name: {"flights": flown}}, [cell], [Rock("boulder", 11)])[-1]
+    assert (found["ratio"], found["gain"]) == (pytest.approx(15 / 35), pytest.approx(4))
+
+
+def test_a_survey_without_errors_changes_nothing(quick, tmp_path, capsys, monkeypatch):
+    exact, surveyed = SurveySettings(sensor=0, exact_poses=True), []
+
+    def without_errors(dataset, settings):
+        surveyed.append(dataset.root)
+        return fly(dataset, exact)
+
+    monkeypatch.setattr(flight, "fly", without_errors)
+    out = tmp_path / "out"
+    done(capsys, out, "--only", "survey,setups", "--rocks", 1)
+    assert len(surveyed) == 1
+    assert (out / "results/survey-leads.csv").is_file()
+    rows, without = (rows_of(out / f"results/{name}.csv") for name in ("survey", "setups"))
+    ring = {row["policy"]: float(row["test"]) for row in without if row["setup"] == "ring"}
+    assert {row["policy"]: float(row["test"]) for row in rows} == pytest.approx(ring)
 
 
 def test_a_policy_of_ones_own_is_compared(quick, tmp_path, capsys):
@@ -359,6 +405,27 @@ def test_an_oracle_that_sees_the_truth_is_best_in_its_first_choice(quick, tmp_pa
     others = [r["test"] for name, r in found.items() if "/ring-" in name and "/random-" in name]
     assert len(others) == setups.DRAWS
     assert next(iter(ring.values())) >= max(others) - 0.1, "its fit is warm, the judge's is not"
+    cells = setups.cells_of(size, rocks, ("oracle", "random"))
+    predicted = setups.foretold_of(found, cells, rocks)
+    assert {row["policy"] for row in predicted} == set(setups.SCORED)
+    assert all(-1 <= row["spearman"] <= 1 <= 1 + row["regret"] for row in predicted)
+    text = setups.text_of(setups.rows_of(found, cells, rocks), [], predicted)
+    assert "| rank correlation of the score with the gain | ring |" in text
+
+
+def test_scores_equal_to_the_gains_foretell_them(monkeypatch):
+    psnr = [20.0, 22.0, 21.0]
+    scores = {"right": psnr, "wrong": [3, 1, 2], "same": [1, 1, 1]}
+
+    def asked(policy):
+        return SimpleNamespace(policy=lambda _: scores[policy], context=lambda *_: None)
+
+    problem = SimpleNamespace(view_information=lambda _: None, with_settings=asked)
+    state = SimpleNamespace(gaussians=None)
+    found = foretold(tuple(scores), problem, state, [0, 1, 2], psnr)
+    assert found["right"] == {"spearman": 1, "regret": 0}
+    assert found["wrong"] == {"spearman": -1, "regret": 2}
+    assert found["same"] == {"spearman": 0, "regret": 2}
 
 
 def test_views_are_chosen_without_a_fit_where_no_model_is_needed(quick, tmp_path, monkeypatch):

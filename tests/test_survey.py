@@ -14,7 +14,7 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from mgs.camera import Camera, look_at
-from mgs.data.dataset import Dataset, load_dataset, write_transforms
+from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, write_transforms
 from mgs.data.rock_image import write_rock_image
 from mgs.files import read_json, write_json
 from mgs.images import write_exr
@@ -258,6 +258,7 @@ def test_files_of_one_name_in_different_folders_stay_apart(tmp_path):
         frame.mask_path.rename(mask)
         frames.append(replace(frame, mask_path=mask, rock_path=rock))
     write_transforms(dataset.root, frames)
+    synthetic.write_dataset(dataset.root / TEST_FOLDER)
     dataset = load_dataset(dataset.root)
     flight = fly(dataset, SurveySettings(exact_poses=True))
     result = write_survey(tmp_path / "survey", dataset, flight)
@@ -265,6 +266,12 @@ def test_files_of_one_name_in_different_folders_stay_apart(tmp_path):
         assert np.array_equal(surveyed.mask(), flown.mask())
         assert np.array_equal(surveyed.rgb(), flown.rgb())
         assert np.array_equal(surveyed.target()[0], flown.target()[0])
+    tests, exact = result.test_views(), dataset.test_views()
+    assert tests.root == tmp_path / "survey" / TEST_FOLDER
+    for surveyed, flown in zip(tests.frames, exact.frames, strict=True):
+        poses = (one.camera.world_to_camera for one in (surveyed, flown))
+        assert np.allclose(*poses, atol=1e-12)
+        assert np.array_equal(surveyed.rgb(), flown.rgb())
 
 
 def test_command_writes_a_dataset_with_its_figure(tmp_path, capsys):

@@ -199,10 +199,10 @@ def test_the_rock_of_a_dataset_given_back_as_mesh_is_the_same_scene(dataset, tmp
 @pytest.mark.parametrize(
     ("suffix", "up", "said"),
     [
-        ("obj", None, "+Y taken as up, its format has no rule (--mesh-up z turns it)"),
-        ("ply", None, "+Z taken as up, its format has no rule (--mesh-up y turns it)"),
-        ("ply", "y", "+Y is up, as told"),
-        ("glb", "z", "+Z is up, as told"),
+        ("obj", None, "+Y taken as up, since its format does not say (--mesh-up z turns it)"),
+        ("ply", None, "+Z taken as up, since its format does not say (--mesh-up y turns it)"),
+        ("ply", "y", "+Y is up, as --mesh-up says"),
+        ("glb", "z", "+Z is up, as --mesh-up says"),
     ],
 )
 def test_what_is_taken_as_up_is_said(tmp_path, suffix, up, said):

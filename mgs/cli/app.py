@@ -135,7 +135,7 @@ VersionOption = typer.Option(
 
 @app.callback()
 def _program(version: Annotated[bool, VersionOption] = False) -> None:
-    """Active Gaussian splatting: exact Fisher information and next-best-view selection."""
+    """Active Gaussian splatting: choose the next best views by exact Fisher information."""
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -21,17 +21,17 @@ def dataset(
     ],
     path: Annotated[Path, argument("Folder of the dataset.")],
     prior: Annotated[
-        Path | None, option("masks: the prior to project. Default: DATASET/prior.")
+        Path | None, option("For masks: folder of the prior. Default: DATASET/prior.")
     ] = None,
 ) -> None:
     """Check a dataset, or make masks for one that has none.
 
     `mgs dataset check DATASET` checks that every file can be read and has the right size, and that
     colour, depth, masks and poses agree. It prints every problem and its cure, and exits with code
-    2 if there is one. Test views are a dataset of their own: give DATASET/test.
+    2 if there is one. Test views are a dataset of their own: check DATASET/test, too.
 
-    `mgs dataset masks DATASET` projects the prior into every image, and writes masks/, and
-    masks.png to look at.
+    `mgs dataset masks DATASET` projects the prior's mesh into every image and writes masks/. Look
+    at masks.png, which shows them, before you use them.
     """
     if action == "masks":
         _make_masks(path, prior or path / "prior")

@@ -5,7 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from mgs.cli.nbv import resume_and_print, settings_of, start_and_print, with_settings_as_options
+from mgs.cli.nbv import (
+    MORE_HELP,
+    resume_and_print,
+    settings_of,
+    start_and_print,
+    with_settings_as_options,
+)
 from mgs.cli.options import DatasetFolder, Force, option, parse_gaussians
 
 PANELS = {
@@ -15,6 +21,13 @@ PANELS = {
     "Advanced": ("pixel_noise", "prior_std", "seed"),
 }
 """Settings with an option of the same name, as `mgs.cli.nbv.PANELS`."""
+
+DEFAULTS = {
+    "passes": " Default: 30 with free means from photographs, else 10.",
+    "means": " Default: free from photographs, else frozen.",
+    "sh": " Default: 1 with free means from photographs, else 0.",
+}
+"""Help of the settings that `mgs.run.nbv.start_fit` decides by the prior."""
 
 
 def fit(
@@ -26,17 +39,17 @@ def fit(
     ] = None,
     gaussians: Annotated[
         str | None,
-        option("Build a prior of this many Gaussians in the run.", metavar="N|auto"),
+        option("Build a prior of this many Gaussians in the run folder.", metavar="N|auto"),
     ] = None,
     force: Force = False,
     **options: Any,
 ) -> None:
     """Fit a model to all images of a dataset, and measure it.
 
-    By default means are free and colours are of degree 1 where the prior comes from photographs
-    (points, masks or random). Means are frozen and colours of degree 0 where it comes from depth or
-    a mesh. Test views are never fitted. The folder is a run of `mgs nbv` that chooses no view, so
-    every command for runs takes it.
+    By default means are free and colours have SH degree 1 if the prior comes from photographs
+    (points, masks or random). Means are frozen and colours have degree 0 if it comes from depth or
+    a mesh. Test views are never fitted. The output is a run folder like that of `mgs nbv`, so all
+    commands for runs accept it.
     """
     from rich.console import Console
 
@@ -49,4 +62,4 @@ def fit(
     resume_and_print(run, console, run.settings.policy)
 
 
-with_settings_as_options(fit, PANELS)
+with_settings_as_options(fit, PANELS, MORE_HELP | DEFAULTS)

@@ -43,33 +43,35 @@ def import_data(
         option("Folder of COLMAP's or Metashape's images (default: images), or topic of a bag."),
     ] = None,
     keyframes: Annotated[
-        str, option("Keyframes of a recording: least seconds or metres apart, as 0.5s or 0.2m.")
+        str,
+        option("Of a recording, import frames at least this time or distance apart: 0.5s or 0.2m."),
     ] = "0.5s",
     masks: Annotated[
-        Path | None, option("Folder of rock masks, named like the images; white is rock.")
+        Path | None, option("Folder of masks, named like the images; the rock is white.")
     ] = None,
     mesh: Annotated[
         Path | None,
         option(
-            "Mesh of the rock whose projections give the masks. World coordinates; "
-            "a GLB is turned from +Y up."
+            "Mesh of the rock, world coordinates; masks are its projections. "
+            "GLB is converted from +Y up to +Z up."
         ),
     ] = None,
     downscale: Annotated[
         int,
-        option("Side of the pixel blocks that become one, as 4 for 12 megapixels.", min=1),
+        option("Average blocks of K x K pixels; 4 suits 12 megapixels.", min=1, metavar="K"),
     ] = 1,
     up: Annotated[
-        str, option("Upward: X,Y,Z in the source's world, or auto: as cameras were held.")
+        str,
+        option("Up direction: X,Y,Z in the source's world, or auto: from how cameras were held."),
     ] = "auto",
     unit: Annotated[
         float | None,
-        option("Metres in the source's unit of length. Default: unknown, unless there is depth."),
+        option("Metres per unit of length of the source. Default: as the source says, if it does."),
     ] = None,
     test_every: Annotated[
         int | None,
         option(
-            "Make every Nth image a test view, by name, from the first on; 8 is usual.",
+            "Make the first and every further Nth image, by name, a test view; 8 is usual.",
             min=2,
             metavar="N",
         ),
@@ -82,10 +84,9 @@ def import_data(
     """Make a dataset from your own data: cameras and images, with depth and masks if there are any.
     Lens distortion is undone.
 
-    Masks come from --masks, else --mesh, the source's own mask files, or the images' alpha. Alpha
-    with values between empty and full is kept, in images of the rock alone (rock/). Points that
-    came with the cameras are kept for `mgs prior`, in sparse.ply. The same command continues an
-    interrupted import.
+    Masks come from --masks, else from --mesh, the source's own mask files, or the images' alpha.
+    Partial alpha is kept in rock/, images of the rock alone. Points that came with the cameras are
+    kept in sparse.ply for `mgs prior`. The same command continues an interrupted import.
     """
     from mgs.data.dataset import TEST_FOLDER
     from mgs.data.importers import import_source
@@ -121,7 +122,7 @@ def import_data(
             on_frame=partial(progress, "importing"),
         )
     if mesh is not None and mesh.suffix.lower() in GLTF:
-        console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
+        console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
     if found.missing:
         notes.print(f"mgs: {found.missing} of {listed} listed images do not exist; skipped them")
     if found.no_cloud:
@@ -156,7 +157,7 @@ def import_data(
     )
     if tests is not None:
         console.print(
-            f"test views: {len(tests.shots)} images, which are no candidates; "
+            f"test views: {len(tests.shots)} images, which are never candidates; "
             f"wrote {out / TEST_FOLDER}"
         )
     _tidy([*found.shots, *(tests.shots if tests else ())], unpacked)

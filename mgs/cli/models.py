@@ -26,24 +26,27 @@ def evaluate(
         list[Path], argument("Folders that `mgs nbv` wrote, or PLYs.", metavar="RUN|SPLATS.ply...")
     ],
     dataset: Annotated[
-        Path | None, option("Dataset of a PLY. Default: that of the run in whose folder it is.")
+        Path | None, option("Dataset for a PLY. Default: that of the run whose folder holds it.")
     ] = None,
     pictures: Annotated[
         bool, option("Write truth, render and difference of each view to RUN/renders.")
     ] = True,
     convergence: Annotated[
         bool,
-        option("Predict how much lower the last fit could get (Newton decrease).", "--convergence"),
+        option(
+            "Estimate how far the loss of the last fit is above its minimum (Newton decrease).",
+            "--convergence",
+        ),
     ] = False,
 ) -> None:
-    """Measure models on the test views, on all views, and on the held-out views; write
-    RUN/metrics.json, and renders beside truth.
+    """Measure PSNR and SSIM of models on test views, all views and held-out views; write
+    RUN/metrics.json, and renders beside the truth.
 
-    Of a run its refitted and pruned models are measured, too, where they are there; the numbers of
-    a PLY are written beside it. Metrics and pictures of the same model and dataset are kept, not
-    made again. The truth is the rock on black. PSNR and SSIM are over the full frame, and masked to
-    the pixels of the rock. metrics.json also has the errors of alpha and depth, where the dataset
-    has their truth.
+    Held-out views are frames of the dataset that the run did not take. A run's refitted and pruned
+    models are measured, too. The metrics of a PLY are written beside it. Metrics and pictures that
+    are up to date are kept. The truth is the rock on black. PSNR and SSIM are over the full frame,
+    and masked to the pixels of the rock. metrics.json also has the errors of alpha and depth, where
+    the dataset has their truth.
     """
     from mgs.report.evaluation import evaluate as measured
     from mgs.report.smaller import PRUNED, REFITTED
@@ -59,7 +62,9 @@ def evaluate(
             )
             if subject.is_dir():
                 if dataset is not None:
-                    raise InputError(f"--dataset: is for a PLY; {subject} has a dataset of its own")
+                    raise InputError(
+                        f"--dataset: is for a PLY, and {subject} has its own dataset; leave it out"
+                    )
                 options = {"pictures": pictures, "convergence": convergence, "progress": progress}
                 rows += _measured_run(subject, len(subjects) == 1, said, options)
             for path in others:
@@ -100,7 +105,11 @@ def diagnose(
     ] = None,
     calibrate: Annotated[
         bool,
-        option("Instead, predict the errors of views not seen, and compare.", "--calibrate"),
+        option(
+            "Instead of maps, predict the errors of unseen views and compare them with the true "
+            "ones.",
+            "--calibrate",
+        ),
     ] = False,
     force: Force = False,
 ) -> None:
@@ -113,9 +122,9 @@ def diagnose(
     information.
 
     With --calibrate it writes uncertainty.json and uncertainty.png instead: how well errors are
-    predicted in test views and in held-out frames. The prediction is calibrated on the
-    run's own views, each left out of a fit once. NAME.errors.exr has the true error and the
-    predicted standard deviation of some views.
+    predicted in test views and in held-out frames. The prediction is calibrated by leaving each of
+    the run's own views out of a fit once. NAME.errors.exr has the true error and the predicted
+    standard deviation of some views.
     """
     from mgs.report.diagnostics import diagnose_run
     from mgs.run.folder import open_run
@@ -152,8 +161,8 @@ def prune(
 ) -> None:
     """Remove Gaussians of a run that its images hardly need; write RUN/gaussians_pruned.ply.
 
-    The change of the training images is measured, and stays within --noise. Nothing is fitted
-    again, and the run itself stays as it is.
+    The change of the training images is measured and stays within --noise. Nothing is fitted
+    again. The run itself is not changed.
     """
     from mgs.report.smaller import PRUNED, prune_run
     from mgs.run.folder import open_run
@@ -181,7 +190,8 @@ def prune(
 def refit(
     runs: Runs,
     learn: Annotated[
-        str, option("auto: each Gaussian learns the kinds that the evidence supports; all: all.")
+        str,
+        option("auto: each Gaussian learns the kinds that the evidence supports; all: all kinds."),
     ] = "auto",
     sh: Annotated[
         str, option("SH degree: 0, or auto: 1 if it predicts left-out views better, else 0.")
@@ -196,8 +206,8 @@ def refit(
 
     The evidence (marginal likelihood of the images) and --loss choose the kinds of parameters that
     each Gaussian learns; views left out choose the SH degree. No test view is used. Parameters that
-    are not learned keep the prior's values, and are marked in the file. The run itself stays as it
-    is.
+    are not learned keep the prior's values, and are marked in the file. The run itself is not
+    changed.
     """
     from mgs.report.smaller import REFITTED, refit_run
     from mgs.run.folder import open_run

@@ -51,7 +51,7 @@ METAVARS = {
 }
 
 MORE_HELP = {
-    "policy": f" Policies: {', '.join(policy_names())}.",
+    "policy": f" Names (docs/nbv.md): {', '.join(policy_names())}.",
     "alpha_weight": " Default: 0.1, or 0 where frames have neither mask nor alpha.",
 }
 
@@ -72,77 +72,82 @@ def nbv(
     resume: Annotated[
         Path | None,
         main(
-            "Continue this run by its config.json; repeat programs: --policy, --capture-...",
+            "Continue this run with the settings of its config.json. Give --policy FILE.py and "
+            "--capture-... options again.",
             metavar="RUN",
         ),
     ] = None,
     capture: Annotated[
         str | None,
         data(
-            "In place of DATASET: a scene (name or .toml), rendered when a view is chosen.",
+            "Scene (name or .toml) in place of DATASET; each view is rendered when it is chosen.",
             metavar="SCENE",
         ),
     ] = None,
     config: Annotated[
         Path | None,
         main(
-            "Settings with the keys of config.json (that of a run works, too); options win.",
+            "File of settings with the keys of config.json, or a run's config.json. "
+            "Options override it.",
             metavar="FILE.toml",
         ),
     ] = None,
     capture_command: Annotated[
         str | None,
         capturing(
-            "Program that takes a picture of a pose: 'CMD {pose} {out}' (JSON in, PNG out).",
+            "Program that takes a picture: 'CMD {pose} {out}' reads a JSON file, writes a PNG.",
             metavar="COMMAND",
         ),
     ] = None,
     capture_folder: Annotated[
         Path | None,
-        capturing("Folder in which poses are written and pictures of them are awaited."),
+        capturing("Folder to which poses are written; pictures are awaited there."),
     ] = None,
     capture_timeout: Annotated[
         float, capturing("Longest wait for a picture, seconds.", min=0.01)
     ] = 600.0,
-    capture_tries: Annotated[int, capturing("Most pictures asked for at a pose.", min=1)] = 3,
+    capture_tries: Annotated[int, capturing("Most attempts at a pose.", min=1)] = 3,
     capture_failure: Annotated[
         str,
         capturing(
-            "After the last try: take the next best pose in its place, or stop the run.",
+            "After the last attempt: choose the next best pose in its place, or stop the run.",
             metavar="skip|stop",
         ),
     ] = "skip",
     capture_distance: Annotated[
         float | None,
         capturing(
-            "Largest distance from the pose asked for. Default: a quarter of the object's.", min=0.0
+            "Largest distance of a picture from its pose, in the dataset's unit. "
+            "Default: a quarter of the distance to the object.",
+            min=0.0,
         ),
     ] = None,
     gaussians: Annotated[
         str | None,
-        data("Build a prior of this many Gaussians in the run (`mgs prior`).", metavar="N|auto"),
+        data("Build a prior of this many Gaussians in the run folder.", metavar="N|auto"),
     ] = None,
     preset: Annotated[
         str | None,
         option(
-            f"Defaults of passes and of the number of Gaussians: {', '.join(PRESETS)}.",
+            f"Defaults for passes and the number of Gaussians: {', '.join(PRESETS)}.",
             rich_help_panel="Fitting",
         ),
     ] = None,
-    force: Annotated[bool, main("Replace a run that is there.", "--force")] = False,
+    force: Annotated[bool, main("Replace an existing run.", "--force")] = False,
     tensorboard: Annotated[
         bool,
         typer.Option(
-            "--tensorboard", help="Log to RUN/tensorboard too.", rich_help_panel="Main options"
+            "--tensorboard", help="Also log to RUN/tensorboard.", rich_help_panel="Main options"
         ),
     ] = False,
     **options: Any,
 ) -> None:
-    """Choose the next best views: fit to the seeds, choose a view, read its image, fit again.
+    """Choose the next best views: fit to a few seed views, choose a view, read its image, fit
+    again.
 
-    Ends when the budget is spent, or with --stop-gain or --stop-uncertainty. Writes config.json,
-    steps.jsonl (a line for each view), checkpoint.npz, gaussians.ply and metrics.json into the run
-    folder. An interrupted run continues with --resume, and takes the same views.
+    Ends when the budget is spent, or earlier by --stop-gain or --stop-uncertainty. Writes
+    config.json, steps.jsonl (a line for each view), checkpoint.npz, gaussians.ply and metrics.json
+    into the run folder. An interrupted run continues with --resume and chooses the same views.
     """
     from rich.console import Console
 
@@ -231,24 +236,28 @@ def settings_of(given: dict[str, Any], fit: dict[str, Any] | None = None) -> dic
     return settings | {"train": train}
 
 
-def with_settings_as_options(function: Any, panels: dict[str, tuple[str, ...]] = PANELS) -> Any:
+def with_settings_as_options(
+    function: Any,
+    panels: dict[str, tuple[str, ...]] = PANELS,
+    more_help: dict[str, str] = MORE_HELP,
+) -> Any:
     """Give a command an option for each setting in `panels`, passed as `**options`."""
     signature = inspect.signature(function, eval_str=True)
     parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
     for panel, names in panels.items():
-        parameters += [_option(name, panel) for name in names]
+        parameters += [_option(name, panel, more_help.get(name, "")) for name in names]
     function.__signature__ = signature.replace(parameters=parameters)
     function.__annotations__ = {p.name: p.annotation for p in parameters}
     return function
 
 
-def _option(name: str, panel: str) -> inspect.Parameter:
+def _option(name: str, panel: str, more_help: str) -> inspect.Parameter:
     """The option of a setting: type, help and default from its model."""
     model = NbvSettings if name in NbvSettings.model_fields else TrainSettings
     hint, field = get_type_hints(model)[name], model.model_fields[name]
     kind = next((part for part in get_args(hint) if part in (int, float, str)), hint)
     kind = {int: int, float: float, bool: bool, dict[str, float]: list[str]}.get(kind, str)
-    text, default = (field.description or "") + MORE_HELP.get(name, ""), field.default
+    text, default = (field.description or "") + more_help, field.default
     if isinstance(default, dict):
         kind, default = list[str], ", ".join(f"{k}={v:g}" for k, v in default.items())
     if default is not None and not isinstance(default, bool) and "Default:" not in text:

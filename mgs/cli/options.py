@@ -23,9 +23,12 @@ def argument(text: str, **more: Any) -> Any:
 Runs = Annotated[list[Path], argument("Folders that `mgs nbv` wrote.", metavar="RUN...")]
 DatasetFolder = Annotated[Path, argument("Dataset folder (transforms.json).")]
 Seed = Annotated[
-    int, option("Root seed: the same seed gives the same result.", "--random-seed", min=0)
+    int,
+    option(
+        "Seed of all random draws: the same seed gives the same result.", "--random-seed", min=0
+    ),
 ]
-Force = Annotated[bool, option("Replace an output that is there.", "--force")]
+Force = Annotated[bool, option("Replace an existing output.", "--force")]
 
 
 def parse_up(text: str) -> tuple[float, float, float] | None:

@@ -99,7 +99,8 @@ def view(
     ],
     port: Annotated[int, option("Port to serve on; 0: any free one.", min=0, max=65535)] = 8080,
     host: Annotated[
-        str, option("Address to serve on. Any but 127.0.0.1 can be reached by others.")
+        str,
+        option("Address to serve on. With any but 127.0.0.1, other machines can reach the page."),
     ] = "127.0.0.1",
     follow: Annotated[
         bool, option("Show every new step of a run in progress.", "--follow")
@@ -108,10 +109,9 @@ def view(
     """Show a run or a model in the browser: Gaussians, mesh and cameras, turned by mouse, keyboard
     or touch.
 
-    While the camera moves, the browser draws the Gaussians, without view-dependent colour. While it
-    rests, the kernel's exact image is shown. Layers: colour, alpha, depth; for a run also
-    information, uncertainty, and what is unobserved. A click on a camera shows its image and its
-    numbers. Ctrl-C ends it.
+    While the camera moves, the browser draws the Gaussians, without view-dependent colour. When it
+    rests, mgs renders the exact image. Layers: colour, alpha, depth; for a run also information,
+    uncertainty and unobserved. A click on a camera shows its image and its numbers. Ctrl-C ends it.
     """
     from mgs.view.server import Viewer
 
@@ -120,7 +120,7 @@ def view(
     try:
         token = viewer.access.token
         if token:
-            typer.echo(f"--host {host}: whoever has the address below, with its token, can look")
+            typer.echo(f"--host {host}: anyone who has the address below, with its token, can look")
         shown = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         query = f"/?token={token}" if token else ""
         typer.echo(f"open http://{shown}:{viewer.port}{query} in a browser; Ctrl-C ends it")

@@ -44,53 +44,55 @@ def prior(
         str | None,
         option(
             "Number of Gaussians, on the surface and behind it. "
-            "Default: auto, what the closest pixel resolves.",
+            "Default: auto, as many as the closest camera resolves.",
             metavar="N|auto",
         ),
     ] = None,
     spacing: Annotated[
-        float | None, option("Distance between samples, metres, instead of N.")
+        float | None,
+        option("Distance between samples, in the dataset's unit; in place of --gaussians."),
     ] = None,
     source: Annotated[
         str | None,
         option(
-            "depth, mesh, points, hull (of the masks) or random. "
-            "Default: the first of depth, points, hull that there is, else random.",
+            "Source of the surface: depth, points, hull (of the masks), mesh (--mesh) or random. "
+            "Default: the first of depth, points and hull that the dataset has, else random.",
             "--from",
         ),
     ] = None,
     points: Annotated[
-        Path | None, option("PLY file of points to build it from, world coordinates.")
+        Path | None, option("PLY file of points for --from points, world coordinates.")
     ] = None,
     up: Annotated[
         str | None,
-        option("Upward: X,Y,Z, or auto: the ground's normal. Default: as the dataset says."),
+        option("Up direction: X,Y,Z, or auto: the ground's normal. Default: as the dataset says."),
     ] = None,
     mesh: Annotated[
         Path | None,
-        option("Mesh to sample. World coordinates, metres; a GLB is turned from +Y up."),
+        option("Mesh to sample, world coordinates. GLB is converted from +Y up to +Z up."),
     ] = None,
     backing: Annotated[
         float,
-        option("Gaussians behind the surface per one on it, for opacity; in the paper 0."),
+        option("Gaussians behind the surface for each on it, to keep it opaque; in the paper 0."),
     ] = 0.5,
     poisson_depth: Annotated[
         int | None,
-        option("Octree depth of the Poisson surface, 3 to 12. Default: by the cloud's density."),
+        option("Octree depth of the Poisson surface, 3 to 12. Default: from the cloud's density."),
     ] = None,
     prior_noise: Annotated[
-        float, option("Degrade the rock's points: standard deviation of noise, metres.")
+        float,
+        option("Degrade the prior: standard deviation of noise on the rock's points, metres."),
     ] = 0.0,
     holes: Annotated[
-        float, option("Degrade the rock's points: share to remove, in round holes.")
+        float, option("Degrade the prior: share of the rock's points to remove, in round holes.")
     ] = 0.0,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
-    """Build a mesh of the rock, and sample N points on it.
+    """Build the prior: a mesh of the rock, and points sampled on it, where the Gaussians start.
 
-    From depth images: fuse a cloud, find the ground plane and the rock above it, reconstruct its
-    surface (Poisson). From points that came with the cameras: reconstruct the surface of those
+    From depth images: fuse a cloud, find the ground plane and the rock above it, and reconstruct
+    its surface (Poisson). From points that came with the cameras: reconstruct the surface of those
     inside the masks or above the ground. From a hull: take the largest body inside all masks. Then
     spread samples evenly over the faces that some frame sees. Writes mesh.ply, points.ply,
     prior.json and prior.png.
@@ -121,7 +123,7 @@ def prior(
             cameras = [frame.camera for frame in loaded.frames]
             result = prior_from_mesh(mesh, settings, axis or loaded.up, loaded.unit, cameras)
             if mesh.suffix.lower() in GLTF:
-                console.print(f"{mesh}: turned from +Y up, the rule of its format, to +Z up")
+                console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
         else:
             upward: Any = "auto" if up == "auto" else axis
             chosen = source_of(loaded, source, points)
@@ -141,8 +143,8 @@ def prior(
     agreed = result.numbers.get("colour_agreement", 1.0)
     if agreed < AGREEMENT:
         console.print(
-            f"the photographs agree on {agreed:.0%} of the surface's colours, and on a right "
-            f"surface on {AGREEMENT:.0%} or more: it may be wrong; fit with `--means free`",
+            f"the photographs agree on only {agreed:.0%} of the surface's colours (on a correct "
+            f"surface on {AGREEMENT:.0%} or more), so it may be wrong; fit with `--means free`",
             soft_wrap=True,
         )
     if "resolution" in result.numbers:

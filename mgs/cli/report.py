@@ -31,19 +31,18 @@ def report(
     ] = None,
     html: Annotated[
         Path | None,
-        option("One page with everything, interactive; it opens from the disk and loads nothing."),
+        option("Interactive HTML page to write; one file that opens without a network."),
     ] = None,
     force: Force = False,
 ) -> None:
     """Compare runs: draw the orbit, information gain, coverage, PSNR against images and one test
     view, and make a table.
 
-    Without test views in the dataset, a view is drawn that the fewest runs were trained on, and
-    PSNR is over all views. Figures need runs that are finished and measured by `mgs eval`; nothing
-    is computed again.
+    If the dataset has no test views, PSNR is over all views, and the view drawn is one that the
+    fewest runs were trained on. Figures need runs that are finished and measured by `mgs eval`;
+    nothing is computed again.
 
-    The page of --html takes unfinished runs too. Its pictures are drawn from the model that the run
-    folder holds.
+    The page of --html takes unfinished runs, too, and draws the model that the run folder holds.
     """
     from mgs.plotting import FORMATS
 
@@ -80,8 +79,7 @@ def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
         typer.echo(f"wrote {file}")
     if not any(file.stem == "psnr" for file in written):
         typer.echo(
-            "PSNR against images is left out: "
-            "it needs that all runs were made with --evaluate-every"
+            "PSNR against images is left out: make all runs with --evaluate-every to have it"
         )
 
 

@@ -37,7 +37,7 @@ def export(
 ) -> None:
     """Write a model for other programs: viewers, game engines, web pages.
 
-    Reads and writes the same formats, so it converts between them, too.
+    All formats can also be read, so the command converts between them, too.
     """
     from mgs.report.exporting import in_srgb, read_model, to_y_up
     from mgs.splat_files import FORMATS, write_gaussians
@@ -78,29 +78,34 @@ def video(
     ] = None,
     path: Annotated[
         Literal["turntable", "spiral", "cameras"],
-        option("Way of the camera: a circle, two turns up and down, or through the dataset's."),
+        option(
+            "Camera path: a circle, two turns that rise and fall, or through the dataset's cameras."
+        ),
     ] = "turntable",
     beside: Annotated[
         Literal["truth", "uncertainty"] | None,
         option(
-            "Second picture: the map of what is unknown, or the truth, which shows the dataset's "
-            "own views."
+            "Second picture: the true images, at the dataset's own views, or the map of what is "
+            "unknown."
         ),
     ] = None,
     story: Annotated[
         bool,
-        option("Show how the model came to be, view by view; fits it again for that.", "--story"),
+        option("Show the model after each view of the run; repeats the fits.", "--story"),
     ] = False,
     seconds: Annotated[
-        float | None, option("Length. Default: 8, or 1 a view with --story or truth.", min=0.1)
+        float | None,
+        option(
+            "Length, seconds. Default: 8, or 1 per view with --story or --beside truth.", min=0.1
+        ),
     ] = None,
-    fps: Annotated[int, option("Frames a second along a path.", min=1, max=60)] = 25,
+    fps: Annotated[int, option("Frames per second along a path.", min=1, max=60)] = 25,
     width: Annotated[
         int | None, option("Width of a picture in pixels. Default: the cameras' own.", min=16)
     ] = None,
     force: Force = False,
 ) -> None:
-    """Write a film of each run: around its model, or how it came to be."""
+    """Make a video of each run: a camera path around its model, or the model view by view."""
     from mgs import runtime
     from mgs.report.story import story_frames
     from mgs.report.video import check_film, path_frames, write_film

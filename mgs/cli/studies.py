@@ -59,24 +59,27 @@ def reproduce(
     preset: Annotated[
         str,
         option(
-            "quick: Table I of 12 of 32 views, 320x240. paper: of 54 of 100 views, 640x480.",
+            "quick: Table I with 12 of 32 views, 320x240. paper: 54 of 100 views, 640x480.",
             "--scale",
         ),
     ] = "quick",
     only: Annotated[
         str | None,
         option(
-            "Results to make, separated by commas: table1, figures, setups, oracle. "
-            "Default: all but oracle."
+            "Results to make, separated by commas: table1, figures, setups, flights, survey, "
+            "oracle. Default: table1, figures and setups."
         ),
     ] = None,
     rocks: Annotated[
         int | None,
-        option("Rocks of setups and oracle. Default: as --scale says.", min=1),
+        option(
+            "Number of rocks for setups, flights, survey and oracle. Default: as --scale says.",
+            min=1,
+        ),
     ] = None,
     policy: Annotated[
         list[str] | None,
-        option("A further policy for the set-ups: a name or FILE.py:FUNCTION; repeatable."),
+        option("A further policy for setups: a name or FILE.py:FUNCTION; repeatable."),
     ] = None,
     mesh: Annotated[
         list[Path] | None,
@@ -90,9 +93,11 @@ def reproduce(
         str | None, option("Use the workers of this Dask scheduler instead, as tcp://HOST:8786.")
     ] = None,
 ) -> None:
-    """Make the results of docs/results.md: Table I at equal numbers of images, policies in six
-    set-ups over many rocks with statistics, and an oracle that knows the test views.
+    """Make the results of docs/results.md: the paper's Table I, policies in six set-ups over many
+    rocks with statistics, and an oracle.
 
+    Table I compares policies at equal numbers of images. The oracle chooses the view that raises
+    the PSNR of the test views most: an upper bound for policies, which cannot see test views.
     Every dataset, prior and run is made once and kept in OUT/cells; the results are written to
     OUT/results. Runs whose seconds are reported run one at a time: let nothing else run meanwhile.
     """
@@ -128,8 +133,8 @@ def stress(
         str | None, option("Names of experiments, separated by commas. Default: all.")
     ] = None,
 ) -> None:
-    """Try to make the methods fail: experiments test hypotheses, and a rule turns the numbers into
-    verdicts.
+    """Try to make the methods fail: test hypotheses by experiments, and judge each by a fixed
+    statistical rule.
 
     Writes stability.csv (all numbers), verdicts.json, stability.md (the verdicts as tables) and a
     plot of each experiment.
@@ -157,10 +162,10 @@ def parsimony(
     ] = "quick",
 ) -> None:
     """Chart quality and cost against the number of Gaussians, the kinds of parameters learned, and
-    the SH degree, with the automatic choice marked.
+    the SH degree; mark the automatic choice.
 
-    Renders the scenes, fits each model view by view, and judges it on test views that no model
-    sees. Writes parsimony.json, parsimony.csv, parsimony.md and parsimony.png.
+    Renders the scenes, fits each model view by view, and measures it on test views that no model
+    is fitted to. Writes parsimony.json, parsimony.csv, parsimony.md and parsimony.png.
     """
     from mgs.study import parsimony as study
     from mgs.study.output import text_of

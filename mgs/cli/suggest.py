@@ -40,9 +40,11 @@ def suggest(
         Path | None,
         option("Candidates: a transforms.json without images, or a CSV with columns x,y,z."),
     ] = None,
-    dome: Annotated[int | None, option("Candidates: N poses on a dome.", min=1)] = None,
-    ring: Annotated[int | None, option("Candidates: N poses on a ring.", min=1)] = None,
-    grid: Annotated[int | None, option("Candidates: about N poses of a lattice.", min=1)] = None,
+    dome: Annotated[int | None, option("Candidates: poses on a dome.", min=1, metavar="N")] = None,
+    ring: Annotated[int | None, option("Candidates: poses on a ring.", min=1, metavar="N")] = None,
+    grid: Annotated[
+        int | None, option("Candidates: about N poses of a cubic lattice.", min=1, metavar="N")
+    ] = None,
     views: Annotated[int, option("Views to plan together, in flying order.", min=1)] = 1,
     out: Annotated[
         Path | None,
@@ -50,37 +52,51 @@ def suggest(
     ] = None,
     plan: Annotated[
         list[Path] | None,
-        option("Flight plan to write: .plan, .waypoints or .kml. Needs --origin."),
+        option("Flight plan to write: .plan, .waypoints or .kml; repeatable. Needs --origin."),
     ] = None,
     origin: Annotated[
         str | None,
-        option("Place of the world's origin: LAT,LON,ALT, and the bearing of +Y if not north."),
+        option("Where the world's origin is: LAT,LON,ALT or, if +Y is not north, ...,BEARING."),
     ] = None,
     radius: Annotated[
-        float | None, option("Distance of placed poses. Default: median of the images'.")
+        float | None,
+        option("Radius of --dome, --ring or --grid. Default: median distance of the images."),
     ] = None,
     elevations: Annotated[
-        str | None, option("Lowest and highest elevation, degrees. Default if placed: 10,80.")
+        str | None,
+        option(
+            "Lowest and highest elevation, degrees. "
+            "Default: 10,80 with --dome, --ring or --grid, else any."
+        ),
     ] = None,
     safe_distance: Annotated[
         float | None,
-        option("Least distance from the prior's mesh. Default if placed: half that of the images."),
+        option(
+            "Least distance from the prior's mesh. "
+            "Default: half that of the images with --dome, --ring or --grid, else 0."
+        ),
     ] = None,
     no_fly: Annotated[
         float | None,
-        option("Radius in metres of an upright cylinder around the object to fly around."),
+        option(
+            "Radius in metres of an upright cylinder around the object that the flight must not "
+            "enter."
+        ),
     ] = None,
     clearance: Annotated[
-        float | None, option("Least height in metres above the object's lowest point.")
+        float | None, option("Lowest height of a pose above the object's lowest point, metres.")
     ] = None,
     flight_length: Annotated[
-        float | None, option("Most metres of the flight; --views is then the most.")
+        float | None, option("Longest flight in metres; --views is then an upper limit.")
     ] = None,
-    flight_time: Annotated[float | None, option("Most seconds of the flight.")] = None,
-    speed: Annotated[float | None, option("Metres per second. Default: 2.")] = None,
-    hover: Annotated[float | None, option("Seconds at each picture. Default: 3.")] = None,
+    flight_time: Annotated[float | None, option("Longest flight in seconds.")] = None,
+    speed: Annotated[
+        float | None, option("Speed between pictures, metres per second. Default: 2.")
+    ] = None,
+    hover: Annotated[float | None, option("Seconds that a picture takes. Default: 3.")] = None,
     policy: Annotated[
-        str | None, option("Policy that scores. Default: that of `mgs nbv`, or of the run.")
+        str | None,
+        option("Policy that scores candidates. Default: that of the run, or of `mgs nbv`."),
     ] = None,
     prior: Annotated[
         Path | None, option("Folder of `mgs prior`. Default: DATASET/prior, or one built now.")
@@ -88,15 +104,16 @@ def suggest(
     gaussians: Annotated[
         str | None, option("Build a prior of this many Gaussians.", metavar="N|auto")
     ] = None,
-    preset: Annotated[str | None, option("As of `mgs nbv`.")] = None,
+    preset: Annotated[str | None, option("As in `mgs nbv`: fast, balanced or accurate.")] = None,
     force: Force = False,
 ) -> None:
     """Rank candidate poses by what a picture from each would add; plan the next flight.
 
-    Takes all images of a dataset, fits a model to them, and rates candidates, of which no image is
-    needed; by default 100 poses on a dome. Of a run it takes the model as it is; by default its own
-    frames that are left are the candidates. With --views K it plans K views together and puts them
-    into flying order, from the first image and back to it. Lengths are in the dataset's unit.
+    Given a dataset, fits a model to all its images and scores 100 poses on a dome, or the
+    candidates that you choose; they need no images. Given a run, uses its model as it is; its
+    candidates are by default the frames that it has not taken. With --views K it plans K views
+    together and puts them into flying order, from the first image and back to it. Lengths are in
+    the dataset's unit.
     """
     from mgs.data.flight_plan import check_plan_path, parse_origin
 
@@ -145,7 +162,9 @@ def suggest(
         )
         crossed = _crossed(run, found)
         if crossed and plan:
-            raise InputError(f"suggest: {crossed}, so no flight plan is written; give --no-fly")
+            raise InputError(
+                f"suggest: {crossed}, so no flight plan is written; give --no-fly METRES"
+            )
         if out is not None:
             from mgs.report.suggestion import write_suggestion
 
@@ -274,7 +293,7 @@ def _print(console: Console, found: Suggestion, views: int, run: Run, crossed: s
     from mgs.policy.criteria import GAIN_UNIT
 
     for reason, count in found.dropped.items():
-        console.print(f"dropped: {count} {reason}")
+        console.print(f"candidates left out: {count} {reason}")
     rows = found.plan if views > 1 else found.ranking[:SHOWN]
     table = Table(box=None)
     numbers = ("score", "gain", "distance", "azimuth", "elevation", "unseen", "unknown")
@@ -286,12 +305,12 @@ def _print(console: Console, found: Suggestion, views: int, run: Run, crossed: s
     unit = run.dataset.unit
     plan = f"{len(found.plan)} view{'s' if len(found.plan) > 1 else ''}"
     console.print(
-        f"gain: Eq. 7, {GAIN_UNIT}; unseen, unknown: of what the picture shows\n"
+        f"gain: Eq. 7, {GAIN_UNIT}; unseen, unknown: shares of what the picture shows\n"
         f"flight: {found.metres:.1f} {unit} and {found.seconds:.0f} s from the first image through "
         f"{plan} and back"
     )
     if crossed:
-        console.print(f"{crossed}; --no-fly METRES plans around it")
+        console.print(f"{crossed}; give --no-fly METRES to plan around it")
 
 
 def _cells(view: View, unit: str) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from mgs.files import Ours, atomic_folder
 
 FILES = [
     *("survey.json", "cloud.ply", "survey.png", "transforms.json", "rock.glb"),
-    *("images", "masks", "rock", "depth"),
+    *("images", "masks", "rock", "depth", "test"),
 ]
 """Names in a folder of this command."""
 
@@ -26,7 +26,7 @@ def survey(
     ] = None,
     poses: Annotated[
         Literal["estimated", "exact"],
-        option("estimated: from odometry, registration and loop closure. exact: as flown."),
+        option("estimated: by odometry, registration and loop closure. exact: the true poses."),
     ] = "estimated",
     sensor_noise: Annotated[
         float | None,
@@ -37,15 +37,16 @@ def survey(
     ] = None,
     drift: Annotated[
         float | None,
-        option("Factor on the errors of odometry. Default: as the scene says, else 1."),
+        option("Factor on the errors of odometry. Default: as the dataset's scene says, else 1."),
     ] = None,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
-    """Survey a dataset's orbit: noisy depth, drifting odometry, registration, loop closure, fusion.
+    """Simulate a survey flight along a dataset's orbit: noisy depth, drifting odometry,
+    registration, loop closure and fusion.
 
-    The result is a dataset again, with estimated poses and measured depth, so `mgs prior OUT`
-    builds the prior of such a flight. The folder also holds cloud.ply, survey.json and survey.png.
+    The result is a dataset with estimated poses and measured depth, from which `mgs prior OUT`
+    builds a prior. The folder also holds cloud.ply, survey.json and survey.png.
     """
     from mgs.data.dataset import load_dataset
     from mgs.survey.flight import SurveySettings, fly

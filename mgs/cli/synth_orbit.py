@@ -38,7 +38,7 @@ def synth_orbit(
     ] = None,
     mesh_up: Annotated[
         Literal["y", "z"] | None,
-        option("Up axis of --mesh. Default: y for GLB (its rule) and OBJ, z for others."),
+        option("Up axis of --mesh. Default: y for GLB (as glTF says) and OBJ, else z."),
     ] = None,
     preset: Annotated[
         str, option("quick: 32 frames of 320x240. paper: 100 frames of 640x480.", "--scale")
@@ -47,27 +47,30 @@ def synth_orbit(
         int | None, option("Samples per pixel. Default: as --scale says.", min=1)
     ] = None,
     frames: Annotated[
-        int | None, option("Number of frames. Default: as --scale says.", min=1)
+        int | None, option("Number of views on the orbit. Default: as --scale says.", min=1)
     ] = None,
     size: Annotated[
         str | None, option("Image size WIDTHxHEIGHT, pixels. Default: as --scale says.")
     ] = None,
     test_views: Annotated[
-        int, option("Number of test views on a dome, to evaluate models; in OUT/test.", min=0)
+        int, option("Number of test views on a dome around the rock, in OUT/test.", min=0)
     ] = 0,
     on_demand: Annotated[
         bool,
         option(
-            "Render test views and a survey, but no frame: `mgs nbv OUT` renders those it takes.",
+            "Render no frames yet, only test views and a survey for `mgs prior`; "
+            "`mgs nbv OUT` renders each frame that it chooses.",
             "--on-demand",
         ),
     ] = False,
     pose_noise: Annotated[
-        float, option("Noise on the positions in transforms.json, metres per axis.", min=0)
+        float,
+        option(
+            "Error of camera positions in transforms.json: standard deviation per axis, metres.",
+            min=0,
+        ),
     ] = 0.0,
-    rotation_noise: Annotated[
-        float, option("Noise on the rotations there, degrees per axis.", min=0)
-    ] = 0.0,
+    rotation_noise: Annotated[float, option("The same of camera rotations, degrees.", min=0)] = 0.0,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
@@ -79,7 +82,7 @@ def synth_orbit(
     command continues an interrupted run.
 
     With --on-demand it writes poses, test views and a survey (depth and masks, in OUT/survey). The
-    image of a frame is rendered when a run of `mgs nbv` takes it.
+    image of a frame is rendered when `mgs nbv` chooses it.
     """
     runtime.start()
     from mgs.synth.orbit import PoseNoise

@@ -152,7 +152,10 @@ def read_bag(path: Path, unpack: Path, topic: str | None, spacing: Spacing) -> l
         times = [seconds(message) for _, message in messages(reader, topic=topic)]
         posed = [(t, pose) for t in times if (pose := tree.pose(frame, t)) is not None]
         if not posed:
-            raise InputError(f"{path}: the poses and the images of {topic} have no time in common")
+            raise InputError(
+                f"{path}: no image of {topic} has a pose at its time; "
+                "record poses and images together, by one clock"
+            )
         kept = dict(posed[k] for k in spacing.choose(posed))
         shots: dict[float, dict[str, Any]] = {}
         for _, message in messages(reader, topic=topic):

@@ -96,12 +96,12 @@ class Dataset:
 
 
 def load_dataset(root: str | Path, *, to_capture: bool = False) -> Dataset:
-    """Read transforms.json and check that the files it names exist (unless it is on demand).
+    """Load the dataset in the folder `root`: the frames of its transforms.json (docs/data.md).
 
-    to_capture: frames whose image does not exist are on demand. Pixels are read later, by the
-    methods of `Frame`. Raises InputError if the folder or a file is missing, intrinsics are
-    missing, images are distorted, a pose is not finite or singular, there are no frames, or two
-    frames have the same name.
+    Checks that image files exist, unless the dataset is on demand. Pixels are read later, by the
+    methods of `Frame`. to_capture: frames without an image are on demand, too. Raises InputError if
+    the folder or a file is missing, intrinsics are missing, images are distorted, a pose is not
+    finite or singular, there are no frames, or two frames have the same name.
     """
     root = Path(root)
     path = root / "transforms.json"
@@ -120,10 +120,10 @@ def load_dataset(root: str | Path, *, to_capture: bool = False) -> Dataset:
 
 
 def load_cameras(path: str | Path, like: Camera | None = None) -> list[tuple[str, Camera]]:
-    """(file_path, camera) of every frame of a transforms.json, in its order.
+    """Read (file_path, camera) of every frame of a transforms.json, in its order.
 
-    path: the file, or its folder. like: camera of the intrinsics where the file has none. The image
-    files need not exist. Otherwise raises InputError as `load_dataset`.
+    path: the file, or its folder. like: a camera whose intrinsics are used if the file has none.
+    Raises InputError as `load_dataset`, except that image files need not exist.
     """
     path = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
     data, records = read_records(path)

@@ -25,8 +25,9 @@ class Frame:
     """One keyframe: its camera, its time in seconds, and the files of its images.
 
     on_demand: the files exist only after a run has taken the frame. Reading a file that does not
-    exist yet raises InputError. Of a live capture (`mgs.run.live`), capture_path: its record, None
-    before; asked: the camera asked for, where the picture is from another; given_up: no picture.
+    exist yet raises InputError. In a live capture (`mgs.run.live`), capture_path is the record of
+    the picture, None before it is taken; asked is the camera asked for, if the picture was taken
+    from another; given_up says that no picture could be taken.
     """
 
     name: str

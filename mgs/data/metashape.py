@@ -58,7 +58,10 @@ def _shot(path: Path, camera: Any, lens: Any, factor: float, images: Path) -> di
     p2 are OpenCV's p2 and p1 (its manual, appendix D)."""
     label = camera.get("label") or ""
     if lens.get("type", "frame") != "frame":
-        raise InputError(f"{path}: camera {label} is {lens.get('type')}; only frame is supported")
+        raise InputError(
+            f"{path}: camera {label} is of type {lens.get('type')}, and only frame is supported; "
+            "export undistorted photographs"
+        )
     found = lens.find("calibration[@class='adjusted']")
     found = lens.find("calibration") if found is None else found
     size = lens.find("resolution") if found is None else found.find("resolution")

@@ -33,7 +33,9 @@ def rows(path: Path, least: int) -> list[list[str]]:
         lines = path.read_text(errors="replace").splitlines()
     found = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if short := [words for words in found if len(words) < least]:
-        raise InputError(f"{path}: {' '.join(short[0])[:60]!r} has fewer than {least} columns")
+        raise InputError(
+            f"{path}: {' '.join(short[0])[:60]!r} has fewer than {least} columns; correct the line"
+        )
     return found
 
 
@@ -77,7 +79,7 @@ def calibration(folder: Path, image: Path) -> tuple[np.ndarray, np.ndarray]:
     values = numbers(path, [word for words in rows(path, 1) for word in words])
     if len(values) not in (4, 8, 9):
         raise InputError(
-            f"{path}: has {len(values)} numbers; expected fx fy cx cy (k1 k2 p1 p2 k3)"
+            f"{path}: has {len(values)} numbers; give fx fy cx cy, or fx fy cx cy k1 k2 p1 p2 k3"
         )
     fx, fy, cx, cy, *distortion = values
     K = np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]])
@@ -127,11 +129,15 @@ def read_open3d(folder: Path, spacing: Spacing) -> list[dict[str, Any]]:
     words = [word for line in rows(path, 3) for word in line]
     values = numbers(path, words)
     if len(values) % 19:
-        raise InputError(f"{path}: expected three numbers and a 4x4 matrix for each image")
+        raise InputError(
+            f"{path}: needs three numbers and a 4x4 matrix for each image; record it again"
+        )
     matrices = np.array(values).reshape(-1, 19)[:, 3:].reshape(-1, 4, 4)
     images = sorted(path for path in (folder / "color").iterdir() if path.is_file())
     if len(images) != len(matrices):
-        raise InputError(f"{path}: has {len(matrices)} poses for {len(images)} images in color")
+        raise InputError(
+            f"{path}: has {len(matrices)} poses for {len(images)} images in color; make them equal"
+        )
     times = OPEN3D_INTERVAL * np.arange(len(images))
     K, distortion = calibration(folder, images[0])
     shots: list[dict[str, Any]] = []
@@ -183,7 +189,10 @@ def _opencv_yaml(path: Path) -> tuple[np.ndarray, np.ndarray]:
         found.append(np.array(numbers(path, data[1].replace(",", " ").split())))
     K, D = found
     if K.size != 9 or D.size not in (0, 4, 5, 8):
-        raise InputError(f"{path}: has {K.size} and {D.size} numbers, not 9 and 4, 5 or 8")
+        raise InputError(
+            f"{path}: has {K.size} numbers in camera_matrix and {D.size} in "
+            "distortion_coefficients, not 9 and 4, 5 or 8; export it again"
+        )
     K = K.reshape(3, 3)
     K[:2, 2] += 0.5
     return K, np.concatenate([D, np.zeros(max(0, 5 - len(D)))])

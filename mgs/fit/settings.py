@@ -55,17 +55,17 @@ class TrainSettings(BaseModel):
     means: Literal["frozen", "normal", "free"] = "frozen"
     """How means move: frozen, as in the paper; normal, along the prior's normals; or free."""
     density: str = "fixed"
-    """Density control of free means: fixed, or relocate (the least seen Gaussians, by error)."""
+    """Density control of free means: fixed, or relocate (move little-seen ones to large errors)."""
     optimiser: str = "natural"
-    """Optimiser of the fit: natural (gradient over Fisher information) or adam."""
+    """Optimiser of the fit: natural (gradient divided by Fisher information) or adam."""
     passes: Annotated[int, Field(ge=1)] = PASSES
-    """Most passes over the images in any fit."""
+    """Most passes over the images in a fit."""
     tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.01
     """The fit has settled when two passes in a row lower the loss by less than this share."""
     rates: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = RATES
-    """Learning rate of a kind of parameter, 0: not learned; of `mean` in metres, where it moves."""
+    """Learning rate by kind of parameter, 0: not learned; `mean`, in metres, only if means move."""
     alpha_weight: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 0.0
-    """Weight of alpha as a fourth channel of a pixel, (sigma_rgb / sigma_alpha)^2; 0: none."""
+    """Weight of alpha as a fourth channel in the loss, (sigma_rgb / sigma_alpha)^2; 0: not used."""
     decay: Positive = 0.1
     """Factor by which the rates fall over `passes`."""
     seed: Annotated[int, Field(ge=0)] = 0

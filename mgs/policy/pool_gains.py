@@ -20,6 +20,7 @@ each entry: one kernel reads S and M once, and writes S once.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import cache
 from typing import Any
 
@@ -150,6 +151,12 @@ class PoolGains:
             self.M = [mi.Float64(padded(M[:, a, b], np.float64)) for a, b in upper]
             self.q = _dot(_times([_at(entry, self.of) for entry in self.M], moved), moved)
         dr.eval(self.S, self.M, self.g, self.q)
+
+    def copy(self) -> PoolGains:
+        """The same gains, to be changed apart from these."""
+        other = copy(self)
+        other.taken = list(self.taken)
+        return other
 
     @one_at_a_time
     def of_poses(self, poses: Sequence[int]) -> NDArray[np.float64]:

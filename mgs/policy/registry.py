@@ -36,6 +36,10 @@ PLANNED = {"directional-d": DIRECTIONAL_D}
 """Policies that plan the whole budget (`Problem.planned`) -> degree and tau of the gains that the
 plan maximises."""
 
+FLOWN = {"directional-d": (1, 0.1, True)}
+"""Policies that plan a whole flight (`mgs.policy.tour.planned_tour`) -> degree, tau and over_dome
+of the gains that its plan maximises. Chosen on two rocks that judge nothing."""
+
 
 def directional_d(context: PolicyContext) -> Array:
     """Directional D-optimality, nats (`mgs.policy.directional`)."""

@@ -1,17 +1,40 @@
-"""Tours of a flight: lengths of legs, cheapest insertion, 2-opt. Pure NumPy.
+"""Tours of a flight: lengths of legs, 2-opt, and plans within a limit. Pure NumPy.
 
 A tour is a list of poses, the indices of rows of a matrix of legs. Its two ends stay where they
 are: where the camera is, and its home. Positions are in metres, with +Z up.
+
+A plan grows by cost-benefit greedy insertion (`grown`). Where the gain of a set of views is known
+without a fit, it is then improved by ruin and recreate (`planned_tour`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mgs.policy.criteria import Array
+
+if TYPE_CHECKING:
+    from mgs.policy.pool_gains import PoolGains
+
+Share = Callable[[Array, int], NDArray[np.float64]]
+"""(metres of a tour, number of its stops) -> share of the limits that it takes; at most 1 fits."""
+
+Pick = Callable[[list[int], NDArray[np.float64]], tuple[int, float]]
+"""(stops, their costs) -> the next stop and its gain. It counts as taken from then on."""
+
+ROUNDING = 1e-9
+"""Share of the limits: a stop in reach fits, though its metres are summed in another order."""
+
+BETTER = 1 + 1e-6
+"""Least ratio of gains for which stops are replaced: above rounding errors. A chosen constant."""
+
+WIDTHS = (1, 2, 3)
+"""Numbers of neighbouring stops that are replaced together. A chosen constant."""
 
 ARC_STEP = np.radians(15)
 """Largest angle between two corners of a leg around a cylinder. A chosen constant."""
@@ -114,3 +137,71 @@ def flying_order(matrix: Array, start: int, stops: Sequence[int], home: int) -> 
         left.remove(nearest)
         tour.append(nearest)
     return two_opt(matrix, [*tour, home])[1:-1]
+
+
+def grown(
+    legs: Array, tour: Sequence[int], free: Sequence[int], pick: Pick, share: Share, per_stop: float
+) -> tuple[list[int], float]:
+    """Add stops to a tour until none fits: (the tour, the sum of their gains).
+
+    The stop that is picked joins at its cheapest place, then 2-opt shortens the tour. The cost of a
+    stop is the share of the limits that it adds, and `per_stop`.
+    """
+    way, left, total = list(tour), list(free), 0.0
+    while left:
+        metres, stops = tour_length(legs, way), len(way) - 2
+        added, places = insertions(legs, way, left)
+        shares = share(metres + added, stops + 1)
+        fits = np.flatnonzero(shares <= 1 + ROUNDING)
+        if not len(fits):
+            break
+        cost = shares[fits] - share(np.array(metres), stops) + per_stop
+        stop, gain = pick([left[k] for k in fits], cost)
+        way.insert(int(places[left.index(stop)]), stop)
+        way, total = two_opt(legs, way), total + gain
+        left.remove(stop)
+    return way, total
+
+
+def planned_tour(
+    legs: Array,
+    ends: Sequence[int],
+    free: Sequence[int],
+    gains: PoolGains,
+    share: Share,
+    per_stop: float,
+) -> list[int]:
+    """Tour between `ends` of large total gain: `grown` by gain per cost, then improved.
+
+    Each one to three neighbouring stops are dropped and the tour grown again without the first of
+    them, as long as that raises the total gain. gains: after the views taken; changed.
+    """
+
+    def of(held: PoolGains) -> Pick:
+        def pick(stops: list[int], cost: NDArray[np.float64]) -> tuple[int, float]:
+            found = held.of_poses(stops)
+            best = int((found / cost).argmax())
+            held.take([stops[best]])
+            return stops[best], float(found[best])
+
+        return pick
+
+    tour, _ = grown(legs, ends, free, of(gains), share, per_stop)
+    improved = True
+    while improved:
+        improved = False
+        for width, first in product(WIDTHS, range(1, len(free) + 1)):
+            dropped = tour[first:-1][:width]
+            if len(dropped) < width:
+                continue
+            held, lost = gains.copy(), 0.0
+            for stop in dropped:
+                held.drop(stop)
+                lost += float(held.of_poses([stop])[0])
+            rest = two_opt(legs, [stop for stop in tour[:-1] if stop not in dropped] + tour[-1:])
+            others = [stop for stop in free if stop not in rest and stop != dropped[0]]
+            new, won = grown(legs, rest, others, of(held), share, per_stop)
+            new, more = grown(legs, new, dropped[:1], of(held), share, per_stop)
+            if won + more > BETTER * lost:
+                tour, gains, improved = new, held, True
+    return tour

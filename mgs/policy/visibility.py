@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +13,13 @@ from mgs.camera import Camera
 from mgs.memory import IMAGE_BYTES, kept_within
 from mgs.policy.context import Gains
 from mgs.policy.criteria import Array
-from mgs.policy.directional import Views, dome_cameras, squared_weights
+from mgs.policy.directional import Views, dome_cameras, of_points, squared_weights
+
+if TYPE_CHECKING:
+    from mgs.policy.pool_gains import PoolGains
+
+FEW = 500
+"""About the number of Gaussians by which a flight is planned. A chosen constant."""
 
 
 class Visibility:
@@ -73,6 +80,18 @@ class Visibility:
         gains = PoolGains(self.points, self.pool(), self.lam, degree, tau)
         gains.take(taken)
         return planned_views(gains, candidates, count)
+
+    def few_gains(self, degree: int, tau: float, over_dome: bool) -> PoolGains | None:
+        """Gains of all cameras for about FEW of the Gaussians, before any view is taken; None where
+        no camera sees any, or they do not fit into the memory."""
+        from mgs.policy.pool_gains import PoolGains, fits
+
+        some = slice(None, None, max(len(self.points) // FEW, 1))
+        pool = of_points(self.pool(), some)
+        if not fits(self.points[some], pool, degree):
+            return None
+        dome = of_points(self.dome(), some) if over_dome else None
+        return PoolGains(self.points[some], pool, self.lam, degree, tau, dome)
 
     def _seen(self, frame: int) -> Array:
         """Squared blending weights of the Gaussians in one view [N]."""

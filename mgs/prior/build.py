@@ -45,14 +45,17 @@ from mgs.seeds import derive_seed
 
 @dataclass(frozen=True, repr=False)
 class Prior:
-    """A mesh of the rock and N samples of its seen faces.
+    """A mesh of the rock, and N samples of those of its faces that some frame sees.
 
-    points: [N,3] world, metres. normals: [N,3] unit. spacing: sqrt(sampled area / N), metres, about
-    the distance between neighbours. depth_tolerance: largest difference between a depth image and
-    the prior that counts as the same surface, metres: three rms distances of the cloud from the
-    mesh, a voxel, or two standard deviations of depth noise, whichever is largest; the spacing for
-    a given mesh. numbers: contents of prior.json. backed: number of first points, evenly spread by
-    themselves, that have a Gaussian behind them too (`mgs.prior.initial`). up: unit vector.
+    - points: [N,3] samples in the world, metres. normals: [N,3], of unit length.
+    - spacing: sqrt(sampled area / N), metres, about the distance between neighbours.
+    - depth_tolerance: largest difference between a depth image and the prior that counts as the
+      same surface, metres. It is three rms distances of the cloud from the mesh, a voxel, or two
+      standard deviations of depth noise, whichever is largest; for a given mesh, the spacing.
+    - numbers: contents of prior.json.
+    - backed: the first `backed` points, evenly spread, have a second Gaussian behind the surface
+      (`mgs.prior.initial`).
+    - up: unit vector that points upwards in the world.
     """
 
     mesh: Mesh
@@ -84,9 +87,15 @@ def build_prior(
     up: Up | Literal["auto"] | None = None,
     **given: Any,
 ) -> Prior:
-    """Build the prior of a dataset, as `build_prior(dataset, gaussians=2000)`.
+    """Build the prior of a dataset, as in `build_prior("demo/dataset", gaussians=2000)`.
 
-    settings, or given: fields of `PriorSettings`. Other arguments and errors as `prior_and_cloud`.
+    - settings, or keyword arguments: fields of `PriorSettings`.
+    - on_stage: called with the name of each stage.
+    - source: "depth", "points", "hull" (of the masks) or "random"; by default the first that the
+      dataset has. points: PLY file in place of the dataset's points.
+    - up: unit vector; "auto": normal of the ground plane, if there is one; None: the dataset's.
+
+    Raises InputError if the dataset lacks the source, or no surface is found that a frame sees.
     """
     dataset = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     asked = replace(settings or PriorSettings(), **given)
@@ -104,12 +113,9 @@ def prior_and_cloud(
 ) -> tuple[Prior, SegmentedCloud | None]:
     """Build the prior of a dataset. Returns it, and the cloud of its mesh (None for a hull).
 
-    on_stage: called with the name of each stage. source: "depth", "points", "hull" or "random"; by
-    default the first that the dataset has. points: PLY file in place of the dataset's points. up:
-    unit vector; "auto" is the normal of the ground plane, if there is one; None the dataset's.
-    Raises InputError as `source_of`, `check_masks`, `surface_of`, `scattered`, `segment_dataset`,
-    `poisson_mesh` and `sample_surface`, and if no frame sees the mesh; NoSurface, which holds the
-    cloud, if points give no surface.
+    Arguments as `build_prior`. Raises InputError as `source_of`, `check_masks`, `surface_of`,
+    `scattered`, `segment_dataset`, `poisson_mesh` and `sample_surface`, and if no frame sees the
+    mesh; NoSurface, which holds the cloud, if points give no surface.
     """
     chosen = source_of(dataset, source, points)
     if chosen == "random":
@@ -232,17 +238,17 @@ def prior_from_mesh(
     unit: str = "m",
     cameras: Sequence[Camera] = (),
 ) -> Prior:
-    """Prior of a given mesh in world coordinates, sampled all over.
+    """Sample a given mesh file in world coordinates, all over.
 
     up, unit, cameras: of the dataset; the cameras decide the number of Gaussians if the settings do
-    not. Raises InputError as `read_mesh`, `resolution` and `sample_surface`, and for settings that
-    only a cloud has: noise, holes, poisson_depth and density.
+    not. Raises InputError if the mesh cannot be read or sampled, and for settings that only a cloud
+    has: noise, holes, poisson_depth and density.
     """
     settings.refuse_shaping("--mesh gives one")
     mesh = read_mesh(path)
     if settings.density is not None:
         raise InputError(
-            f"{path}: a density counts by the voxels of a cloud, which a mesh has not; "
+            f"{path}: a density is relative to the voxels of a cloud, and a mesh has none; "
             "give a number or a spacing"
         )
     points, normals, spacing, sampled = _samples(mesh, settings, cameras, 0.0)

@@ -73,9 +73,9 @@ def visual_hull(
     if field.max() <= 0:
         against = _against(frames, views, points)
         raise InputError(
-            f"prior: the masks share no point of space (at best {len(against)} of {len(frames)} "
-            f"frames, such as {against[0]}, are against it); poses and masks do not fit, "
-            "or the object moved; correct or remove frames"
+            f"prior: the masks share no point in space (the best lies outside {len(against)} of "
+            f"{len(frames)}, such as {against[0]}'s); poses and masks do not fit, or the object "
+            "moved; correct or remove frames"
         )
     for _ in range(REFINEMENTS):
         field, cells = _refined(field), 2 * cells

@@ -77,8 +77,9 @@ def initial_gaussians(
     """Place one flat Gaussian per sample of a prior, in its mean colour, then one behind each
     backed sample.
 
-    inset: depth below the sample, over `pixel_on`. gains: [V,3] exposures that divide the colours
-    (`mgs.prior.exposure`). colours: `colours_of` the prior, if kept between calls.
+    inset: depth of the Gaussians below the samples, in pixels on the surface (`pixel_on`). gains:
+    [V,3] exposures that divide the colours (`mgs.prior.exposure`). colours: `colours_of(prior)`, to
+    reuse it between calls.
 
     Returns (N + backed Gaussians of degree 0, seen [N] bool). A frame sees a sample that lies in
     its rock mask, faces the camera and agrees with the depth image (or else the mesh's depth) up to

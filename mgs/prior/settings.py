@@ -14,15 +14,19 @@ from mgs.errors import InputError
 class PriorSettings:
     """Settings of a prior.
 
-    gaussians: number of Gaussians, on the surface and behind it; "auto": as many as the closest
-    pixel of a frame can tell apart (`mgs.prior.resolution`), also the default without spacing and
-    density. spacing: distance between samples, metres, instead of a number. density: samples per
-    square voxel of the cloud, about a pixel on the rock, instead of both. backing: Gaussians behind
-    the surface per sample (`mgs.prior.initial`); 0 as in the paper. poisson_depth: octree depth of
-    the Poisson reconstruction; None: finest cells of at most 1.5 voxels. noise (metres), holes
-    (share of points): degrade the rock's points (`mgs.prior.segmentation.degrade`). seed: root
-    seed. Raises InputError if the number is below 2, the spacing or density is not positive, number
-    and spacing are both given, or backing, noise or holes are out of range.
+    - gaussians: number of Gaussians, on the surface and behind it. "auto", the default if neither
+      spacing nor density is given: as many as the closest camera resolves (`mgs.prior.resolution`).
+    - spacing: distance between samples, metres, in place of `gaussians`.
+    - density: samples per square voxel of the cloud, in place of both; a voxel is about a pixel on
+      the rock.
+    - backing: Gaussians behind the surface per sample (`mgs.prior.initial`), 0 to 1; the paper: 0.
+    - poisson_depth: octree depth of the Poisson reconstruction, 3 to 12; by default its finest
+      cells are at most 1.5 voxels.
+    - noise: standard deviation, metres, and holes: share of points, 0 to 0.9, to degrade the rock's
+      points (`mgs.prior.segmentation.degrade`).
+    - seed: of all random draws.
+
+    Raises InputError if a number is out of range, or `gaussians` and `spacing` are both given.
     """
 
     gaussians: int | Literal["auto"] | None = None

@@ -79,8 +79,7 @@ def intersection(a: Mesh, b: Mesh) -> Mesh:
     pieces = (_to_solid(a.vertices, a.faces) ^ _to_solid(b.vertices, b.faces)).decompose()
     if not pieces:
         raise InputError(
-            "prior: the points and the hull of the masks have nothing in common; "
-            "poses, points or masks are wrong"
+            "prior: no point lies in the hull of the masks; correct poses, points or masks"
         )
     return _from_solid(max(pieces, key=lambda part: part.volume()))
 

@@ -57,8 +57,8 @@ def error_to_truth(
         seen |= visible(surface, normals, frame.camera, frame.depth(), tolerance, two_sided=True)
     if not seen.any():
         raise InputError(
-            f"{truth}: no frame sees the true rock; "
-            "it is another dataset's, or in another coordinate system"
+            f"{truth}: no frame sees the true rock; it is of another dataset or in other "
+            "coordinates, so remove or replace it"
         )
     there = distances_to_mesh(points, true.vertices, true.faces)
     back = distances_to_mesh(surface[seen], mesh.vertices, mesh.faces)

@@ -215,9 +215,10 @@ def evaluate_run(
     """Evaluate a run of `mgs nbv` on its dataset and its test views; write RUN/metrics.json and,
     with `pictures`, RUN/renders. Returns the contents of metrics.json.
 
-    run: folder or opened run. convergence: also predict how far the last fit is from its minimum
-    (entry "fit": `mgs.report.convergence.remaining_decrease`). say: called with lines for the user:
-    files written and kept.
+    - run: folder or opened run.
+    - convergence: also estimate how far the loss of the last fit is above its minimum (entry "fit":
+      `mgs.report.convergence.remaining_decrease`).
+    - say: called with lines for the user: files written and kept.
 
     Metrics and pictures of the same model, dataset and version of mgs are kept, not made again. In
     an on-demand dataset only frames that the run has taken have an image, so none is held out.
@@ -338,13 +339,15 @@ def evaluate(
     progress: Progress = no_progress,
     **options: Any,
 ) -> dict[str, Any]:
-    """Measure a run, or a model on the views of a dataset; return the contents of metrics.json.
+    """Measure PSNR and SSIM of a run or a model; return the contents of metrics.json.
 
-    subject: a run or its folder, measured by `evaluate_run` with its options; or Gaussians, or a
-    PLY. dataset: of a model; default of a PLY in a run's folder: that of the run. trained: names of
-    the frames that the model was trained on; there those of the run. The numbers of a PLY are
-    written beside it, as NAME.metrics.json. Raises InputError as `evaluate_run`, `read_ply` and
-    `load_dataset`, and where a model comes without a dataset.
+    - subject: a run or its folder, measured by `evaluate_run` with its options; or Gaussians, or a
+      PLY file, whose metrics are written beside it as NAME.metrics.json.
+    - dataset: of Gaussians or a PLY. Default for a PLY in a run folder: the run's.
+    - trained: names of the frames that the model was trained on; in a run folder, the run's.
+
+    Raises InputError as `evaluate_run`, `read_ply` and `load_dataset`, and if a model comes without
+    a dataset.
     """
     if isinstance(subject, Run) or (not isinstance(subject, Gaussians) and Path(subject).is_dir()):
         return evaluate_run(subject, progress=progress, **options)
@@ -359,7 +362,7 @@ def evaluate(
             run = open_run(path.parent)
             dataset, trained = run.dataset, [frame.name for frame in run.taken]
     if dataset is None:
-        raise InputError(f"{path or 'the model'}: is of no run here; give a dataset with --dataset")
+        raise InputError(f"{path or 'the model'}: is in no run folder; give its --dataset")
     views = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     names, tests = list(trained), views.test_views()
     metrics = evaluate_model(

@@ -323,7 +323,7 @@ def uncertainty_figure(
     coloured = list(zip(shown, PREDICTION_COLOURS, strict=False))
     with matplotlib.rc_context(STYLE):
         figure = new_figure(8.4, 6.7)
-        figure.suptitle("Predicted errors beside the true ones")
+        figure.suptitle("Predicted errors of unseen views beside the true ones")
         above, below = figure.subfigures(2, 1, height_ratios=(1.15, 1))
         _draw_maps(above, maps)
         area, held, pit = below.subplots(1, 3)
@@ -369,7 +369,7 @@ def _draw_ause(axis: Any, rows: Sequence[tuple[dict[str, Any], str]]) -> None:
     constant = rows[0][0]["ause"]["constant"]
     axis.axhline(constant, color="black", linewidth=1, linestyle="--", label="a constant")
     axis.set_xticks([])
-    axis.set_ylabel("AUSE of |error|")
+    axis.set_ylabel("AUSE (lower is better)")
     axis.set_ylim(0, 1.3 * constant)
     axis.legend(loc="upper right", fontsize=8)
 

@@ -276,7 +276,7 @@ def _views(run: Run) -> tuple[list[Frame], dict[str, tuple[Frame, ...]]]:
     """The training frames, and the sets of other views, by name; none of these is empty."""
     where, settings, frames = run.folder, run.settings, run.taken
     if settings.train.means != "frozen":
-        raise InputError(f"{where}: learns means; --calibrate needs frozen means")
+        raise InputError(f"{where}: learns means; --calibrate needs a run with --means frozen")
     if settings.exposure:
         raise InputError(f"{where}: estimates exposure; --calibrate needs a run without --exposure")
     if len(frames) < 2 * FOLDS:

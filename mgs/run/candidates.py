@@ -144,7 +144,9 @@ def place_poses(
     if shape == "grid":
         offsets = _lattice(count, radius, elevations)
         if not len(offsets):
-            raise InputError(f"--grid {count}: has no pose in the elevations; ask for more")
+            raise InputError(
+                f"--grid {count}: has no pose within --elevations; raise it, or widen them"
+            )
     else:
         band = elevations if shape == "dome" else ((low + high) / 2,) * 2
         kind = "hemisphere" if shape == "dome" else "rings"

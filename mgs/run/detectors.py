@@ -200,7 +200,7 @@ DETECTORS: dict[str, Detector] = {
         0.05,  # chosen: a warm fit of a good run lowers its loss
         lambda v, limit: (
             f"every pass of the fit had a loss at least {percent(v)} above its start; "
-            "lower the rates"
+            "lower the learning rates (--rate)"
         ),
     ),
     "prior": Detector(
@@ -214,7 +214,8 @@ DETECTORS: dict[str, Detector] = {
         0.15,
         lambda v, limit: (
             f"the fit leaves {percent(v)} of the images' variance inside the masks unexplained "
-            f"in the median view (limit {percent(limit)})"
+            f"in the median view (limit {percent(limit)}); check poses and masks, or give more "
+            "Gaussians"
         ),
     ),
     "exposure": Detector(
@@ -243,21 +244,22 @@ DETECTORS: dict[str, Detector] = {
         3.0,  # means that were free on 2 and 4 views moved by 1.0 and 1.3, and did no harm
         lambda v, limit: (
             f"the means have left the prior's surface: they moved by {v:.1f} standard deviations "
-            f"of a Gaussian (rms; limit {limit:.1f})"
+            f"of a Gaussian (rms; limit {limit:.1f}); lower --rate mean=METRES"
         ),
     ),
     "coverage": Detector(
         0.2,
         lambda v, limit: (
             f"only {percent(1 - v)} of the prior's Gaussians are observed "
-            f"(limit {percent(1 - limit)}): the others are known from the prior alone"
+            f"(limit {percent(1 - limit)}), so the others are known from the prior alone; "
+            "take views of the other sides"
         ),
     ),
     "saturated": Detector(
         0.9,  # chosen: a tenth
         lambda v, limit: (
             f"gains are saturated: the view just taken gained {percent(1 - v)} of the run's "
-            f"largest information gain (limit {percent(1 - limit)})"
+            f"largest information gain (limit {percent(1 - limit)}); further views add little"
         ),
     ),
 }

@@ -7,7 +7,7 @@ A flight starts at the first view taken, its home, and ends there. `NbvSettings.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,12 +36,14 @@ class Flight:
     """The legs of a flight, metres [V,V] (`mgs.policy.tour.legs`), and its limits.
 
     home: pose where it ends. skipped: number of views taken before it; it starts at the last one.
+    tours: those planned, by the views taken and the candidates.
     """
 
     settings: NbvSettings
     legs: NDArray[np.float64]
     home: int
     skipped: int = 0
+    tours: dict[tuple[tuple[int, ...], tuple[int, ...]], list[int]] = field(default_factory=dict)
 
     def share(self, metres: float | Array, pictures: int) -> NDArray[np.float64]:
         """Share of the limits that a flight of this length and number of pictures takes."""
@@ -56,6 +58,17 @@ class Flight:
     def metres(self, taken: Sequence[int]) -> float:
         """Metres through all views taken, and home."""
         return self.flown(taken) + float(self.legs[taken[-1], self.home])
+
+    def share_from(self, taken: Sequence[int], most: int) -> tour.Share:
+        """Share of the limits that the flight takes with a tour after the views taken; infinite
+        with more than `most` stops."""
+        flown, pictures = self.flown(taken), len(taken) - self.skipped
+
+        def share(metres: Array, stops: int) -> NDArray[np.float64]:
+            whole = self.share(flown + metres, pictures + stops)
+            return whole if stops <= most else np.full_like(whole, np.inf)
+
+        return share
 
     def in_reach(self, taken: Sequence[int], stops: Sequence[int]) -> list[int]:
         """The stops that leave enough of the limits to come home."""

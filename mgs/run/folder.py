@@ -274,7 +274,7 @@ def read_checkpoint(out: Path) -> State | None:
     ) as error:
         reason = " ".join(str(error).split())[:120]
         raise InputError(
-            f"{path}: not a readable checkpoint ({reason}); delete it to begin with the seeds"
+            f"{path}: not a readable checkpoint ({reason}); delete it to start again from the seeds"
         ) from None
     frames = read_config(out).get("frames")
     check_frames(path, state.taken, len(frames) if isinstance(frames, list) else 0)

@@ -34,9 +34,9 @@ def select_views(
 ) -> Iterator[Learned | Choice]:
     """Run the loop from the seeds, or from a state; yield the state after every fit.
 
-    Ends when the budget is spent, or by `stop_uncertainty` or `stop_gain`. After `stop_gain` the
-    last item is the choice that was refused. chooser: in place of `choose`. Raises InputError as
-    `choose` and `learn`.
+    chooser: function to use in place of `choose`. The loop ends when the budget is spent, or by
+    `stop_uncertainty` or `stop_gain`. After `stop_gain` the last item is the choice that was
+    refused. Raises InputError as `choose` and `learn`.
     """
     if state is None:
         problem.make_seeds()
@@ -76,10 +76,11 @@ def learn(
     surface: np.ndarray | None = None,
     choices: Sequence[Choice] = (),
 ) -> Learned:
-    """Capture the views that are new in `taken`, fit to all of them, sum their information.
+    """Capture the views that are new in `taken`, fit to all of `taken`, and sum their information.
 
-    surface: `Fitted.surface` of `taken` at the poses asked for, where it is known. Raises
-    FitDivergedError, and InputError where a frame cannot be read.
+    before: the model of the last step, where the fit starts. surface: `Fitted.surface` of `taken`,
+    if it is known already. choices: recorded in the result. Raises FitDivergedError, and InputError
+    if a frame cannot be read.
     """
     new = taken[len(before.taken) :] if before else taken
     gains = capture(problem, new, taken)
@@ -112,7 +113,10 @@ def fit_views(
     before: Fitted | None = None,
     gains: np.ndarray | None = None,
 ) -> Fit:
-    """Fit to the views taken, from the model before (`warm_start`), else from the prior."""
+    """Fit to the views taken, starting at the model of the last step (`before`), else at the prior.
+
+    gains: [V,3] exposures of the views taken, None if they are not estimated.
+    """
     problem.progress("fitting", 0, 1)
     start = problem.start_of(taken)
     step, model = 0, start
@@ -126,7 +130,7 @@ def fit_views(
 
 
 def information(problem: Problem, model: Gaussians, taken: Sequence[int]) -> np.ndarray:
-    """H [N,P]: Fisher information of the views taken at a model, summed over them."""
+    """Sum the Fisher information of the views taken, at a model: H [N,P], diagonal of J^T J."""
     H = np.zeros((len(model), len(problem.lam)))
     for done, i in enumerate(taken):
         problem.progress("information of the training set", done, len(taken))
@@ -165,16 +169,16 @@ def choose_batch(
 def choose(
     problem: Problem, state: Fitted, fisher: Callable[[int], np.ndarray] | None = None
 ) -> tuple[int, float]:
-    """Choose the next view: (frame, score) of the view in reach of largest score / travel cost.
+    """Choose the next view; return (frame, score) of the largest score / travel cost in reach.
 
-    With a policy that plans, it is a view of the plan (`Problem.planned`). A tie goes to the pose
-    farthest from those taken. Where the flight has a limit, it is the first stop of `plan_flight`.
-    fisher(frame) -> [N,P]: information of a view at the model, computed by default. Raises
-    InputError if the policy returns no valid score.
+    Of equal views, the one farthest from those taken is chosen. A policy that plans chooses among
+    the views of its plan (`Problem.planned`). If the flight has a limit, the result is the first
+    stop of `plan_flight`. fisher: function frame -> information [N,P] of its view at the model,
+    computed by default. Raises InputError if the policy returns no valid score.
     """
     fisher = fisher or problem.view_information(state.gaussians)
     if problem.settings.flies:
-        return plan_flight(problem, state, fisher)[0]
+        return next(plan_flight(problem, state, fisher))
     left = problem.planned(state.taken, problem.reachable(state.taken))
     context = problem.context(state, left, fisher)
     return rated(problem, context, problem.travel_cost(context))[0]

@@ -62,8 +62,11 @@ def run_nbv(
     progress: Progress = no_progress,
     **settings: Any,
 ) -> Run:
-    """Choose views one by one, as the paper does: `start_run`, then `resume_nbv`, with their
-    arguments and errors."""
+    """Choose views one by one, as the paper does; return the finished run.
+
+    Does the same as `mgs nbv`, as in `run_nbv("demo/dataset", "run", policy="d-optimal",
+    budget=8)`: `start_run`, then `resume_nbv`, with their arguments and errors.
+    """
     run = start_run(dataset, out, progress=progress, **settings)
     return resume_nbv(run, on_step, progress, run.policy, settings.get("live"))
 
@@ -82,22 +85,23 @@ def start_run(
     progress: Progress = no_progress,
     **settings: Any,
 ) -> Run:
-    """Check everything, find or build the prior, and write config.json of a new run folder `out`.
+    """Check all inputs, find or build the prior, and write config.json of a new run folder `out`.
 
-    capture: a scene (`mgs.synth.scene_file.load_scene_file`) in place of a dataset: the run renders
-    an image only when its view is chosen, and has its own OUT/dataset with CAPTURE_TEST_VIEWS.
-    live: how pictures of the dataset's poses without an image are captured: `Live`, or a function
-    (pose file, picture file) (docs/howto/on-site.md). They are kept in OUT/dataset.
-    prior: a folder, or a Prior, which is copied into the run; default DATASET/prior where there is
-    one, else a prior of `gaussians` is built in the run (default: as many as the images resolve).
-    preset: a row of `PRESETS`, defaults of what is not given. settings: fields of `NbvSettings`;
-    `policy` may be a function with arguments as in docs/howto/policy.md, whose source is kept in
-    the run. By default the budget is 50 views or all candidates, and alpha_weight is ALPHA_WEIGHT,
-    or 0 where frames have neither mask nor alpha. force: replace a run that is there.
+    - capture: a scene, by name or TOML file, in place of a dataset. The run renders an image only
+      when its view is chosen, and has its own OUT/dataset with CAPTURE_TEST_VIEWS.
+    - live: takes the pictures of poses without an image: a `Live`, or a function(pose file, picture
+      file) (docs/howto/on-site.md). They are kept in OUT/dataset.
+    - prior: a folder, or a Prior, which is copied into the run. Default: DATASET/prior if it
+      exists, else a prior of `gaussians` built in the run (default: as many as cameras resolve).
+    - preset: a row of `PRESETS`, whose values are defaults. loose: as `NbvSettings.with_spacing`.
+    - force: replace an existing run.
+    - settings: fields of `NbvSettings`. `policy` may also be a function (docs/howto/policy.md),
+      whose source is kept in the run. The default of `budget` is 50 views or all candidates, that
+      of `alpha_weight` is ALPHA_WEIGHT, or 0 if frames have neither mask nor alpha.
 
-    Leaves no folder behind where it fails. Raises InputError where the folder is not empty, a
-    setting is invalid, the dataset is too small, an input is missing or damaged, or the cameras are
-    too near to the prior to draw it.
+    Leaves no folder behind if it fails. Raises InputError if the folder is not empty, a setting is
+    invalid, the dataset is too small, an input is missing or damaged, or the cameras are too near
+    to the prior to draw it.
     """
     out = Path(out)
     if (dataset is None) == (capture is None):
@@ -251,11 +255,11 @@ def resume_nbv(
 ) -> Run:
     """Continue a run from its last finished step to its end; return it, with its state.
 
-    policy: required if it is the user's own: FILE.py:FUNCTION, or the Python function. That is
-    code, so the user names it, not the folder; a Run of this process knows it. live: as
-    `start_run`, given again where pictures are still to be captured. on_step(state): called after
-    every step, or batch of steps, that is finished and on disk. progress(stage, done, total):
-    called during a step.
+    - on_step: called as on_step(state) after every finished step, or batch of steps, on disk.
+    - progress: called as progress(stage, done, total) during a step.
+    - policy: FILE.py:FUNCTION, or the Python function, if the policy is your own. Code is never
+      taken from the folder. A Run that was started in this process knows its policy.
+    - live: as in `start_run`; give it again if pictures are still to be captured.
 
     A finished run is returned as it is. Raises InputError if the folder holds no run, its inputs
     are missing or changed, another process works on it, a fit diverged, or `policy` is not the

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from mgs.errors import InputError
 from mgs.policy import poses, tour
 from mgs.policy.context import PolicyContext
+from mgs.policy.registry import FLOWN
 from mgs.run.problem import Problem
 from mgs.run.state import Fitted
-
-ROUNDING = 1e-9
-"""Share of the limits: a stop in reach fits, though its metres are summed in another order."""
 
 
 def surface_information(
@@ -62,32 +61,62 @@ def rated(
 
 def plan_flight(
     problem: Problem, state: Fitted, fisher: Callable[[int], np.ndarray]
-) -> list[tuple[int, float]]:
-    """Views of the rest of the flight in flying order, each with its score when it was planned.
+) -> Iterator[tuple[int, float]]:
+    """Views of the rest of the flight in flying order, each with its score.
 
-    Cost-benefit greedy: the view of largest score / cost joins the tour at its cheapest place, and
-    2-opt shortens the tour. Then the next one, as if it were taken, until none fits. The cost is
-    the share of the limits that a view adds, and its share of the views that the budget has left.
+    With a policy of FLOWN it is the rest of `planned_flight`, and scores are those after the views
+    before. Otherwise the tour is `grown` by the view of largest score / cost, as if those before it
+    were taken, and scores are those at that time. The cost is the share of the limits that a view
+    adds, and its share of the views that the budget has left.
     """
-    flight, settings = problem.flight, problem.settings
-    pool, way = problem.reachable(state.taken), [state.taken[-1], flight.home]
-    most = settings.budget - (len(state.taken) - settings.seeds)
-    before, pictures = flight.flown(state.taken), len(state.taken) - flight.skipped
+    if plan := planned_flight(problem, state.taken):
+        for k, frame in enumerate(plan):
+            before = replace(state, taken=[*state.taken, *plan[:k]])
+            yield rated(problem, problem.context(before, [frame], fisher))[0]
+        return
     planned, scores = state, dict[int, float]()
-    while pool and len(scores) < most:
-        metres, count = before + tour.tour_length(flight.legs, way), pictures + len(scores)
-        added, places = tour.insertions(flight.legs, way, pool)
-        shares = flight.share(metres + added, count + 1)
-        fits = [k for k in range(len(pool)) if shares[k] <= 1 + ROUNDING]
-        if not fits:
-            break
-        context = problem.context(planned, [pool[k] for k in fits], fisher)
-        cost = shares[fits] - flight.share(metres, count) + 1 / most
-        frame, score = rated(problem, context, cost)[0]
-        scores[frame] = score
-        way.insert(int(places[pool.index(frame)]), frame)
-        way = tour.two_opt(flight.legs, way)
-        pool.remove(frame)
-        if pool and len(scores) < most:
-            planned = with_view(problem, planned, frame, fisher(frame))
-    return [(frame, scores[frame]) for frame in way[1:-1]]
+
+    def pick(frames: list[int], cost: np.ndarray) -> tuple[int, float]:
+        nonlocal planned
+        frame, score = rated(problem, problem.context(planned, frames, fisher), cost)[0]
+        planned, scores[frame] = with_view(problem, planned, frame, fisher(frame)), score
+        return frame, score
+
+    most, ends = views_left(problem, state.taken), [state.taken[-1], problem.flight.home]
+    share = problem.flight.share_from(state.taken, most)
+    free = problem.reachable(state.taken)
+    way, _ = tour.grown(problem.flight.legs, ends, free, pick, share, 1 / most)
+    yield from ((frame, scores[frame]) for frame in way[1:-1])
+
+
+def planned_flight(problem: Problem, taken: Sequence[int]) -> list[int]:
+    """Rest of the tour that a policy of FLOWN plans after the seeds; empty for other policies.
+
+    If another view was taken than the next one of the plan, a new plan is made after all views
+    taken.
+    """
+    settings, flight = problem.settings, problem.flight
+    model = FLOWN.get(settings.policy)
+    if model is None or settings.nearest is not None:
+        return []
+    for start in (taken[: settings.seeds], taken):
+        key = tuple(start), tuple(problem.reachable(start))
+        if key not in flight.tours:
+            gains = problem.visibility.few_gains(*model)
+            if gains is None:
+                return []
+            problem.progress("planning the flight", 0, 1)
+            gains.take(start)
+            most = views_left(problem, start)
+            ends, share = [start[-1], flight.home], flight.share_from(start, most)
+            way = tour.planned_tour(flight.legs, ends, key[1], gains, share, 1 / most)
+            flight.tours[key] = way[1:-1]
+        plan, done = flight.tours[key], list(taken[len(start) :])
+        if plan[: len(done)] == done and plan[len(done) :]:
+            return plan[len(done) :]
+    return []
+
+
+def views_left(problem: Problem, taken: Sequence[int]) -> int:
+    """Number of views that the budget has left."""
+    return problem.settings.budget - (len(taken) - problem.settings.seeds)

@@ -90,15 +90,17 @@ class Operations:
 
 
 class Problem:
-    """A selection problem: which of the frames to take, and how the model is fitted to them.
+    """A selection problem: V candidate frames, and how the model is fitted to those taken.
 
-    Positions, centre and points are in coordinates in which +Z is up, metres. lam [P]: lambda of
-    the run; prior_lam: the same without columns of means and without `--lam`, for the surface.
-    allowed [V]: poses that `no_fly` and `clearance` allow. skipped: number of views taken before
-    the flight. What depends on images (`start`) is computed when first asked for.
+    - positions, centre, points: metres, in coordinates in which +Z is up.
+    - lam: [P], lambda of the run. prior_lam: the same for the surface, without columns of means and
+      without the setting `lam`.
+    - allowed: [V] bool, poses that `no_fly` and `clearance` allow.
+    - skipped: number of views taken before the flight.
+    - seeds: seed views; by default spread over the directions of the poses allowed.
 
-    seeds: frames that start the model; by default spread over the directions of those allowed.
-    Raises InputError where these are too few, or their flight exceeds the limits.
+    Values that depend on images are computed at their first use. Raises InputError if there are
+    too few seeds, or their flight exceeds the limits.
     """
 
     def __init__(
@@ -278,7 +280,10 @@ class Problem:
             failed = next(i for i in self.seeds if self.frames[i].given_up)
             others = self.reachable(self.seeds)
             if not others:
-                raise InputError(f"{self.dataset.root}: too few poses are left for the seeds")
+                raise InputError(
+                    f"{self.dataset.root}: too few poses are left for the seeds; "
+                    "lower --seed-views, or give more poses"
+                )
             nearest = poses.nearest_poses(self.positions[others], self.positions[failed], 1)[0]
             self.seeds = [others[nearest] if i == failed else i for i in self.seeds]
 

@@ -61,53 +61,53 @@ class NbvSettings(BaseModel):
     prior: Path
     """Folder of the prior."""
     policy: str = "directional-d"
-    """Policy that scores the candidates, or FILE.py:FUNCTION of your own."""
+    """Policy that scores candidate views: a name, or FILE.py:FUNCTION of your own."""
     nearest: Annotated[int, Field(ge=1)] | None = None
-    """Choose among this many views nearest to the last one. Default: all."""
+    """Choose among this many candidates, the nearest to the last view. Default: all."""
     travel: Scale | None = None
-    """Distance in metres that costs as much as an image: scores are over 1 + distance / METRES."""
+    """Distance that costs as much as an image; scores are divided by 1 + distance / METRES."""
     flight_length: Scale | None = None
-    """Most metres of the flight, with the seeds and the way home. Default: no limit."""
+    """Longest flight in metres, including the seed views and the return. Default: no limit."""
     flight_time: Scale | None = None
-    """Most seconds of the flight at --speed, and --hover for each picture. Default: no limit."""
+    """Longest flight in seconds, at --speed, with --hover at each picture. Default: no limit."""
     speed: Scale = 2.0
     """Speed between pictures, metres per second."""
     hover: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 3.0
     """Seconds that a picture takes."""
     no_fly: Scale | None = None
-    """Radius in metres of an upright cylinder around the object that no pose and no leg enters."""
+    """Radius in metres of an upright cylinder around the object that the flight must not enter."""
     clearance: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
-    """Least height in metres of a pose above the object's lowest point."""
+    """Lowest height of a pose above the object's lowest point, metres."""
     estimator: str = "exact"
     """Estimator of the Fisher information: exact, hutchinson, or loss-gradient (the paper's)."""
     budget: Annotated[int, Field(ge=0)] = 50
-    """Most views to choose beyond the seeds. Default: 50, or all candidates if fewer."""
+    """Most views to choose beyond the seed views. Default: 50, or all candidates if fewer."""
     batch: Annotated[int, Field(ge=1)] = 1
-    """Views to choose before their images are read and fitted; the last batch may be smaller."""
+    """Views to choose before the next fit; the last batch may be smaller."""
     stop_gain: Positive | None = None
-    """End the run before a view whose `information_gain` (Eq. 7) is below this."""
+    """End the run if the chosen view's information gain (Eq. 7, ½ nat per parameter) is lower."""
     stop_uncertainty: Annotated[float, Field(gt=0, lt=1)] | None = None
     """End the run when at most this share (0 to 1) of the prior's variance is left."""
     seeds: Annotated[int, Field(ge=1)] = 4
-    """Number of views, spread over the directions of the poses, that start the model."""
+    """Number of seed views for the first fit, spread evenly over the directions of the poses."""
     seed: Annotated[int, Field(ge=0)] = 0
-    """Root of every random draw."""
+    """Seed of all random draws."""
     lam: Annotated[float, Field(ge=1e-30, le=1e30, allow_inf_nan=False)] | None = None
     """One lambda for all parameters, as in the paper. Default: (pixel noise / prior std)^2."""
     pixel_noise: Scale = PIXEL_NOISE
-    """Standard deviation of a pixel's residual, linear RGB; sets lambda of every criterion."""
+    """Standard deviation of a pixel's residual, linear RGB; sets lambda, the regularisation."""
     prior_std: dict[str, Scale] = PRIOR_STD
-    """Prior standard deviation of a kind of parameter; of `mean` in metres, where it moves."""
+    """Prior standard deviation by kind of parameter; `mean`, in metres, only if means move."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
-    """Measure PSNR after every so many views; 0: at the end only. Never affects the choice."""
+    """Measure PSNR each time after this many views; 0: only at the end. Does not affect choices."""
     warm_passes: Annotated[int, Field(ge=1)] = WARM_PASSES
-    """Most passes of the fits after the first; `passes` where that is less."""
+    """Most passes of each fit after the first; never more than `passes`."""
     warm_rate: Positive = 1.0
-    """Learning rates of the fits after the first, over those of the first."""
+    """Factor on the learning rates of the fits after the first."""
     exposure: bool = False
-    """Estimate a gain per image and channel, where exposure or white balance differ."""
+    """Estimate a gain per image and channel, for images of unequal exposure or white balance."""
     sh: Annotated[int, Field(ge=0, le=3)] = 0
-    """Degree of colours as functions of direction, 0 (one colour) to 3 (spherical harmonics)."""
+    """Degree of the spherical harmonics of colour: 0 (the same from all directions) to 3."""
     train: TrainSettings = TrainSettings()
     """Settings of each fit."""
 

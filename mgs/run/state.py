@@ -29,11 +29,13 @@ class Choice:
 
 @dataclass
 class Fitted:
-    """The model after a fit, and what the views taken say about it.
+    """The model after a fit, and the Fisher information of the views taken.
 
-    gaussians: the model. H [N,P]: information of the views taken at that model. surface [S,P]:
-    their exact information about the S Gaussians on the prior's surface, as they were before
-    training; it has no columns of means. taken: frame indices in the order of their choice.
+    - gaussians: the model.
+    - H: [N,P] information of the views taken, at that model (diagonal of J^T J).
+    - surface: [S,P] their exact information about the S Gaussians on the prior's surface, as they
+      were before training; it has no columns of means.
+    - taken: frame indices in the order of their choice.
     """
 
     gaussians: Gaussians
@@ -60,7 +62,8 @@ class Learned(Fitted):
 class State(Fitted):
     """State of a run after a step, as the run folder holds it.
 
-    steps: lines of steps.jsonl. inputs: hashes of the inputs (`mgs.run.inputs`).
+    gaussians, H, surface, taken: as `Fitted`. steps: lines of steps.jsonl. inputs: hashes of the
+    inputs (`mgs.run.inputs`).
     """
 
     steps: list[dict[str, Any]] = field(default_factory=list)

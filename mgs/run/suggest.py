@@ -227,7 +227,7 @@ def _plan(
                 "suggest: no candidate is within the limits of the flight; raise --flight-length "
                 "or --flight-time"
             )
-        stops = plan_flight(problem, state, fisher)
+        stops = list(plan_flight(problem, state, fisher))
         problem.settings = problem.settings.model_copy(update={"batch": len(stops)})
         chooser = _following(stops)
     _, choices, _ = choose_batch(problem, state, chooser)

@@ -88,17 +88,19 @@ def fisher(
     """Fisher information of one view about each Gaussian: float32 [N,P], or [N,P,P] for the
     estimator `block`.
 
-    Entries are in (linear RGB / unit of the parameter)^2. They depend on model and pose alone, not
-    on the camera's image. The array may be a view of a larger one (padded rows).
+    It is the diagonal of J^T J (or its blocks), where J is the Jacobian of the image, in (linear
+    RGB / unit of the parameter)^2. The order of the P parameters is that of docs/notation.md. The
+    result depends on model and pose alone, not on the camera's image. The array may be a view of a
+    larger one (padded rows).
 
-    gaussians, background, cache: as in `render`.
-    estimator: a name in `ESTIMATORS`. options: `probes` and `seed` of `hutchinson`.
-    means: a name in `MEANS`.
-    normals: directions for means="normal" [N,3], world, of any length but 0. They are given, not
-        taken from the Gaussians' axes, because those turn during a fit, and information summed over
-        views must be about the same direction.
-    alpha_weight: (sigma_rgb / sigma_alpha)^2, up to 1e12, if a pixel's alpha is observed beside its
-        colour; 0: it is not.
+    - gaussians, background, cache: as in `render`.
+    - estimator: a name in `ESTIMATORS`. options: `probes` and `seed` of `hutchinson`.
+    - means: "frozen", "normal" or "free": 0, 1 or 3 columns of the means, after the others.
+    - normals: directions for means="normal" [N,3], world, of any length but 0. They are given, not
+      taken from the Gaussians' axes, because those turn during a fit, and information summed over
+      views must be about the same direction.
+    - alpha_weight: (sigma_rgb / sigma_alpha)^2, up to 1e12, if a pixel's alpha is observed beside
+      its colour; 0: it is not.
 
     Raises InputError for an unknown estimator; as `render`; for blocks of 2^31 numbers or more, or
     too large for the memory; for unusable means, normals or alpha_weight, or an estimator that does

@@ -263,9 +263,11 @@ def render(
 ) -> Image:
     """Render Gaussians by EWA splatting (Kerbl et al. 2023, with `mgs.splat.constants`).
 
-    gaussians: NumPy fields, or TensorXf fields, any of which may have gradients enabled.
-    background: linear RGB, one number or three, or a Dr.Jit colour, with or without gradient.
-    cache: keep one between calls to reuse the block lists of cameras.
+    - gaussians: NumPy fields, or TensorXf fields, any of which may have gradients enabled.
+    - background: linear RGB, one number or three, or a Dr.Jit colour, with or without gradient.
+    - cache: pass the same one to all calls, to reuse the block lists of cameras.
+
+    Returns rgb [H,W,3] (linear), alpha [H,W] and depth [H,W] (expected z-depth, metres), TensorXf.
 
     Differentiable by Dr.Jit in reverse mode (`dr.backward`) and forward mode (`dr.forward`, `jvp`).
     Not differentiated: the camera, the thresholds (ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN) and the
@@ -295,9 +297,9 @@ def jvp(
     """Derivative of the image along `tangents` of the Gaussians: J v in one pass (forward mode),
     with J the Jacobian of `render`.
 
-    gaussians, camera, background, cache: as in `render`; their gradients are ignored.
-    tangents: derivatives by some t, by name of a parameter ("means", "log_scales", "quats",
-        "logit_opacities", "sh"), NumPy or Dr.Jit of the parameter's shape. Others are constant.
+    - gaussians, camera, background, cache: as in `render`; their gradients are ignored.
+    - tangents: d parameter / dt for some t, by name ("means", "log_scales", "quats",
+      "logit_opacities", "sh"), NumPy or Dr.Jit of the parameter's shape. Others are constant.
 
     Returns the derivatives by t of rgb [H,W,3], alpha [H,W] and depth [H,W], TensorXf. Raises
     InputError as `render`, and for a tangent of an unknown name, of a wrong shape or not finite.

@@ -10,7 +10,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Mapping
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +104,17 @@ class Case:
         needs = tuple(cell.name for cell in cells)
         return [*cells, Cell(self.prior_name, f"{__name__}:make_prior", arguments, needs)]
 
+    def surveyed(self, seed: int) -> tuple[Case, list[Cell]]:
+        """The case of a survey of this dataset, and the cells of its dataset, survey and prior."""
+        label = f"{self.name}-survey"
+        task, arguments = f"{__name__}:make_survey", {"dataset": self.dataset, "seed": seed}
+        first = self.cells()[:-1]
+        flown = Cell(f"survey/{label}", task, arguments, tuple(cell.name for cell in first))
+        given = Path(CELLS) / flown.name / "survey"
+        case = replace(self, scene=replace(self.scene, label=label), given=given)
+        prior = replace(case.cells()[-1], needs=(flown.name,))
+        return case, [*first, flown, prior]
+
     def with_task(self, name: str, task: str, alone: bool = False, **arguments: Any) -> list[Cell]:
         """The cells above, and last a cell of a task that gets their folders."""
         cells = self.cells()
@@ -133,6 +144,20 @@ def make_dataset(
         changed = SceneFile.model_validate(sections)
         synthesise(folder, changed, images, seed, mesh, test_views=size["tests"])
     return {"frames": len(load_dataset(folder))}
+
+
+def make_survey(root: Path, out: Path, dataset: str, seed: int) -> dict[str, Any]:
+    """Survey a dataset into OUT/survey, as `mgs survey` does. Returns the rms errors of the poses,
+    metres and degrees."""
+    from mgs.survey.flight import SurveySettings, fly
+    from mgs.survey.folder import save_survey
+
+    folder, data, settings = out / "survey", load_dataset(root / dataset), SurveySettings(seed=seed)
+    shutil.rmtree(folder, ignore_errors=True)  # of a process that was killed
+    with atomic_folder(folder) as unfinished:
+        numbers = save_survey(unfinished, data, fly(data, settings), settings)
+    error = numbers["error"]["optimised"]
+    return {key: error[key] for key in ("ate_rms", "rotation_rms")}
 
 
 def make_prior(root: Path, out: Path, dataset: str, **settings: Any) -> dict[str, Any]:

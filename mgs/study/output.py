@@ -90,8 +90,8 @@ COLUMNS = 3
 """Most plots side by side."""
 
 
-def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row]) -> None:
-    """Draw the panels that have rows; panels with the same groups share a legend."""
+def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row], title: str = "") -> None:
+    """Draw the panels that have rows; panels with the same groups share a legend. title: of all."""
     import matplotlib
 
     drawn = [(panel, chosen) for panel in panels if (chosen := _rows_of(panel, rows))]
@@ -109,14 +109,17 @@ def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row]) -> Non
             (_draw_lines if _numeric(panel, chosen) else _draw_names)(axis, panel, chosen)
             if panel.by and not shared:
                 axis.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
-                figure.suptitle(panel.title)
+                title = title or panel.title
             else:
                 axis.set_title(panel.title)
         for axis in axes[len(drawn) :]:
             axis.remove()
+        if title:
+            figure.suptitle(title)
         if shared:
             handles, labels = axes[0].get_legend_handles_labels()
-            figure.legend(handles, labels, loc="outside upper center", ncols=2 * columns)
+            side = "lower" if title else "upper"
+            figure.legend(handles, labels, loc=f"outside {side} center", ncols=2 * columns)
         save_figure(figure, path)
 
 

@@ -15,9 +15,10 @@ from mgs.errors import InputError, flag
 from mgs.policy import from_file as policy_file
 from mgs.policy.registry import policy_named
 from mgs.run.inputs import file_digest, policy_record
+from mgs.study import flights
 from mgs.study.case import Case, Size
 from mgs.study.rocks import FRESH, Rock
-from mgs.study.setups import DRAWS, ORACLE, POLICIES, SetupSize, cells_of
+from mgs.study.setups import DRAWS, ORACLE, POLICIES, SURVEYED, SetupSize, cells_of
 from mgs.study.statistics import MOST_ROCKS
 from mgs.study.sweep import Cell, names_of
 
@@ -67,13 +68,14 @@ TABLE_ROCK = Rock("boulder", 0)
 
 @dataclass(frozen=True)
 class ReproduceSize:
-    """Size of a reproduction: of the runs of Table I, of the set-ups, and numbers of rocks.
+    """Size of a reproduction: of the runs of Table I, set-ups and flights, and numbers of rocks.
 
     own_policies: policies that the set-ups compare, too. meshes: rocks in place of FRESH.
     """
 
     table: RunSize
     setups: SetupSize
+    flights: SetupSize
     setup_rocks: int = len(FRESH)
     oracle_rocks: int = 2
     own_policies: tuple[str, ...] = ()
@@ -90,9 +92,12 @@ class ReproduceSize:
 
 
 SIZES = {
-    "quick": ReproduceSize(RunSize(Size(320, 240, 32, 12), 10_000, 8), SetupSize()),
+    "quick": ReproduceSize(
+        RunSize(Size(320, 240, 32, 12), 10_000, 8), SetupSize(), SetupSize(gaussians=6000)
+    ),
     "paper": ReproduceSize(
         RunSize(Size(640, 480, 100, 24, spp=16), 100_000, 50),
+        SetupSize(320, 240, 24, 16),
         SetupSize(320, 240, 24, 16),
     ),
 }
@@ -177,10 +182,20 @@ def setup_cells(size: ReproduceSize, count: int) -> list[Cell]:
     return cells_of(size.setups, size.some_rocks(count), size.policies)
 
 
+def survey_cells(size: ReproduceSize, count: int) -> list[Cell]:
+    """Every policy with poses and priors of a survey."""
+    return cells_of(size.setups, size.some_rocks(count), size.policies, SURVEYED)
+
+
 def oracle_cells(size: ReproduceSize, count: int) -> list[Cell]:
     """The set-ups, and the oracle in each on the first rocks."""
     rocks = size.some_rocks(count)
     return setup_cells(size, count) + cells_of(size.setups, rocks, (ORACLE,))
+
+
+def flight_cells(size: ReproduceSize, count: int) -> list[Cell]:
+    """Flights over the first rocks."""
+    return flights.cells_of(size.flights, size.some_rocks(count))
 
 
 def _runs_cells(runs: Iterable[Run]) -> list[Cell]:
@@ -209,6 +224,8 @@ RESULTS = {
     "table1": Result(lambda size, _: _runs_cells(table_runs(size).values())),
     "figures": Result(lambda size, _: _runs_cells(figure_runs(size))),
     "setups": Result(setup_cells, "setup_rocks", most=len(FRESH)),
+    "flights": Result(flight_cells, "setup_rocks", optional=True, most=len(FRESH)),
+    "survey": Result(survey_cells, "setup_rocks", optional=True, most=len(FRESH)),
     "oracle": Result(oracle_cells, "oracle_rocks", optional=True, most=len(FRESH)),
 }
 """Every result by name, in the order in which they are made."""
@@ -255,9 +272,9 @@ def with_options(
     """
     labels = list(POLICIES)
     for policy in policies:
-        _check_used(f"--policy {policy}", names, "setups", "oracle")
+        _check_used(f"--policy {policy}", names, "setups", "survey", "oracle")
         if policy in POLICIES:
-            raise InputError(f"--policy {policy}: is compared anyway")
+            raise InputError(f"--policy {policy}: is compared anyway; leave it out")
         if policy_file.label(policy) in labels:
             raise InputError(f"--policy {policy}: {NAMESAKE}")
         labels.append(policy_file.label(policy))
@@ -272,7 +289,10 @@ def with_options(
 def _check_used(option: str, names: Sequence[str], *results: str) -> None:
     """Raise InputError if an option is for none of the results to make."""
     if not set(results) & set(names):
-        raise InputError(f"{option}: is for {' and '.join(results)}, and --only leaves both out")
+        raise InputError(
+            f"{option}: is for {', '.join(results)}, of which --only names none; "
+            "leave out the option, or name one of these"
+        )
 
 
 def _with_meshes(

@@ -12,11 +12,11 @@ import numpy as np
 from mgs.files import write_csv
 from mgs.report.evaluation import evaluate_run
 from mgs.report.writing import write_report
-from mgs.study import reproduce, setups
+from mgs.study import flights, reproduce, setups
 from mgs.study.output import table, write_table
 from mgs.study.reproduce import ReproduceSize, Run
 from mgs.study.setups import Found
-from mgs.study.sweep import Report, cell_folder, found, run_cells
+from mgs.study.sweep import Cell, Report, cell_folder, found, run_cells
 from mgs.study.verdict import Row
 
 Rows = list[Row]
@@ -114,26 +114,52 @@ def write_figures(work: Work) -> list[Path]:
 
 
 def write_setups(work: Work) -> list[Path]:
-    """setups.csv, .json, .md and .png; leads.csv; with the oracle where it is done."""
-    size, rocks = work.size, work.size.some_rocks(work.count)
-    cells = reproduce.oracle_cells(size, work.count)
+    """setups.csv, .json, .md and .png; leads.csv; where it is done, the oracle and foretold.csv."""
+    return _write_setups(work, "setups", reproduce.oracle_cells(work.size, work.count))
+
+
+def write_survey(work: Work) -> list[Path]:
+    """survey.csv, .json, .md and .png, and survey-leads.csv: as `write_setups`."""
+    return _write_setups(work, "survey", reproduce.survey_cells(work.size, work.count))
+
+
+def _write_setups(work: Work, name: str, cells: Sequence[Cell]) -> list[Path]:
+    rocks, prefix = work.size.some_rocks(work.count), "" if name == "setups" else f"{name}-"
     known = dict(work.results)
     for cell in cells:
         if cell.name not in known and (result := found(work.root, cell)) is not None:
             known[cell.name] = result
-    rows = setups.rows_of(known, [cell for cell in cells if cell.name in known], rocks)
+    done = [cell for cell in cells if cell.name in known]
+    rows, predicted = setups.rows_of(known, done, rocks), setups.foretold_of(known, done, rocks)
     leads = [lead for key in setups.MEASURES for lead in setups.leads_of(rows, setups.LEADER, key)]
-    write_csv(work.out / "leads.csv", leads)
-    setups.draw(work.out / "setups.png", rows)
-    text = setups.text_of(rows, leads)
-    written = write_table(work.out, "setups", rows, text, work.command, rocks=work.count)
-    return [*written, work.out / "leads.csv", work.out / "setups.png"]
+    files = [work.out / f"{prefix}leads.csv", work.out / f"{name}.png"]
+    write_csv(files[0], leads)
+    setups.draw(files[1], rows)
+    text = setups.text_of(rows, leads, predicted)
+    written = write_table(work.out, name, rows, text, work.command, rocks=work.count) + files
+    if predicted:
+        write_csv(work.out / "foretold.csv", predicted)
+        written.append(work.out / "foretold.csv")
+    return written
+
+
+def write_flights(work: Work) -> list[Path]:
+    """flights.csv, .json, .md and .png."""
+    rocks = work.size.some_rocks(work.count)
+    cells = reproduce.flight_cells(work.size, work.count)
+    rows = flights.rows_of(work.results, cells, rocks)
+    flights.draw(work.out / "flights.png", rows)
+    text = flights.text_of(rows)
+    written = write_table(work.out, "flights", rows, text, work.command, rocks=work.count)
+    return [*written, work.out / "flights.png"]
 
 
 WRITERS: dict[str, Callable[[Work], list[Path]]] = {
     "table1": write_table1,
     "figures": write_figures,
     "setups": write_setups,
+    "flights": write_flights,
+    "survey": write_survey,
     "oracle": write_setups,
 }
 """Writers of results, which return the files written."""
@@ -154,7 +180,7 @@ def make(
     result = reproduce.RESULTS[name]
     command = f"mgs reproduce --scale {preset} --only {name}"
     command += f" --rocks {count}" if result.count(size) > 1 else ""
-    if name in ("setups", "oracle"):
+    if name in ("setups", "survey", "oracle"):
         command += "".join(f" --policy {_from_here(policy)}" for policy in size.own_policies)
     if result.rocks:
         command += "".join(f" --mesh {rock.mesh.name}" for rock in size.meshes if rock.mesh)

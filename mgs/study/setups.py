@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from mgs.run.settings import NbvSettings, with_defaults
 from mgs.run.state import Fitted
 from mgs.splat import ListCache
 from mgs.study.case import Case, Size, test_views_of
-from mgs.study.oracle import oracle
+from mgs.study.oracle import foretold, oracle
 from mgs.study.output import Panel, draw_matrix, table, with_interval
 from mgs.study.rocks import Rock
 from mgs.study.statistics import holm, interval, permutation_p
@@ -50,6 +50,15 @@ LEADER = "directional-d"
 """Policy whose lead over every other is tested: the default of `mgs nbv`."""
 
 RANDOM, ORACLE = "random", "oracle"
+
+SCORED = tuple(policy for policy in POLICIES if policy != RANDOM)
+"""Policies whose scores are compared with what each candidate gains, at the oracle's choices."""
+
+FORETOLD = {
+    "spearman": "rank correlation of the score with the gain",
+    "regret": "regret of one choice (dB)",
+}
+"""Keys of `mgs.study.oracle.foretold`."""
 
 MEAN = "mean"
 """Name of the mean over the set-ups, beside their names."""
@@ -75,7 +84,7 @@ class Setup:
 
     orbit: values of the scene's orbit. frames: number of poses. seeds: views to start with. every:
     take only the first half of the frames, and one in so many of the others. settings: more of
-    `mgs nbv`.
+    `mgs nbv`. survey: poses, depth and prior are those of `mgs survey`, with its noise and drift.
     """
 
     orbit: Mapping[str, Any]
@@ -83,6 +92,7 @@ class Setup:
     seeds: int = 4
     every: int | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    survey: bool = False
 
 
 RING = {"kind": "circle", "distances": [1]}
@@ -97,6 +107,9 @@ SETUPS = {
     "mixed distances": Setup({"kind": "hemisphere", "distances": [1, 2, 3]}, 36),
 }
 """The ring is the paper's; in the others the choice matters more."""
+
+SURVEYED = {"surveyed ring": Setup(RING, 48, survey=True)}
+"""Set-ups apart, as a robot measures: their poses and priors are wrong."""
 
 
 @dataclass(frozen=True)
@@ -121,13 +134,19 @@ def case_of(rock: Rock, setup: Setup, size: SetupSize) -> Case:
     return Case(rock.at(dict(setup.orbit)), images, number | {"seed": 0})
 
 
-def cells_of(size: SetupSize, rocks: Iterable[Rock], policies: Sequence[str]) -> list[Cell]:
+def cells_of(
+    size: SetupSize,
+    rocks: Iterable[Rock],
+    policies: Sequence[str],
+    setups: Mapping[str, Setup] = SETUPS,
+) -> list[Cell]:
     """Cells of every policy in every set-up on every rock, with datasets and priors."""
     cells: dict[str, Cell] = {}
     for rock in rocks:
         ring = case_of(rock, SETUPS["ring"], size)
-        for name, setup in SETUPS.items():
+        for name, setup in setups.items():
             case = case_of(rock, setup, size)
+            case, data = case.surveyed(rock.index) if setup.survey else (case, case.cells())
             common = {"seeds": setup.seeds, "budget": size.images - setup.seeds, **setup.settings}
             for policy in policies:
                 for draw in range(DRAWS if policy == RANDOM else 1):
@@ -143,8 +162,9 @@ def cells_of(size: SetupSize, rocks: Iterable[Rock], policies: Sequence[str]) ->
                         every=setup.every,
                         settings=settings,
                     )
-                    last = replace(made[-1], needs=(*made[-1].needs, ring.cells()[0].name))
-                    for cell in (*ring.cells()[:1], *made[:-1], last):
+                    needs = (ring.cells()[0].name, *(cell.name for cell in data))
+                    last = replace(made[-1], needs=needs)
+                    for cell in (*ring.cells()[:1], *data, last):
                         cells[cell.name] = cell
     return list(cells.values())
 
@@ -161,16 +181,20 @@ def choose_and_judge(
     """Task: choose views by a policy, fit all of them from the prior, and judge the model.
 
     Returns MEASURES, "taken" (indices of the frames in the order taken) and "path" (metres through
-    the views taken).
+    the views taken). The oracle's has "foretold": means of `foretold` over its choices.
     """
     policy = settings["policy"]
-    shared, tests, pool, on_ring = _shared(
+    shared, tests, pool, on_ring = shared_problem(
         root / dataset, root / prior, root / ring, every, settings["seeds"], settings["budget"]
     )
     chosen_by = RANDOM if policy == ORACLE else policy
     problem = shared.with_settings(**settings | {"policy": chosen_by})
+    tried: list[dict[str, dict[str, float]]] = []
     if policy == ORACLE or needs_model(policy):
-        chooser = oracle(test_views_of(shared.dataset)) if policy == ORACLE else None
+        chooser = None
+        if policy == ORACLE:
+            views = test_views_of(shared.dataset)
+            chooser = oracle(views, lambda *of: tried.append(foretold(SCORED, *of)))
         states = select_views(problem, _after_seeds(shared), chooser)
         taken = [state for state in states if isinstance(state, Fitted)][-1].taken
     else:
@@ -188,6 +212,14 @@ def choose_and_judge(
         "ring": float((on_pool if mine else on_ring(model))["psnr"].mean()),
         "path": float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
         "taken": taken,
+    } | ({"foretold": _means(tried)} if tried else {})
+
+
+def _means(tried: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
+    """Means of `foretold` over choices."""
+    return {
+        policy: {key: float(np.mean([one[policy][key] for one in tried])) for key in first}
+        for policy, first in tried[0].items()
     }
 
 
@@ -207,7 +239,7 @@ Measure = Callable[..., dict[str, np.ndarray]]
 
 
 @lru_cache(maxsize=1)
-def _shared(
+def shared_problem(
     dataset: Path, prior: Path, ring: Path, every: int | None, seeds: int, budget: int
 ) -> tuple[Problem, Measure, Measure, Measure]:
     """Problem of a set-up on one rock, and PSNR over test views, candidates and the ring.
@@ -246,8 +278,7 @@ def rows_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> lis
     groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for cell in cells:
         if cell.name.startswith("setup/"):
-            _, rock, where, _ = cell.name.split("/")
-            setup = next(s for s in SETUPS if where.startswith(s.replace(" ", "-") + "-"))
+            rock, setup = _place(cell)
             policy = policy_file.label(cell.arguments["settings"]["policy"])
             groups.setdefault((rock, setup, policy), []).append(results[cell.name])
     rows: list[Row] = [
@@ -260,6 +291,25 @@ def rows_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> lis
         against = base[row["rock"], row["setup"]]
         row |= {f"{key}_gain": row[key] - against[key] for key in MEASURES}
     return rows
+
+
+def foretold_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> list[Row]:
+    """A row for each rock and set-up that the oracle was tried on, and each of SCORED: FORETOLD."""
+    scenes = {rock.name: rock.scene for rock in rocks}
+    rows: list[Row] = []
+    for cell in cells:
+        for policy, numbers in results[cell.name].get("foretold", {}).items():
+            rock, setup = _place(cell)
+            about = {"rock": rock, "scene": scenes[rock], "setup": setup, "policy": policy}
+            rows.append(about | numbers)
+    return rows
+
+
+def _place(cell: Cell) -> tuple[str, str]:
+    """Rock and set-up of a cell of `choose_and_judge`."""
+    _, rock, where, _ = cell.name.split("/")
+    names = {name.replace(" ", "-"): name for name in (*SETUPS, *SURVEYED)}
+    return rock, names[where.rpartition("-")[0]]
 
 
 def by_scene(rows: Sequence[Row], setup: str, policy: str, key: str) -> dict[str, float]:
@@ -317,28 +367,21 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     draw_matrix(path, Panel("setup", "gain", "set-up", "", "policy", title=title), means)
 
 
-def text_of(rows: Sequence[Row], leads: Sequence[Row]) -> str:
+def text_of(rows: Sequence[Row], leads: Sequence[Row], predicted: Sequence[Row] = ()) -> str:
     """Tables with a line for each policy and a column for each set-up: gains over `random` by each
-    of MEASURES, share of the oracle's gain, and the leader's lead."""
+    of MEASURES, share of the oracle's gain, the leader's lead, and FORETOLD of `foretold_of`."""
     setups, policies = _setups(rows), _policies(rows)
+    matrix = partial(_matrix, setups)
 
-    def gain(setup: str, policy: str, key: str) -> float | None:
-        found = by_scene(rows, setup, policy, f"{key}_gain")
-        return float(np.mean(list(found.values()))) if found else None
+    def means(of: Sequence[Row], key: str, form: str) -> Callable[[str, str], str]:
+        def cell(setup: str, policy: str) -> str:
+            found = by_scene(of, setup, policy, key)
+            return format(np.mean(list(found.values())), form) if found else "–"
 
-    def matrix(title: str, cell: Callable[[str, str], str], over: Sequence[str]) -> str:
-        columns = {title: "policy"} | {setup: setup for setup in setups}
-        lines = [{"policy": p} | {setup: cell(setup, p) for setup in setups} for p in over]
-        return table(columns, lines)
-
-    def signed(value: float | None) -> str:
-        return "–" if value is None else f"{value:+.2f}"
-
-    def gains(key: str) -> Callable[[str, str], str]:
-        return lambda setup, policy: signed(gain(setup, policy, key))
+        return cell
 
     tables = [
-        matrix(f"{title}, over random (dB)", gains(key), policies)
+        matrix(f"{title}, over random (dB)", means(rows, f"{key}_gain", "+.2f"), policies)
         for key, title in MEASURES.items()
     ]
     known = {(lead["setup"], lead["policy"]): lead for lead in leads if lead["measure"] == "test"}
@@ -355,7 +398,18 @@ def text_of(rows: Sequence[Row], leads: Sequence[Row]) -> str:
     )
     if ORACLE in policies:
         tables.append(_shares(rows, setups, policies, matrix))
+    if predicted:
+        tables += [matrix(t, means(predicted, k, ".2f"), SCORED) for k, t in FORETOLD.items()]
     return "\n".join(tables)
+
+
+def _matrix(
+    setups: Sequence[str], title: str, cell: Callable[[str, str], str], policies: Sequence[str]
+) -> str:
+    """Table of cell(setup, policy), a line for each policy."""
+    columns = {title: "policy"} | {setup: setup for setup in setups}
+    lines = [{"policy": p} | {setup: cell(setup, p) for setup in setups} for p in policies]
+    return table(columns, lines)
 
 
 def _shares(

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from mgs.data.clouds import SparseCloud, write_cloud
-from mgs.data.dataset import Dataset, load_dataset, write_transforms
+from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, write_transforms
+from mgs.data.frames import Frame
 from mgs.files import copy_file, write_json
 from mgs.images import write_exr
 from mgs.plotting import STYLE, new_figure, save_figure
@@ -40,28 +41,37 @@ def save_survey(
 def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
     """Write a survey of a dataset as a dataset into the folder `out`, and load it.
 
-    Images, masks and the true rock (rock.glb) are copied, except images of on-demand frames; depth
-    is measured and poses are estimated. Raises InputError if a file cannot be read or written.
+    Images, masks, the true rock (rock.glb) and the test views, whose poses are exact, are copied,
+    except images of on-demand frames; depth is measured and poses are estimated. Raises InputError
+    if a file cannot be read or written.
     """
     frames = []
     for frame, pose, depth in zip(dataset.frames, survey.optimised, survey.depths, strict=True):
-        # Files are named after their frame, since only frames are sure to have different names.
-        paths: dict[str, Any] = {}
-        fields = {"images": "image_path", "masks": "mask_path", "rock": "rock_path"}
-        for kind, field in fields.items():
-            path = getattr(frame, field)
-            paths[field] = path and out / kind / f"{frame.name}{path.suffix}"
-            if path and not (frame.on_demand and kind == "images"):
-                copy_file(path, paths[field])
         measured = out / "depth" / f"{frame.name}.exr"
         write_exr(measured, {"Z": depth})
         camera = replace(frame.camera, world_to_camera=np.linalg.inv(pose))
-        frames.append(replace(frame, camera=camera, depth_path=measured, **paths))
+        frames.append(replace(_copied(out, frame), camera=camera, depth_path=measured))
     truth = dataset.root / "rock.glb"
     if truth.is_file():
         copy_file(truth, out / "rock.glb")
+    if tests := dataset.test_views():
+        folder = out / TEST_FOLDER
+        copied = [replace(_copied(folder, frame), depth_path=None) for frame in tests.frames]
+        write_transforms(folder, copied)
     write_transforms(out, frames)
     return load_dataset(out)
+
+
+def _copied(out: Path, frame: Frame) -> Frame:
+    """A frame with its image, masks and rock copied into folders of `out`."""
+    # Files are named after their frame, since only frames are sure to have different names.
+    paths: dict[str, Any] = {}
+    for kind, field in (("images", "image_path"), ("masks", "mask_path"), ("rock", "rock_path")):
+        path = getattr(frame, field)
+        paths[field] = path and out / kind / f"{frame.name}{path.suffix}"
+        if path and not (frame.on_demand and kind == "images"):
+            copy_file(path, paths[field])
+    return replace(frame, **paths)
 
 
 def draw_survey(

@@ -95,8 +95,8 @@ def registration_cloud(frame: Frame, depth: np.ndarray, grid: float) -> tuple[An
     points = own.unproject(z)[z > 0]
     if len(points) < 100:
         raise InputError(
-            f"survey: frame {frame.name} has only {len(points)} depth returns; "
-            "it cannot be registered"
+            f"survey: frame {frame.name} has only {len(points)} depth returns, so it cannot be "
+            "registered; remove it"
         )
     return small_gicp.preprocess_points(
         points, downsampling_resolution=grid, num_neighbors=NEIGHBOURS, num_threads=1

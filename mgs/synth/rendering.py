@@ -68,7 +68,7 @@ SHEET_COLUMNS, SHEET_WIDTH, SHEET_FRAMES = 8, 160, 32
 
 @dataclass(frozen=True)
 class RenderPreset:
-    """Image size in pixels, number of frames, samples per pixel."""
+    """Size of a rendered dataset: image size in pixels, number of frames, samples per pixel."""
 
     width: int
     height: int
@@ -92,21 +92,22 @@ def synthesise(
     test_views: int = 0,
     on_demand: bool = False,
 ) -> Dataset:
-    """Render a scene as a dataset into the folder `out` (files: docs/data.md).
+    """Render a scene as a dataset into the folder `out` (files: docs/data.md); return the dataset.
 
-    scene: name of a scene of mgs, path of a TOML file, or a loaded scene. preset: a name of
-    PRESETS, or a `RenderPreset`. seed: root seed of rock, ground and rendering. mesh: file that
-    replaces the procedural rock; mesh_up: its up axis, "y" or "z", by default `up_axis`.
-    pose_noise: error of the poses in transforms.json; true_poses.json then holds the exact ones.
-    test_views: number of `evaluation_cameras` to render into `out`/test, with exact poses; they do
-    not change the orbit. on_demand: render only the survey and the test views; a run renders the
-    frames it takes (`mgs.synth.capture`). progress: called (views done, all views). say: called
-    with lines for the user.
+    - scene: name of a scene of mgs, path of a TOML file, or a loaded scene.
+    - preset: a name of PRESETS, or a `RenderPreset`.
+    - seed: of all random draws in rock, ground and rendering.
+    - mesh: file of a rock in place of the procedural one. mesh_up: its up axis, "y" or "z"; by
+      default `up_axis`.
+    - pose_noise: error of the poses in transforms.json; true_poses.json then holds the exact ones.
+    - test_views: number of views on a dome to render into `out`/test, with exact poses.
+    - on_demand: render only the survey and the test views; a run renders the frames it takes.
+    - progress: called as progress(views done, all views). say: called with lines for the user.
 
-    An interrupted run of the same settings is completed, with the same files as after one run; a
-    finished one is loaded as it is.
-    Raises InputError if the scene or preset is unknown, `out` is not empty, not writable or locked
-    by another process, the mesh is bad, or the rock is not wholly in every view or is hidden.
+    An interrupted call is completed by a second one, with the same files as after one call. A
+    finished dataset is loaded as it is. Raises InputError if the scene or preset is unknown, `out`
+    is not empty, not writable or locked by another process, the mesh is bad, or the rock is not
+    wholly in every view or is hidden.
     """
     runtime.start()
     out = Path(out)
@@ -216,12 +217,12 @@ def rock_of(
     extents = " x ".join(f"{x:.2f}" for x in rock.extents)
     up, suffix = mesh_up or up_axis(mesh), Path(mesh).suffix.lower()
     if mesh_up:
-        reason = "is up, as told"
+        reason = "is up, as --mesh-up says"
     elif suffix in GLTF:
         reason = f"is up, as in all {suffix[1:].upper()} files"
     else:
         other = "y" if up == "z" else "z"
-        reason = f"taken as up, its format has no rule (--mesh-up {other} turns it)"
+        reason = f"taken as up, since its format does not say (--mesh-up {other} turns it)"
     say(
         f"{mesh}: +{up.upper()} {reason}; scaled {scale:.4g} times to the scene's rock size, "
         f"now {extents} m"
@@ -380,7 +381,7 @@ def _meter(
     if exposure >= wanted:
         return wanted
     say(
-        f"exposure: {wanted / exposure:.3g} times lower than a rock so dark asks for: "
-        f"about {MAX_CLIPPED:.0%} of rock and ground clips"
+        f"exposure: {wanted / exposure:.3g} times lower than so dark a rock needs, so that about "
+        f"{MAX_CLIPPED:.0%} of rock and ground clips, not more"
     )
     return exposure

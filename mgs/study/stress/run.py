@@ -48,7 +48,8 @@ def run_stress(
             continue
         own = [row for result in results if result for row in result.get("rows", ())]
         claims = [judged(claim, own) for claim in experiment.claims]
-        draw_panels(out / f"{name}.png", experiment.panels, own)
+        title = "" if experiment.panels[0].title else experiment.question
+        draw_panels(out / f"{name}.png", experiment.panels, own, title)
         experiments.append({"name": name, "question": experiment.question, "claims": claims})
         rows += [{"experiment": name} | row for row in own]
         sections.append(f"**{name}**: {experiment.question}\n\n{verdict_table(claims)}")

@@ -1,0 +1,209 @@
+"""Flights with a limit: PSNR against metres of a policy that plans a tour, and of others.
+
+Every flight starts and ends at the same pose. One fit to its images from the prior is judged on the
+test views. Even spacing is flown with many numbers of images. So for the PSNR of another flight
+there are the metres with which even spacing has the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.policy import tour
+from mgs.policy.poses import smallest_angle
+from mgs.run.loop import fit_views
+from mgs.run.planning import planned_flight, rated
+from mgs.run.problem import Problem
+from mgs.run.state import Fitted
+from mgs.study.output import Content, Panel, draw_panels, table
+from mgs.study.rocks import Rock
+from mgs.study.setups import SETUPS, Found, SetupSize, case_of, shared_problem
+from mgs.study.statistics import interval
+from mgs.study.sweep import Cell
+from mgs.study.verdict import Row
+
+POOLS = {"dome": SETUPS["one seed"], "mixed distances": SETUPS["mixed distances"]}
+"""Candidates; the flight starts with one seed in both."""
+
+LENGTHS = (0.2, 0.35, 0.55)
+"""Lengths of a flight over that of a short tour through all candidates."""
+
+EVEN, EVEN_IMAGES = "even spacing", (2, 3, 4, 5, 6, 8, 11, 15, 20, 27, 36)
+"""Baseline, and its numbers of images."""
+
+OURS = "planned tour"
+Flier = Callable[[Problem], list[int]]
+"""A function of a problem with a limit that returns the views of a flight in flying order."""
+
+
+def one_by_one(problem: Problem) -> list[int]:
+    """Views of the largest score / travel cost in reach, one after another."""
+    taken, unused = problem.seeds, np.zeros(0)  # these policies use poses and surface alone
+    while left := problem.reachable(taken):
+        context = problem.context(Fitted(problem.start, unused, unused, taken), left)
+        taken = [*taken, rated(problem, context, problem.travel_cost(context))[0][0]]
+    return taken
+
+
+def cut(problem: Problem) -> list[int]:
+    """Views in the order of a choice without a limit, as many as a short tour can take."""
+    flight, order = problem.flight, one_by_one(problem.with_settings(flight_length=None))
+    flown = [short_tour(problem, order[:count]) for count in range(1, len(order) + 1)]
+    return max((way for way in flown if flight.share(flight.metres(way), len(way)) <= 1), key=len)
+
+
+def short_tour(problem: Problem, views: Sequence[int]) -> list[int]:
+    """The views in the order of a short tour from the first one and back."""
+    home, *stops = views
+    return [home, *tour.flying_order(problem.flight.legs, home, stops, home)]
+
+
+def evenly_spaced(problem: Problem, count: int) -> list[int]:
+    """So many views, each the farthest in direction from those before, in a short tour."""
+    chosen = list(problem.seeds)
+    while len(chosen) < count:
+        left = [i for i in range(len(problem.frames)) if i not in chosen]
+        views = problem.positions[left], problem.positions[chosen]
+        apart = smallest_angle(*views, problem.centre, np.random.default_rng(0))
+        chosen.append(left[int(apart.argmax())])
+    return short_tour(problem, chosen)
+
+
+FLIERS: Mapping[str, tuple[Flier, dict[str, Any]]] = {
+    OURS: (lambda problem: [*problem.seeds, *planned_flight(problem, problem.seeds)], {}),
+    "score / (1 + metres)": (one_by_one, {"travel": 1.0}),
+    "five nearest": (one_by_one, {"nearest": 5}),
+    "no limit, cut": (cut, {}),
+}
+"""How the views of a flight are chosen by `directional-d`, and settings of `mgs nbv`."""
+
+
+def cells_of(size: SetupSize, rocks: Iterable[Rock]) -> list[Cell]:
+    """A cell for each rock and pool, with its dataset and prior."""
+    cells: dict[str, Cell] = {}
+    for rock in rocks:
+        for name, setup in POOLS.items():
+            case = case_of(rock, setup, size)
+            count = "" if size.gaussians is None else f"-{size.gaussians}"
+            folder = f"{name.replace(' ', '-')}-{size.width}x{size.height}{count}"
+            frames = setup.frames // size.fewer
+            made = case.with_task(
+                f"flights/{rock.name}/{folder}", f"{__name__}:fly_and_judge", frames=frames
+            )
+            cells |= {cell.name: cell for cell in made}
+    return list(cells.values())
+
+
+def fly_and_judge(root: Path, out: Path, dataset: str, prior: str, frames: int) -> dict[str, Any]:
+    """Task: fly every policy with every length, and judge a fit to each flight's images.
+
+    Returns "flights": "policy", "length" (None for even spacing), "images", "metres", "psnr" and
+    "psnr_mask" over the test views, dB, and "taken".
+    """
+    folders = root / dataset, root / prior, root / dataset
+    problem, tests, _, _ = shared_problem(*folders, None, 1, frames - 1)
+    problem = problem.with_settings(policy="directional-d")
+    everywhere = [*problem.seeds, *problem.reachable(problem.seeds)]
+    whole = problem.flight.metres(short_tour(problem, everywhere))
+
+    @cache
+    def judged(views: tuple[int, ...]) -> dict[str, float]:
+        on = tests(fit_views(problem, list(views)).gaussians)
+        return {key: float(on[key].mean()) for key in ("psnr", "psnr_mask")}
+
+    def flight(policy: str, length: float | None, taken: list[int]) -> Row:
+        row: Row = {"policy": policy, "length": length, "images": len(taken)}
+        row |= {"metres": problem.flight.metres(taken), **judged(tuple(sorted(taken)))}
+        return row | {"taken": [int(i) for i in taken]}
+
+    flights = [flight(EVEN, None, evenly_spaced(problem, n)) for n in EVEN_IMAGES if n <= frames]
+    for policy, (fly, settings) in FLIERS.items():
+        for length in LENGTHS:
+            limited = problem.with_settings(flight_length=length * whole, **settings)
+            flights.append(flight(policy, length, fly(limited)))
+    return {"whole": whole, "flights": flights}
+
+
+def rows_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> list[Row]:
+    """A row for each flight, with "gain": dB over even spacing with the same metres, and "ratio":
+    metres over those with which even spacing has the same PSNR, both interpolated between the
+    shortest and the longest of even spacing."""
+    scenes = {rock.name: rock.scene for rock in rocks}
+    rows: list[Row] = []
+    for cell in (cell for cell in cells if cell.name.startswith("flights/")):
+        _, rock, where = cell.name.split("/")
+        pool = next(name for name in POOLS if where.startswith(name.replace(" ", "-") + "-"))
+        about = {"rock": rock, "scene": scenes[rock], "pool": pool}
+        flights = results[cell.name]["flights"]
+        even = sorted((one["metres"], one["psnr"]) for one in flights if one["policy"] == EVEN)
+        metres, psnr = np.array(even).T
+        psnr = np.maximum.accumulate(psnr)
+        for one in flights:
+            row = about | {key: value for key, value in one.items() if key != "taken"}
+            if one["policy"] != EVEN:
+                row["gain"] = one["psnr"] - float(np.interp(one["metres"], metres, psnr))
+                row["ratio"] = one["metres"] / float(np.interp(one["psnr"], psnr, metres))
+            rows.append(row)
+    return rows
+
+
+def by_scene(rows: Sequence[Row]) -> list[Row]:
+    """Means over the rocks of a scene, for each pool, policy and length."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    keys = ("scene", "pool", "policy", "length")
+    for row in rows:
+        if row["length"] is not None:
+            groups.setdefault(tuple(row[key] for key in keys), []).append(row)
+    numbers = ("images", "metres", "psnr", "psnr_mask", "gain", "ratio")
+    return [
+        dict(zip(keys, group, strict=True))
+        | {key: float(np.mean([row[key] for row in found])) for key in numbers}
+        for group, found in groups.items()
+    ]
+
+
+def text_of(rows: Sequence[Row]) -> str:
+    """A line for each pool, length and policy: means over scenes with 95 % intervals."""
+    groups: dict[tuple[str, float, str], list[Row]] = {}
+    for row in by_scene(rows):
+        groups.setdefault((row["pool"], row["length"], row["policy"]), []).append(row)
+
+    def mean(key: str, form: str) -> Callable[[Row], str]:
+        def cell(line: Row) -> str:
+            values = [row[key] for row in line["of"]]
+            ends = interval(values)
+            middle = format(float(np.mean(values)), form)
+            return middle if ends is None else f"{middle} [{ends[0]:{form}}, {ends[1]:{form}}]"
+
+        return cell
+
+    columns: dict[str, Content] = {
+        "candidates": "pool",
+        "length": "length:.0%",
+        "policy": "policy",
+        "images": lambda line: f"{np.mean([row['images'] for row in line['of']]):.1f}",
+        "PSNR (dB)": lambda line: f"{np.mean([row['psnr'] for row in line['of']]):.2f}",
+        "over even spacing (dB)": mean("gain", "+.2f"),
+        "metres / even spacing's": mean("ratio", ".2f"),
+    }
+    lines = [
+        {"pool": pool, "length": length, "policy": policy, "of": groups[pool, length, policy]}
+        for pool, length, policy in sorted(groups, key=lambda one: (one[0], one[1]))
+    ]
+    return table(columns, lines)
+
+
+def draw(path: Path, rows: Sequence[Row]) -> None:
+    """Draw the metres over those of even spacing against the length, means over scenes."""
+    shown = [row | {"percent": 100 * row["length"]} for row in by_scene(rows)]
+    labels = "length / that through all candidates (%)", "metres / even spacing's, equal PSNR"
+    panels = [
+        Panel("percent", "ratio", *labels, "policy", only=(("pool", pool),), title=pool)
+        for pool in POOLS
+    ]
+    draw_panels(path, panels, shown)
