@@ -166,7 +166,10 @@ OPTIONS: dict[str, list[tuple[str, str]]] = {
         ("--policy best", "--policy best: unknown; choose one of"),
         ("--policy uniform", "--policy uniform: is compared anyway"),
         ("--policy angle --policy angle", "angle: there is one of this name already"),
-        ("--policy block-d --only table1", "is for setups, survey, oracle, of which --only names none"),
+        (
+            "--policy block-d --only table1",
+            "is for setups, survey, oracle, of which --only",
+        ),
         ("--policy none.py:f", "none.py"),
         ("--mesh none.glb", "none.glb: cannot be read (No such file or directory)"),
         ("--mesh a.glb --only table1", "is for results over many rocks, and --only leaves them"),
