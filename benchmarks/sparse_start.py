@@ -25,8 +25,9 @@ MODELS = {
     "frozen, mesh": {},
     "free, mesh": {"means": "free"},
     "free, random points": {"means": "free"},
-    "free with relocation, random points": {"means": "free", "train": {"density": "relocate"}},
+    "free with relocation, random points": {"means": "free", "density": "relocate"},
 }
+"""Settings of the fits by name."""
 
 
 def main(out: Path, rocks: int) -> None:
@@ -38,7 +39,7 @@ def main(out: Path, rocks: int) -> None:
         data, mesh = mgs.load_dataset(out / case.dataset), mgs.load_prior(out / case.prior)
         count = len(mesh.points) + mesh.backed
         points = mgs.build_prior(data, source="random", gaussians=count)
-        for model, settings in MODELS.items():
+        for model, train in MODELS.items():
             for budget in (0, 8):
                 run = (
                     out
@@ -47,7 +48,12 @@ def main(out: Path, rocks: int) -> None:
                 )
                 if not (run / "metrics.json").is_file():
                     prior = points if "points" in model else mesh
-                    given = {"prior": prior, "policy": "d-optimal", "budget": budget, **settings}
+                    given = {
+                        "prior": prior,
+                        "policy": "d-optimal",
+                        "budget": budget,
+                        "train": train,
+                    }
                     mgs.evaluate(mgs.run_nbv(data, run, **given))
                 test = read_json(run / "metrics.json")["test"]
                 numbers = [test["psnr"], test["psnr_mask"]]
