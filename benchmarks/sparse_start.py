@@ -25,7 +25,6 @@ MODELS = {
     "frozen, mesh": {},
     "free, mesh": {"means": "free"},
     "free, random points": {"means": "free"},
-    "free with relocation, random points": {"means": "free", "density": "relocate"},
 }
 """Settings of the fits by name."""
 
