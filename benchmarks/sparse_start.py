@@ -2,7 +2,7 @@
 
 `python benchmarks/sparse_start.py OUT` fits the hemispheres of `mgs reproduce --only setups`: to 4
 images, and 8 more chosen by `d-optimal`. Frozen and free means from the mesh; free means from as
-many random points in the box of the cameras' common view, without and with relocation.
+many random points in the box that the cameras see.
 """
 
 import sys
