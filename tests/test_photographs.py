@@ -459,7 +459,7 @@ def test_poses_alone_are_fitted_from_random_points(data, tmp_path, capfd):
     command(*fitted)
     settings = read_json(tmp_path / "run/config.json")["settings"]
     assert (settings["seeds"], settings["budget"], settings["train"]["means"]) == (10, 0, "free")
-    assert settings["sh"] == 1
+    assert (settings["sh"], settings["train"]["decay"]) == (0, 0.02)
     frames = load_dataset(tmp_path / "d").frames
     start, seen = initial_gaussians(load_prior(tmp_path / "d/prior"), frames)
     assert seen.mean() > 0.9

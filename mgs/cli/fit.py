@@ -46,10 +46,10 @@ def fit(
 ) -> None:
     """Fit a model to all images of a dataset, and measure it.
 
-    By default means are free and colours have SH degree 1 if the prior comes from photographs
-    (points, masks or random). Means are frozen and colours have degree 0 if it comes from depth or
-    a mesh. Test views are never fitted. The output is a run folder like that of `mgs nbv`, so all
-    commands for runs accept it.
+    By default means are free if the prior comes from photographs (points, masks or random), and
+    colours have SH degree 1 if it comes from points or masks. Otherwise means are frozen and
+    colours have degree 0. Test views are never fitted. The output is a run folder like that of
+    `mgs nbv`, so all commands for runs accept it.
     """
     from rich.console import Console
 

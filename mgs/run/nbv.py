@@ -46,8 +46,12 @@ CAPTURE_TEST_VIEWS = 12
 FREE_PASSES = 30
 """Passes of a fit of free means to all images. A chosen constant."""
 
-FREE_SH = 1
-"""`NbvSettings.sh` of such a fit. A chosen constant (docs/fit.md)."""
+FREE_DECAY = 0.02
+"""`TrainSettings.decay` of such a fit: its last passes average over the images. A chosen constant
+(docs/fit.md)."""
+
+FREE_SH = {"points": 1, "hull": 1, "random": 0}
+"""`NbvSettings.sh` of such a fit by the source of its prior. Chosen constants (docs/fit.md)."""
 
 LOOSE = {"points": 4.0, "hull": 4.0, "random": 40.0}
 """Sources of a prior less sure than the images -> factor on its standard deviations in a fit
@@ -168,8 +172,8 @@ def start_fit(
     """`start_run` of a run that takes all images at once and chooses none.
 
     By default means are free where the prior comes from photographs (`LOOSE`), with FREE_PASSES
-    passes, colours of degree FREE_SH and a looser prior, else frozen. Arguments and errors as
-    `start_run`.
+    passes, FREE_DECAY, colours of degree FREE_SH and a looser prior, else frozen. Arguments and
+    errors as `start_run`.
     """
     root = Path(dataset)
     loaded, train = load_dataset(root), dict(settings.pop("train", {}))
@@ -180,8 +184,8 @@ def start_fit(
     loose = 1.0
     if train["means"] == "free" and source in LOOSE:
         loose = LOOSE[source]
-        train.setdefault("passes", FREE_PASSES)
-        settings.setdefault("sh", FREE_SH)
+        train = {"passes": FREE_PASSES, "decay": FREE_DECAY} | train
+        settings.setdefault("sh", FREE_SH[source])
     every = {"seeds": len(loaded), "budget": 0, "train": train, "loose": loose}
     return start_run(
         root, out, prior=prior, gaussians=gaussians, progress=progress, **settings | every
