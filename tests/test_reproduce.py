@@ -115,8 +115,11 @@ def test_metres_are_compared_at_the_same_psnr():
     even = [(10, 20), (20, 24), (30, 23.5), (40, 28)]
     flown = [{"policy": flights.EVEN, "length": None, "metres": m, "psnr": p} for m, p in even]
     flown += [{"policy": "mine", "length": 0.5, "metres": 15, "psnr": 26}]
-    found = flights.rows_of({cell.name: {"flights": flown}}, [cell], [Rock("boulder", 11)])[-1]
+    flown += [{"policy": "mine", "length": 0.2, "metres": 12, "psnr": 19}]
+    rocks = [Rock("boulder", 11)]
+    *_, found, low = flights.rows_of({cell.name: {"flights": flown}}, [cell], rocks)
     assert (found["ratio"], found["gain"]) == (pytest.approx(15 / 35), pytest.approx(4))
+    assert (low["ratio"], low["gain"]) == (None, pytest.approx(-1.8))
 
 
 def test_a_survey_without_errors_changes_nothing(quick, tmp_path, capsys, monkeypatch):

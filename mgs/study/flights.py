@@ -131,8 +131,8 @@ def fly_and_judge(root: Path, out: Path, dataset: str, prior: str, frames: int) 
 
 def rows_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> list[Row]:
     """A row for each flight, with "gain": dB over even spacing with the same metres, and "ratio":
-    metres over those with which even spacing has the same PSNR, both interpolated between the
-    shortest and the longest of even spacing."""
+    metres over those with which even spacing has the same PSNR, both interpolated. The ratio is
+    None where the PSNR is below that of the shortest flight with even spacing."""
     scenes = {rock.name: rock.scene for rock in rocks}
     rows: list[Row] = []
     for cell in (cell for cell in cells if cell.name.startswith("flights/")):
@@ -147,13 +147,14 @@ def rows_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> lis
             row = about | {key: value for key, value in one.items() if key != "taken"}
             if one["policy"] != EVEN:
                 row["gain"] = one["psnr"] - float(np.interp(one["metres"], metres, psnr))
-                row["ratio"] = one["metres"] / float(np.interp(one["psnr"], psnr, metres))
+                same = float(np.interp(one["psnr"], psnr, metres))
+                row["ratio"] = one["metres"] / same if one["psnr"] >= psnr[0] else None
             rows.append(row)
     return rows
 
 
 def by_scene(rows: Sequence[Row]) -> list[Row]:
-    """Means over the rocks of a scene, for each pool, policy and length."""
+    """Means over the rocks of a scene, for each pool, policy and length; NaN for a missing one."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     keys = ("scene", "pool", "policy", "length")
     for row in rows:
@@ -162,7 +163,7 @@ def by_scene(rows: Sequence[Row]) -> list[Row]:
     numbers = ("images", "metres", "psnr", "psnr_mask", "gain", "ratio")
     return [
         dict(zip(keys, group, strict=True))
-        | {key: float(np.mean([row[key] for row in found])) for key in numbers}
+        | {key: float(np.mean(np.array([row[key] for row in found], float))) for key in numbers}
         for group, found in groups.items()
     ]
 
@@ -176,6 +177,8 @@ def text_of(rows: Sequence[Row]) -> str:
     def mean(key: str, form: str) -> Callable[[Row], str]:
         def cell(line: Row) -> str:
             values = [row[key] for row in line["of"]]
+            if np.isnan(values).any():
+                return "–"
             ends = interval(values)
             middle = format(float(np.mean(values)), form)
             return middle if ends is None else f"{middle} [{ends[0]:{form}}, {ends[1]:{form}}]"
@@ -201,9 +204,9 @@ def text_of(rows: Sequence[Row]) -> str:
 def draw(path: Path, rows: Sequence[Row]) -> None:
     """Draw the metres over those of even spacing against the length, means over scenes."""
     shown = [row | {"percent": 100 * row["length"]} for row in by_scene(rows)]
-    labels = "length / that through all candidates (%)", "metres / even spacing's, equal PSNR"
+    labels = "flight / whole tour (%)", "metres / even spacing's"
     panels = [
         Panel("percent", "ratio", *labels, "policy", only=(("pool", pool),), title=pool)
         for pool in POOLS
     ]
-    draw_panels(path, panels, shown)
+    draw_panels(path, panels, shown, "Metres of a flight over even spacing's with the same PSNR")
