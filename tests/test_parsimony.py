@@ -96,7 +96,7 @@ def test_a_given_mesh_takes_its_number_from_the_pixels_too(data, tmp_path, capsy
     synthetic.rock_mesh().export(tmp_path / "rock.ply")
     command("prior", data.root, "--out", tmp_path / "p", "--mesh", tmp_path / "rock.ply")
     assert "resolution" in json.loads((tmp_path / "p/prior.json").read_text())
-    with pytest.raises(InputError, match="a density counts by the voxels of a cloud"):
+    with pytest.raises(InputError, match="a density is relative to the voxels of a cloud"):
         prior_from_mesh(tmp_path / "rock.ply", PriorSettings(density=0.5))
 
 

@@ -219,7 +219,7 @@ def test_a_dark_rock_does_not_blow_out_the_ground(tmp_path):
     dataset = synthesise(tmp_path / "dark", scene, TINY, seed=3, say=notes.append)
     clipped = [(frame.rgb().max(-1) >= 1)[frame.depth() > 0].mean() for frame in dataset.frames]
     assert 0.05 < np.mean(clipped) < 0.25
-    assert "lower than a rock so dark asks for: about 20% of rock and ground clips" in notes[0]
+    assert "lower than so dark a rock needs, so that about 20% of rock and ground clips" in notes[0]
     assert len(notes) == 1
 
 
