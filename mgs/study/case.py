@@ -105,7 +105,7 @@ class Case:
         return [*cells, Cell(self.prior_name, f"{__name__}:make_prior", arguments, needs)]
 
     def surveyed(self, seed: int) -> tuple[Case, list[Cell]]:
-        """The case of a survey of this dataset, and the cells of its dataset, survey and prior."""
+        """Case of a survey of this dataset, and the cells of the dataset, survey and prior."""
         label = f"{self.name}-survey"
         task, arguments = f"{__name__}:make_survey", {"dataset": self.dataset, "seed": seed}
         first = self.cells()[:-1]

@@ -22,8 +22,8 @@ def oracle(
     tell: Callable[[Problem, Fitted, list[int], list[float]], None] = lambda *tried: None,
 ) -> Chooser:
     """Chooser that fits to every candidate in reach; its score is the mean PSNR over the test
-    views, dB. Of equals it takes the first. tell: called with the problem, the state, the
-    candidates and their scores."""
+    views, dB. Of equals it takes the first. tell: callback at each choice, with the
+    problem, the state, the candidates and their scores."""
     measure = psnr_measure(tests, ListCache())
 
     def choose(problem: Problem, state: Fitted, fisher: Any = None) -> tuple[int, float]:
@@ -40,10 +40,11 @@ def oracle(
 def foretold(
     policies: Sequence[str], problem: Problem, state: Fitted, left: list[int], psnr: Sequence[float]
 ) -> dict[str, dict[str, float]]:
-    """How well the scores of policies foretell the PSNR [C] after the fit to each candidate.
+    """Compare the scores of policies with the PSNR after the fit to each candidate.
 
-    Returns for each policy "spearman", the rank correlation (0 if all scores are equal), and
-    "regret", dB: the PSNR of the best candidate less that of the candidate of best score.
+    left: candidates [C]; psnr: their mean PSNR over the test views [C], dB. Returns for each policy
+    "spearman", the rank correlation (0 if all scores are equal), and "regret", dB: the PSNR of the
+    best candidate less that of the candidate with the best score.
     """
     from scipy.stats import spearmanr
 

@@ -109,7 +109,7 @@ SETUPS = {
 """The ring is the paper's; in the others the choice matters more."""
 
 SURVEYED = {"surveyed ring": Setup(RING, 48, survey=True)}
-"""Set-ups apart, as a robot measures: their poses and priors are wrong."""
+"""Set-ups with the estimated poses, measured depth and prior of `mgs survey`."""
 
 
 @dataclass(frozen=True)
@@ -294,7 +294,7 @@ def rows_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> lis
 
 
 def foretold_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> list[Row]:
-    """A row for each rock and set-up that the oracle was tried on, and each of SCORED: FORETOLD."""
+    """Rows with FORETOLD for each rock and set-up of the oracle, and each of SCORED."""
     scenes = {rock.name: rock.scene for rock in rocks}
     rows: list[Row] = []
     for cell in cells:
