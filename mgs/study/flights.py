@@ -58,13 +58,13 @@ def cut(problem: Problem) -> list[int]:
 
 
 def short_tour(problem: Problem, views: Sequence[int]) -> list[int]:
-    """The views in the order of a short tour from the first one and back."""
+    """Order the views along a short tour from the first one and back."""
     home, *stops = views
     return [home, *tour.flying_order(problem.flight.legs, home, stops, home)]
 
 
 def evenly_spaced(problem: Problem, count: int) -> list[int]:
-    """So many views, each the farthest in direction from those before, in a short tour."""
+    """Short tour through `count` views, each the farthest in direction from those before."""
     chosen = list(problem.seeds)
     while len(chosen) < count:
         left = [i for i in range(len(problem.frames)) if i not in chosen]
@@ -80,7 +80,7 @@ FLIERS: Mapping[str, tuple[Flier, dict[str, Any]]] = {
     "five nearest": (one_by_one, {"nearest": 5}),
     "no limit, cut": (cut, {}),
 }
-"""How the views of a flight are chosen by `directional-d`, and settings of `mgs nbv`."""
+"""Fliers by name, all with `directional-d`, and their settings of `mgs nbv`."""
 
 
 def cells_of(size: SetupSize, rocks: Iterable[Rock]) -> list[Cell]:
