@@ -110,6 +110,8 @@ OPTIONS: dict[str, list[tuple[str, str]]] = {
         ("--scene nowhere/x.toml", "x.toml"),
         ("--scale huge", "scale 'huge': unknown; choose one of quick, paper"),
         ("--orbit figure-eight", "--orbit 'figure-eight': unknown"),
+        ("--distances 1,0", "--distances '1,0': expected positive numbers"),
+        ("--distances 1,far", "--distances '1,far': expected positive numbers"),
         ("--size 320", "expected WIDTHxHEIGHT"),
         ("--size 0x12", "--size"),
         ("--size 99999999x99999999", "--size"),

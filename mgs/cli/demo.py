@@ -27,7 +27,11 @@ if TYPE_CHECKING:
     from mgs.run.folder import Run
     from mgs.run.state import State
 
-POLICIES = ("directional-d", "d-optimal", "paper", "uniform", "random")
+POLICIES = ("directional-d", "paper", "d-optimal", "cover", "random")
+
+ORBIT, DISTANCES = "hemisphere", "1,2,3"
+"""Poses of the frames. On a ring at one distance all policies but random choose almost equally
+well."""
 
 GAUSSIANS = 10_000
 """About one Gaussian per pixel of the rock at 320x240."""
@@ -66,7 +70,8 @@ def demo(
 
     heading(f"1/5 a photoreal orbit: 32 frames with depth and masks, and {TEST_VIEWS} test views")
     if not (dataset / "transforms.json").is_file():
-        synth_orbit(dataset, seed=seed, test_views=TEST_VIEWS)
+        views: dict[str, Any] = {"orbit": ORBIT, "distances": DISTANCES, "test_views": TEST_VIEWS}
+        synth_orbit(dataset, seed=seed, **views)
     heading(f"2/5 the prior: {GAUSSIANS:,} Gaussians on the rock's mesh")
     if not (folder / "prior.json").is_file():
         prior(dataset, out=folder, gaussians=str(GAUSSIANS), seed=seed)

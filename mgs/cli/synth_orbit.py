@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from functools import partial
@@ -32,6 +33,13 @@ def synth_orbit(
     ] = "boulder",
     orbit: Annotated[
         str | None, option("circle, rings, spiral or hemisphere. Default: the scene's.")
+    ] = None,
+    distances: Annotated[
+        str | None,
+        option(
+            "Factors on the distance of the frames from the rock, in turn, as in 1,2,3. "
+            "Default: the scene's."
+        ),
     ] = None,
     mesh: Annotated[
         Path | None, option("A real rock: textured GLB, OBJ or PLY, scaled to the scene.")
@@ -89,11 +97,11 @@ def synth_orbit(
     from mgs.synth.rendering import PRESETS, synthesise
 
     settings = load_scene_file(scene)
-    if orbit is not None:
-        if orbit not in ORBITS:
-            raise InputError(f"--orbit {orbit!r}: unknown; choose one of {', '.join(ORBITS)}")
-        chosen = settings.orbit.model_copy(update={"kind": orbit})
-        settings = settings.model_copy(update={"orbit": chosen})
+    if orbit is not None and orbit not in ORBITS:
+        raise InputError(f"--orbit {orbit!r}: unknown; choose one of {', '.join(ORBITS)}")
+    changes = {"kind": orbit, "distances": distances and _parse_distances(distances)}
+    chosen = settings.orbit.model_copy(update={k: v for k, v in changes.items() if v})
+    settings = settings.model_copy(update={"orbit": chosen})
     if mesh_up is not None and mesh is None:
         raise InputError("--mesh-up: says how a mesh stands, but there is none; give --mesh too")
     given = {"spp": spp, "frames": frames, **_parse_size(size)}
@@ -122,6 +130,17 @@ def synth_orbit(
         )
     look = "" if on_demand and not test_views else f"; look at {out / 'contact_sheet.png'}"
     console.print(f"{out}: {views}{look}")
+
+
+def _parse_distances(text: str) -> tuple[float, ...]:
+    """Factors of an option like 1,2,3. Raises InputError if one is no positive number."""
+    try:
+        factors = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        factors = (0.0,)
+    if not all(0 < factor < math.inf for factor in factors):
+        raise InputError(f"--distances {text!r}: expected positive numbers, as in 1,2,3")
+    return factors
 
 
 def _parse_size(size: str | None) -> dict[str, int]:

@@ -310,4 +310,5 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
         Panel(*axes, "learned parameters", label, "choice", True, (("run", scene),), scene)
         for scene in dict.fromkeys(row["run"] for row in rows)
     ]
-    draw_panels(path, panels, rows)
+    title = "The automatic choice of parameters (star) beside fixed ones"
+    draw_panels(path, panels, rows, title)
