@@ -34,6 +34,7 @@ def test_cold_renders_a_new_view_in_each_call(monkeypatch):
         assert other.position[2] == pytest.approx(camera.position[2])
 
 
+@pytest.mark.slow
 def test_times_every_operation_and_writes_json(monkeypatch, capsys, tmp_path):
     json = tmp_path / "a b.json"
     arguments = ["bench", "--gaussians", "1000", "--repeats", "3", "--json", str(json)]

@@ -64,6 +64,7 @@ def test_phi_is_the_objective_of_the_run(case):
     assert found == pytest.approx(goal.phi(as_drjit(model)), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_converged_is_said_at_the_minimum_alone(case):
     """With a prior so strong that the objective is almost quadratic, the minimum is found; a step
     away from it, it is not."""

@@ -152,6 +152,7 @@ def runs(rock: Path, varied: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     return made
 
 
+@pytest.mark.slow
 def test_a_run_finds_the_gains_of_its_images(runs, varied):
     state, out = runs["with"]
     dataset = load_dataset(varied)
@@ -167,6 +168,7 @@ def test_a_run_finds_the_gains_of_its_images(runs, varied):
     assert not any("exposure" in line for line in runs["without"][0].steps)
 
 
+@pytest.mark.slow
 def test_a_fit_with_gains_is_nearly_as_good_as_one_of_constant_exposure_and_without_it_is_worse(
     runs,
 ):

@@ -145,6 +145,7 @@ def test_every_need_of_a_cell_is_a_cell():
         assert all(json.loads(json.dumps(cell.arguments)) == cell.arguments for cell in cells)
 
 
+@pytest.mark.slow
 def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, monkeypatch):
     calls = []
 

@@ -173,6 +173,7 @@ def test_what_no_image_sees_is_not_learned(tmp_path):
     assert not any(mask[hidden].any() for mask in found.learned.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shine", "degree"), [(0.0, 0), (0.3, 1)])
 def test_colours_have_a_degree_where_the_truth_has_one(tmp_path, shine, degree):
     start = model()

@@ -162,6 +162,7 @@ def test_a_rock_of_one_colour_keeps_it():
     np.testing.assert_allclose(continued(expected, coverage), everywhere, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_specular_rock_shines_where_it_mirrors_the_sun_and_nowhere_else():
     """A ball's highlight lies where its normal halves the angle between sun and camera."""
     camera = Camera(K, 64, 48, look_at([3, 0, 1.5], [0, 0, 0.6]))

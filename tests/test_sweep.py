@@ -153,6 +153,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_two_workers_that_are_killed_find_silently_what_a_serial_run_finds(tmp_path):
     import synthetic
 

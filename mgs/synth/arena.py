@@ -45,6 +45,8 @@ def make_ground(
     # Fine detail fades out as the grid gets coarser, and dunes replace it.
     swell = settings.undulation * noise.fractal(p, 2.5, 4, 0.45) * np.exp(-far / 12)
     swell += (0.3 + 10 * settings.undulation) * noise.octave(p, 40) * np.clip(far / 50 - 0.2, 0, 1)
+    # Hills at the edge hide the sky below its horizon, which is black.
+    swell += 5 * np.clip(far / 200 - 1, 0, 1) ** 2
     ripples = 0.006 * noise.fractal(p, 0.3, 2, 0.6) * (far < 7)
     apron = 0.05 * np.exp(-(((far - radius) / (0.35 * radius)) ** 2))
     vertices = np.stack([x, y, swell + ripples + apron], -1).reshape(-1, 3)
