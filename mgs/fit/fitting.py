@@ -94,7 +94,7 @@ def _step(
     t: UInt32, step number from 1.
     """
     copy = with_gradients(model, prior)
-    error = (view.rendered(copy).array - view.pixels) * view.weights
+    error = view.pixels.residual(view.rendered(copy).array)
     loss = dr.mean(dr.square(error))
     dr.backward(0.5 * dr.sum(dr.square(error)))
     step, moved, kept = mi.Float(t), {}, []
