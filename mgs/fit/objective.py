@@ -12,6 +12,9 @@ with lam = (sigma / tau)^2 (`mgs.policy.criteria.regularisation`). Its curvature
 with the Jacobian J of all images: the matrix whose diagonal the criteria use. With lam = 0 it is
 maximum likelihood, the paper's Eq. 2 up to a constant.
 
+Another loss (`mgs.fit.losses`) can take the place of the squared differences. Curvature and
+`Objective.gradient` are always of squared ones.
+
 Alpha may be a fourth channel with noise sigma_alpha. Its squared differences then count
 alpha_weight = (sigma / sigma_alpha)^2 times. The criteria ignore alpha.
 
@@ -34,7 +37,8 @@ import mitsuba as mi
 import numpy as np
 
 from mgs.camera import Camera
-from mgs.errors import InputError
+from mgs.errors import InputError, row_named
+from mgs.fit.losses import LOSSES
 from mgs.gaussians import Gaussians, learned
 from mgs.memory import IMAGE_BYTES, Deferred, kept_within, padded
 from mgs.splat import ListCache, as_drjit, fisher, groups
@@ -140,22 +144,25 @@ class Objective:
     """Phi for some images (see the module). Models are Gaussians with TensorXf fields.
 
     photos: beyond IMAGE_BYTES, they are made from their targets at every use.
+    error: a name in LOSSES.
     """
 
     photos: Sequence[Photo]
     prior: ParameterPrior
     cache: ListCache
     alpha_weight: float = 0.0
+    error: str = "squared"
 
     def loss(self, model: Gaussians) -> float:
-        """2 Phi over the number of pixel values: mean squared error plus the prior's part."""
+        """2 Phi over the number of pixel values: mean loss plus the prior's part."""
         penalty = sum(
             weighted_squares(lam * self.prior.share, d.array) for d, lam in self.offsets(model)
         )
         errors = []
         for photo in self.photos:
-            difference = (_rendered(model, photo, self.cache) - photo.pixels) * photo.weights
-            errors.append(dr.mean(dr.square(difference)) + penalty / len(photo.pixels))
+            drawn = _rendered(model, photo, self.cache)
+            values = LOSSES[self.error](drawn, photo.pixels, photo.weights, photo.size)
+            errors.append(dr.mean(values) + penalty / len(photo.pixels))
             dr.eval(errors[-1])  # frees the rendered image
         return float(np.mean([float(error[0]) for error in errors]))
 
@@ -247,14 +254,16 @@ def objective(
     means: str = "frozen",
     normals: np.ndarray | None = None,
     alpha_weight: float = 0.0,
+    error: str = "squared",
 ) -> Objective:
     """The objective of `mgs.fit.fitting.fit`, from the same arguments and settings.
 
-    Raises InputError if the start or the normals do not fit the Gaussians, or `means` is not a name
-    in `mgs.splat.MEANS`. A target without alpha, where alpha has a weight, raises it when it is
-    read.
+    error: a name in LOSSES. Raises InputError if it is unknown, the start or the normals do not fit
+    the Gaussians, or `means` is not a name in `mgs.splat.MEANS`. A target without alpha, where
+    alpha has a weight, raises it when it is read.
     """
     groups(gaussians.sh_degree, means)  # raises if the name is unknown
+    row_named(LOSSES, error, "loss")
     unit = unit_normals(len(gaussians), normals) if means == "normal" else None
     if len(cameras) != len(targets):
         raise ValueError(f"there are {len(cameras)} cameras, but {len(targets)} targets")
@@ -281,7 +290,7 @@ def objective(
     directions = None if unit is None else mi.TensorXf(padded(unit))
     share = dr.opaque(mi.Float, 1 / max(len(photos), 1))
     prior = ParameterPrior(start, values, share, directions)
-    return Objective(photos, prior, cache or ListCache(), alpha_weight)
+    return Objective(photos, prior, cache or ListCache(), alpha_weight, error)
 
 
 def weighted_squares(lam: Any, offsets: Any) -> Any:
