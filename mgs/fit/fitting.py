@@ -17,6 +17,7 @@ from mgs.camera import Camera
 from mgs.colour import SH_C0
 from mgs.errors import InputError, row_named
 from mgs.fit.density import DENSITIES, DENSITY_PASSES, DENSITY_UNTIL, controlled
+from mgs.fit.losses import LOSSES
 from mgs.fit.objective import (
     Objective,
     ParameterPrior,
@@ -37,7 +38,7 @@ from mgs.splat.recording import frozen
 
 @dataclass(frozen=True)
 class Fit:
-    """Result of a fit. A loss is 2 Phi over the number of pixel values.
+    """Result of a fit. A loss is 2 Phi over the number of pixel values (`Objective.loss`).
 
     gaussians: model (NumPy fields) at the end of the pass with the lowest loss; the given model, if
         no pass had a finite loss.
@@ -70,8 +71,9 @@ def _in_bounds(model: Gaussians) -> Gaussians:
 
 
 @frozen(
-    lambda optimiser, model, prior, view, *others: (
+    lambda optimiser, error, model, prior, view, *others: (
         optimiser,
+        error,
         prior.means,
         *model.sh.shape,
         *view.recorded_sizes,
@@ -79,6 +81,7 @@ def _in_bounds(model: Gaussians) -> Gaussians:
 )
 def _step(
     optimiser: str,
+    error: str,
     model: Gaussians,
     prior: ParameterPrior,
     view: View,
@@ -90,20 +93,22 @@ def _step(
     """One optimiser step on one image and its share of the prior. Returns the model, the buffers
     and the loss before the step.
 
+    optimiser, error: names in OPTIMISERS and LOSSES.
     buffers, rates, information: for each learned array (`mgs.fit.optimisers.Optimiser`).
     t: UInt32, step number from 1.
     """
     copy = with_gradients(model, prior)
-    error = view.pixels.residual(view.rendered(copy).array)
-    loss = dr.mean(dr.square(error))
-    dr.backward(0.5 * dr.sum(dr.square(error)))
+    drawn = view.rendered(copy).array
+    values = LOSSES[error](drawn, view.target.pixels, view.target.weights, view.size)
+    loss = dr.mean(dr.detach(values))
+    dr.backward(0.5 * dr.sum(values))
     step, moved, kept = mi.Float(t), {}, []
     for name, buffer, rate, known in zip(prior.lam, buffers, rates, information, strict=True):
         value, slope = dr.detach(getattr(copy, name)), dr.grad(getattr(copy, name))
         offset = prior.along(name, value - getattr(prior.start, name))
         pull = prior.lam[name] * prior.share
         gradient = prior.along(name, slope) + mi.TensorXf(pull * offset.array, offset.shape)
-        loss += weighted_squares(pull, offset.array) / len(view.pixels)
+        loss += weighted_squares(pull, offset.array) / len(view.target)
         along_normal = offset.shape != value.shape
         found, after = OPTIMISERS[optimiser].step(
             offset if along_normal else value, gradient, known, buffer, rate, step
@@ -141,8 +146,9 @@ def fit(
         [N,1] or, for colours, [N,K,1]). The others keep their values, except colours below
         COLOUR_MIN. Default: all learn.
 
-    Raises InputError if a parameter is not finite, the optimiser is unknown, `start` has another
-    shape, means are to move without normals or without a rate, or a required alpha is missing.
+    Raises InputError if a parameter is not finite, optimiser or loss are unknown, `start` has
+    another shape, means are to move without normals or without a rate, or a required alpha is
+    missing.
     """
     settings = settings or TrainSettings()
     optimiser = row_named(OPTIMISERS, settings.optimiser, "optimiser")
@@ -154,8 +160,8 @@ def fit(
         raise InputError(
             f"train.rates: has no rate of {missing[0]}, which is learned; give one, metres"
         )
-    model, means, weight = as_drjit(gaussians), settings.means, settings.alpha_weight
-    goal = objective(gaussians, cameras, targets, start, lam, cache, means, normals, weight)
+    model, how = as_drjit(gaussians), (settings.means, normals, settings.alpha_weight)
+    goal = objective(gaussians, cameras, targets, start, lam, cache, *how, settings.loss)
     shapes = [offset.shape for offset, _ in goal.offsets(model)]
     masks = [
         filled((learns or {}).get(kind, 1.0), shape)
@@ -218,7 +224,7 @@ def _pass(
             return model, buffers, float("nan")
         count = dr.opaque(mi.UInt32, t)
         model, buffers, loss = _step(
-            optimiser, model, goal.prior, view, buffers, rates, count, information
+            optimiser, goal.error, model, goal.prior, view, buffers, rates, count, information
         )
         losses.append(loss)
     if not _is_finite(model):

@@ -56,6 +56,8 @@ class TrainSettings(BaseModel):
     """How means move: frozen, as in the paper; normal, along the prior's normals; or free."""
     density: str = "fixed"
     """Density control of free means: fixed, or relocate (move little-seen ones to large errors)."""
+    loss: str = "squared"
+    """Loss: squared (difference of linear RGB), or l1-dssim (0.8 L1 + 0.2 D-SSIM of sRGB: 3DGS)."""
     optimiser: str = "natural"
     """Optimiser of the fit: natural (gradient divided by Fisher information) or adam."""
     passes: Annotated[int, Field(ge=1)] = PASSES
