@@ -21,6 +21,7 @@ PANELS = {
             "means",
             "sh",
             "density",
+            "most_gaussians",
             "loss",
             "exposure",
             "alpha_weight",

@@ -127,9 +127,31 @@ class View:
         """Sizes that a recording holds as constants (`mgs.splat.recording.frozen`)."""
         return len(self.lists.splat), len(self.lists.block), *self.size, self.target.stored
 
-    def rendered(self, model: Gaussians) -> Any:
-        """Pixels of a model, TensorXf [H,W,C], differentiable."""
-        return composite_channels(project(model, self.camera), self.packed, self.lists, *self.size)
+    def rendered(self, model: Gaussians, shift: Sequence[Any] = ()) -> Any:
+        """Pixels of a model, TensorXf [H,W,C], differentiable.
+
+        shift: x and y [N] of zeros, px, to differentiate by the splats' centres.
+        """
+        splats = project(model, self.camera)
+        if shift:
+            x, y = splats.mean_x + shift[0], splats.mean_y + shift[1]
+            splats = replace(splats, mean_x=x, mean_y=y)
+        return composite_channels(splats, self.packed, self.lists, *self.size)
+
+    def slopes(self, shift: Sequence[Any]) -> list[Any]:
+        """For each Gaussian, the norm of the derivative of the image's mean loss by its centre, in
+        units of half the width and height, and 1 if it is drawn, else 0; Float [N] each.
+
+        shift: as in `rendered`, with the gradient of half the summed loss.
+        """
+        width, height, _ = self.size
+        along_x, along_y = (
+            dr.grad(s) * (size / len(self.pixels))
+            for s, size in zip(shift, (width, height), strict=True)
+        )
+        pairs = dr.gather(mi.UInt32, self.lists.slot_end - self.lists.slot_start, self.lists.place)
+        norm = dr.sqrt(dr.square(along_x) + dr.square(along_y))
+        return [norm, dr.select(pairs > 0, mi.Float(1), 0)]
 
 
 @dataclass
