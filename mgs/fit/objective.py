@@ -146,7 +146,7 @@ class View:
         """
         width, height, _ = self.size
         along_x, along_y = (
-            dr.grad(s) * (size / len(self.pixels))
+            dr.grad(s) * (size / len(self.target))
             for s, size in zip(shift, (width, height), strict=True)
         )
         pairs = dr.gather(mi.UInt32, self.lists.slot_end - self.lists.slot_start, self.lists.place)
