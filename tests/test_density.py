@@ -1,4 +1,4 @@
-"""Density control of a fit: formula of a split, relocation, bitwise repetition."""
+"""Density control of a fit: formula of a split, relocation, adaption, bitwise repetition."""
 
 from dataclasses import replace
 
@@ -7,10 +7,12 @@ import pytest
 
 from mgs.bench import surface_camera, surface_gaussians
 from mgs.errors import InputError
-from mgs.fit.density import MOST_COPIES, Statistics, relocate, split, statistics
+from mgs.fit import density, fitting
+from mgs.fit.density import MOST_COPIES, Slopes, Statistics, adapt, relocate, split, statistics
 from mgs.fit.fitting import fit
 from mgs.fit.objective import objective
 from mgs.fit.settings import RATES, TrainSettings
+from mgs.rotation import rotmat_from_quat
 from mgs.splat import as_drjit, reference, render
 
 
@@ -76,5 +78,154 @@ def test_a_fit_with_relocation_repeats_bitwise_and_needs_free_means(scene):
     assert one.loss < one.losses[0]
     with pytest.raises(InputError, match="free means"):
         fit(start, [camera], [target], TrainSettings(density="relocate"))
-    with pytest.raises(InputError, match="fixed, relocate"):
+    with pytest.raises(InputError, match="fixed, relocate, adaptive"):
         fit(start, [camera], [target], TrainSettings(density="dreams"))
+
+
+def slopes(gradient, most=1000, before=500, step=600):
+    """Slopes in a scene of 10 m."""
+    return Slopes(np.asarray(gradient, float), before, step, 10.0, most)
+
+
+@pytest.fixture
+def mixed():
+    """200 Gaussians, the first 100 of 0.2 m, the others smaller than 0.1 m; and gradients: large at
+    every fourth."""
+    model = surface_gaussians(200)
+    model.log_scales[:] = np.log([0.05, 0.02, 0.01])
+    model.log_scales[:100, 1] = np.log(0.2)
+    return model, np.where(np.arange(200) % 4 == 0, 3e-4, 1e-4)
+
+
+def test_small_ones_are_copied_and_large_ones_divided(mixed):
+    model, gradient = mixed
+    new, kept = adapt(model, slopes(gradient), np.random.default_rng(0))
+    assert len(new) == 250
+    whole = kept >= 0
+    large, small = np.arange(0, 100, 4), np.arange(100, 200, 4)
+    assert set(kept[whole]) == set(range(200)) - {*large}
+    assert new[whole] == model[kept[whole]]
+    assert sorted(~kept[~whole]) == sorted([*small, *large, *large])
+    copies = np.isin(~kept, small)
+    assert new[copies] == model[~kept[copies]]
+    parts = np.isin(~kept, large)
+    parents = model[~kept[parts]]
+    for name in ("quats", "logit_opacities", "sh"):
+        assert np.array_equal(getattr(new[parts], name), getattr(parents, name))
+    assert np.allclose(new[parts].log_scales, parents.log_scales - np.log(1.6), atol=1e-6)
+
+
+def test_the_parts_of_a_divided_gaussian_are_drawn_from_it():
+    """Mean and covariance of many parts, along the axes of the Gaussian."""
+    model = surface_gaussians(4000)
+    model.log_scales[:] = np.log([0.3, 0.2, 0.1])
+    rng = np.random.default_rng(0)
+    new, kept = adapt(model, slopes(np.ones(4000), most=10_000), rng)
+    assert (kept < 0).all()
+    offsets = new.means.astype(float) - model.means[~kept]
+    local = (rotmat_from_quat(model.quats[~kept]).transpose(0, 2, 1) @ offsets[..., None])[..., 0]
+    assert np.allclose(local.mean(0), 0, atol=0.01)
+    assert np.allclose(np.cov(local.T), np.diag([0.09, 0.04, 0.01]), atol=0.003)
+
+
+def test_the_faint_and_too_large_are_removed_and_opacities_reset(mixed):
+    model, _ = mixed
+    model.logit_opacities[:10] = -6.0
+    model.log_scales[10:13] = np.log(1.1)
+    none = np.zeros(200)
+    new, kept = adapt(model, slopes(none), np.random.default_rng(0))
+    assert np.array_equal(kept, np.arange(10, 200))
+    assert new == model[kept]
+    late = slopes(none, before=2990, step=3010)
+    new, kept = adapt(model, late, np.random.default_rng(0))
+    assert np.array_equal(kept, np.arange(13, 200))
+    assert new.opacities.max() == pytest.approx(0.01)
+    assert np.array_equal(new.means, model.means[13:])
+    model.logit_opacities[:] = -9.0
+    assert len(adapt(model, slopes(none), np.random.default_rng(0))[0]) == 200
+
+
+def test_no_more_than_the_most_are_added_and_by_gradient(mixed):
+    model, gradient = mixed
+    gradient[[0, 100, 104]] = 1.0
+    new, kept = adapt(model, slopes(gradient, most=203), np.random.default_rng(0))
+    assert len(new) == 203
+    assert sorted({*~kept[kept < 0]}) == [0, 100, 104]
+    assert adapt(model, slopes(gradient, most=7), np.random.default_rng(0))[0] == model
+
+
+def test_times_of_adaption():
+    times = density.DENSITIES["adaptive"].times
+    assert times(30, 100) == list(range(6, 15))
+    assert times(300, 100) == list(range(6, 150))
+    assert times(600, 50) == list(range(12, 300, 2))
+    assert times(3, 100) == []
+    assert density.DENSITIES["relocate"].times(12, 7) == range(5, 9, 5)
+
+
+def test_slopes_are_those_of_the_reference(scene, monkeypatch):
+    """Reference: central differences, in float64, of the mean loss by each splat's centre."""
+    truth, camera, target = scene
+    model = replace(truth, sh=np.zeros_like(truth.sh))
+    found = []
+    monkeypatch.setattr(density, "ADAPTION_FROM", 0)
+    monkeypatch.setattr(density, "ADAPTION_STEPS", 1)
+    monkeypatch.setattr(fitting, "slopes_of", lambda sums, *_: found.append(sums) or 1 / 0)
+    train = TrainSettings(means="free", density="adaptive", rates=RATES | {"mean": 0.0}, passes=4)
+    with pytest.raises(ZeroDivisionError):
+        fit(model, [camera], [target], train)
+    ((norms, drawn),) = found
+    projected = reference.project(model, camera)
+
+    def loss(j, shift):
+        means2d = projected.means2d.copy()
+        means2d[j] += shift
+        moved = replace(projected, means2d=means2d)
+        order, alpha, T, _ = reference.composite(moved, camera)
+        image = (alpha * T) @ moved.colours[order]
+        return np.square(image - target[..., :3].reshape(-1, 3)).mean()
+
+    steps = 1e-5 * np.eye(2)
+    for j in np.random.default_rng(0).permutation(len(model))[:6]:
+        slope = [(loss(j, step) - loss(j, -step)) / 2e-5 for step in steps]
+        expected = np.hypot(slope[0] * camera.width / 2, slope[1] * camera.height / 2)
+        assert np.array(norms)[j] == pytest.approx(expected, rel=1e-2, abs=1e-7)
+    order, alpha, _, _ = reference.composite(projected, camera)
+    seen = np.zeros(len(model), bool)
+    seen[order] = alpha.any(0)
+    assert np.array(drawn)[seen].min() == 1
+    assert set(np.unique(np.array(drawn))) <= {0, 1}
+
+
+@pytest.mark.parametrize("optimiser", ["adam", "natural"])
+def test_a_fit_of_changing_number_repeats_bitwise(scene, monkeypatch, optimiser):
+    truth, camera, target = scene
+    for name, value in (("FROM", 0), ("STEPS", 2)):
+        monkeypatch.setattr(density, f"ADAPTION_{name}", value)
+    monkeypatch.setattr(density, "LEAST_GRADIENT", 1e-5)
+    monkeypatch.setattr(density, "RESET_STEPS", 5)
+    start = replace(truth, sh=np.zeros_like(truth.sh)).with_degree(1)
+    train = TrainSettings(
+        means="free",
+        density="adaptive",
+        loss="l1-dssim",
+        optimiser=optimiser,
+        passes=14,
+        rates=RATES | {"mean": 0.01},
+        most_gaussians=420,
+        sh_steps=2,
+        steady_rates=("colour",),
+    )
+    prior = {"scale": 1.0, "colour": np.full((1, 4, 1), 0.1)}
+    factors = {"colour": np.array([1, 0.05, 0.05, 0.05])[None, :, None]}
+    one, two = (fit(start, [camera], [target], train, lam=prior, learns=factors) for _ in range(2))
+    assert one.gaussians == two.gaussians
+    assert one.losses == two.losses
+    assert 300 < len(one.gaussians) <= 420
+    assert one.loss < one.losses[0]
+    assert np.abs(one.gaussians.sh[:, 1:]).max() > 0
+    with pytest.raises(InputError, match="free means"):
+        fit(start, [camera], [target], TrainSettings(density="adaptive"))
+    learns = {"colour": np.ones((300, 1, 1))}
+    with pytest.raises(InputError, match="all learn"):
+        fit(start, [camera], [target], train, learns=learns)

@@ -1,8 +1,10 @@
-"""Density control of a fit: between passes, Gaussians move to where the images need them."""
+"""Density control of a fit: between passes, Gaussians are moved, added or removed where the images
+need it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -11,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.special import comb, logit
 
+from mgs.camera import Camera
 from mgs.colour import SH_C0
 from mgs.fit.objective import Objective, View
 from mgs.gaussians import Gaussians
@@ -19,11 +22,11 @@ from mgs.rotation import rotmat_from_quat
 from mgs.splat import as_drjit
 from mgs.splat.recording import frozen
 
-DENSITY_PASSES = 5
-"""Passes between two calls of a density control, each as costly as a pass."""
+RELOCATION_PASSES = 5
+"""Passes between two calls of `relocate`, each as costly as a pass."""
 
-DENSITY_UNTIL = 0.75
-"""Share of the passes after which the number and places of Gaussians are left alone."""
+RELOCATION_UNTIL = 0.75
+"""Share of the passes after which Gaussians are left in their places by `relocate`."""
 
 LEAST_OPACITY = 0.005
 """Opacity at and below which a Gaussian is dead (Kheradmand et al. 2024)."""
@@ -37,6 +40,26 @@ MOST_COPIES = 51
 SPREAD = 0.5
 """Standard deviation of a moved Gaussian's offset from its copy, over that of the copy."""
 
+LEAST_GRADIENT = 2e-4
+"""Least gradient (`Slopes`) at which `adapt` adds a Gaussian. This and the next numbers are those
+of Kerbl et al. 2023 and, where the paper is silent, of the authors' program."""
+
+SMALL = 0.01
+"""Largest standard deviation of a Gaussian that is copied and not divided, over the extent."""
+
+DIVISION = 1.6
+"""Factor by which the two parts of a divided Gaussian are smaller."""
+
+TOO_LARGE = 0.1
+"""Largest standard deviation of a Gaussian that is kept, over the extent, after RESET_STEPS."""
+
+RESET_OPACITY, RESET_STEPS = 0.01, 3000
+"""Opacity to which all are lowered, and steps between that."""
+
+ADAPTION_STEPS, ADAPTION_FROM, ADAPTION_UNTIL = 100, 500, 15_000
+"""Steps between two calls of `adapt`, and the steps after and before which it is called; the last
+is half of all steps in a shorter fit."""
+
 
 @dataclass(frozen=True)
 class Statistics:
@@ -49,9 +72,36 @@ class Statistics:
     error: np.ndarray
 
 
-Control = Callable[[Gaussians, Statistics, np.random.Generator], tuple[Gaussians, np.ndarray]]
-"""control(model, statistics, rng) -> (model, kept [N]): index of the Gaussian of the given model
-that each still is, -1 for a changed one. Models have NumPy fields."""
+@dataclass(frozen=True)
+class Slopes:
+    """Means over the steps since the last call of a control.
+
+    gradient: norm of the derivative of an image's mean loss by a Gaussian's centre in the image, in
+        units of half its width and height, mean over the images that show the Gaussian [N].
+    before, step: number of steps made until the last call and until now.
+    extent: size of the scene, metres. most: largest number of Gaussians.
+    """
+
+    gradient: np.ndarray
+    before: int
+    step: int
+    extent: float
+    most: int
+
+
+@dataclass(frozen=True)
+class Density:
+    """A density control and when it is called.
+
+    control(model, found, rng) -> (model, kept [N]): index i of the Gaussian of the given model that
+        each still is, or ~i for a changed copy of i. Models have NumPy fields.
+    times(passes, images): the numbers of passes after which it is called.
+    slopes: whether `found` are `Slopes` of the steps before, or `Statistics` of an extra pass.
+    """
+
+    control: Callable[[Gaussians, Any, np.random.Generator], tuple[Gaussians, np.ndarray]]
+    times: Callable[[int, int], Sequence[int]]
+    slopes: bool = False
 
 
 def split(opacity: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -70,8 +120,8 @@ def split(opacity: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.ndarr
 def relocate(
     model: Gaussians, found: Statistics, rng: np.random.Generator
 ) -> tuple[Gaussians, np.ndarray]:
-    """A `Control` with a fixed number of Gaussians: dead ones become copies of others, drawn by
-    their error.
+    """A control with a fixed number of Gaussians: dead ones become copies of others, drawn by their
+    error.
 
     As Kheradmand et al. 2024, but the error of the images, not opacity, says where Gaussians are
     needed, and the least seen ones move too.
@@ -96,43 +146,129 @@ def relocate(
     for part in parts:
         part[moved] = part[sources]
     along = SPREAD * np.exp(new.log_scales[moved].astype(np.float64))
-    offsets = rotmat_from_quat(new.quats[moved]) @ (along * rng.normal(size=along.shape))[..., None]
-    new.means[moved] += offsets[..., 0]
+    new.means[moved] += _rotated(new.quats[moved], along * rng.normal(size=along.shape))
     kept = np.arange(n)
-    kept[moved] = kept[split_ones] = -1
+    kept[moved], kept[split_ones] = ~sources, ~split_ones
     return new, kept
 
 
-DENSITIES: dict[str, Control | None] = {"fixed": None, "relocate": relocate}
+def _rotated(quats: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """Offsets along the axes of Gaussians, [N,3] -> in the world."""
+    return (rotmat_from_quat(quats) @ offsets[..., None])[..., 0]
+
+
+def adapt(
+    model: Gaussians, found: Slopes, rng: np.random.Generator
+) -> tuple[Gaussians, np.ndarray]:
+    """The control of Kerbl et al. 2023: Gaussians of large gradient are copied if small and divided
+    in two if large; faint and too large ones are removed, and at times all opacities lowered.
+
+    With no room for all, those of largest gradient are taken. Not removed are Gaussians that are
+    large in an image: the authors' program clears that measure before it reads it.
+    """
+    needed = np.argsort(-found.gradient, kind="stable")[: max(found.most - len(model), 0)]
+    needed = np.sort(needed[found.gradient[needed] >= LEAST_GRADIENT])
+    small = _size(model)[needed] <= SMALL * found.extent
+    copied, divided = needed[small], needed[~small]
+    whole = np.delete(np.arange(len(model)), divided)
+    source = np.concatenate([whole, copied, divided, divided])
+    new, parts = model[source], slice(len(whole) + len(copied), None)
+    scales = np.exp(new.log_scales[parts].astype(np.float64))
+    new.means[parts] += _rotated(new.quats[parts], scales * rng.normal(size=scales.shape))
+    new.log_scales[parts] -= np.log(DIVISION)
+    kept = np.where(np.arange(len(source)) < len(whole), source, ~source)
+    alive = new.opacities >= LEAST_OPACITY
+    if found.step > RESET_STEPS:
+        alive &= _size(new) <= TOO_LARGE * found.extent
+    if alive.any():
+        new, kept = new[alive], kept[alive]
+    if found.step // RESET_STEPS > found.before // RESET_STEPS:
+        np.minimum(new.logit_opacities, logit(RESET_OPACITY), out=new.logit_opacities)
+    return new, kept
+
+
+def _size(model: Gaussians) -> np.ndarray:
+    """Largest standard deviation of each Gaussian, metres [N]."""
+    return np.exp(model.log_scales.max(1).astype(np.float64))
+
+
+def slopes_of(
+    sums: list[Any], cameras: Sequence[Camera], steps: tuple[int, int], most: int
+) -> Slopes:
+    """`Slopes` from the sums of `View.slopes` between two numbers of steps.
+
+    The extent is 1.1 times the radius of the camera positions about their mean.
+    """
+    positions = np.array([camera.position for camera in cameras])
+    radius = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
+    norms, views = (np.array(total) for total in sums)
+    return Slopes(norms / np.maximum(views, 1), *steps, 1.1 * radius, most)
+
+
+def _adaption_times(passes: int, images: int) -> list[int]:
+    end = min(ADAPTION_UNTIL, passes * images / 2)
+    steps = [(done, done * images) for done in range(1, passes)]
+    return [
+        done
+        for done, step in steps
+        if ADAPTION_FROM < step < end and step // ADAPTION_STEPS > (step - images) // ADAPTION_STEPS
+    ]
+
+
+DENSITIES: dict[str, Density | None] = {
+    "fixed": None,
+    "relocate": Density(
+        relocate,
+        lambda passes, _: range(
+            RELOCATION_PASSES, math.ceil(RELOCATION_UNTIL * passes), RELOCATION_PASSES
+        ),
+    ),
+    "adaptive": Density(adapt, _adaption_times, slopes=True),
+}
 """Density controls by name."""
 
 
 def controlled(
-    control: Control,
+    density: Density,
+    found: Slopes | None,
     goal: Objective,
     model: Gaussians,
     buffers: list[list[Any]],
     rng: np.random.Generator,
 ) -> tuple[Objective, Gaussians, list[list[Any]]]:
-    """Call a control. A Gaussian that changed is its own start in the prior, and its buffers are
-    zero."""
+    """Call a control. A Gaussian that changed is its own start in the prior; buffers are zero where
+    a parameter changed. found: None for `Statistics`, which are measured here."""
     before = Gaussians(*(np.array(getattr(model, f.name)) for f in fields(model)))
-    after, kept = control(before, statistics(goal, model), rng)
-    same, rows = kept >= 0, np.maximum(kept, 0)
+    after, kept = density.control(before, found or statistics(goal, model), rng)
+    same, source, prior = kept >= 0, np.where(kept < 0, ~kept, kept), goal.prior
 
-    def carried(old: Any, new: Any = 0.0) -> Any:
-        found = np.array(old)[rows]
-        found[~same] = new
-        return mi.TensorXf(padded(found))
+    def start(name: str) -> Any:
+        values = np.array(getattr(prior.start, name))[source]
+        values[~same] = getattr(after, name)[~same]
+        return mi.TensorXf(padded(values))
 
-    start = Gaussians(
-        *(
-            carried(getattr(goal.prior.start, f.name), getattr(after, f.name)[~same])
-            for f in fields(after)
-        )
+    def lam(name: str) -> Any:
+        values = np.array(prior.lam[name])
+        if len(values) == 1:
+            return prior.lam[name]
+        rows = values.reshape(getattr(before, name).shape)[source]
+        return mi.Float(padded(rows).ravel())
+
+    def buffer(name: str, values: Any) -> Any:
+        old, new = getattr(before, name)[source], getattr(after, name)
+        rows = same.reshape(-1, *[1] * (new.ndim - 1))
+        return mi.TensorXf(padded(np.where(rows & (old == new), np.array(values)[source], 0)))
+
+    refilled = replace(
+        prior,
+        start=Gaussians(*(start(f.name) for f in fields(after))),
+        lam={name: lam(name) for name in prior.lam},
     )
-    kept_buffers = [[carried(buffer) for buffer in each] for each in buffers]
-    return replace(goal, prior=replace(goal.prior, start=start)), as_drjit(after), kept_buffers
+    kept_buffers = [
+        [buffer(name, values) for values in each]
+        for name, each in zip(prior.lam, buffers, strict=True)
+    ]
+    return replace(goal, prior=refilled), as_drjit(after), kept_buffers
 
 
 def statistics(goal: Objective, model: Gaussians) -> Statistics:
@@ -156,7 +292,7 @@ def _image_statistics(model: Gaussians, view: View) -> list[Any]:
         copy = replace(model, sh=dr.copy(dr.detach(model.sh)))
         dr.enable_grad(copy.sh)
         drawn = view.rendered(copy).array
-        residual = dr.detach((drawn - view.pixels) * view.weights)
+        residual = dr.detach((drawn - view.target.pixels) * view.target.weights)
         dr.backward(dr.sum(drawn * dr.square(residual) if squared else drawn))
         slope = dr.grad(copy.sh).array
         found.append(sum(dr.gather(mi.Float, slope, first + c) for c in range(3)) / (3 * SH_C0))

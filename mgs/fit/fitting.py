@@ -16,7 +16,8 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.colour import SH_C0
 from mgs.errors import InputError, row_named
-from mgs.fit.density import DENSITIES, DENSITY_PASSES, DENSITY_UNTIL, controlled
+from mgs.fit.density import DENSITIES, controlled, slopes_of
+from mgs.fit.losses import LOSSES
 from mgs.fit.objective import (
     Objective,
     ParameterPrior,
@@ -37,7 +38,7 @@ from mgs.splat.recording import frozen
 
 @dataclass(frozen=True)
 class Fit:
-    """Result of a fit. A loss is 2 Phi over the number of pixel values.
+    """Result of a fit. A loss is 2 Phi over the number of pixel values (`Objective.loss`).
 
     gaussians: model (NumPy fields) at the end of the pass with the lowest loss; the given model, if
         no pass had a finite loss.
@@ -70,15 +71,18 @@ def _in_bounds(model: Gaussians) -> Gaussians:
 
 
 @frozen(
-    lambda optimiser, model, prior, view, *others: (
+    lambda optimiser, error, model, prior, view, *others: (
         optimiser,
+        error,
         prior.means,
         *model.sh.shape,
         *view.recorded_sizes,
+        len(others[-1]),
     )
 )
 def _step(
     optimiser: str,
+    error: str,
     model: Gaussians,
     prior: ParameterPrior,
     view: View,
@@ -86,31 +90,38 @@ def _step(
     rates: list[Any],
     t: Any,
     information: list[Any],
-) -> tuple[Gaussians, list[list[Any]], Any]:
-    """One optimiser step on one image and its share of the prior. Returns the model, the buffers
-    and the loss before the step.
+    slopes: list[Any],
+) -> tuple[Gaussians, list[list[Any]], Any, list[Any]]:
+    """One optimiser step on one image and its share of the prior. Returns the model, the buffers,
+    the loss before the step, and the slopes.
 
+    optimiser, error: names in OPTIMISERS and LOSSES.
     buffers, rates, information: for each learned array (`mgs.fit.optimisers.Optimiser`).
-    t: UInt32, step number from 1.
+    t: UInt32, step number from 1. slopes: sums of `View.slopes`, to which the step's are added; if
+        empty, they are not measured.
     """
-    copy = with_gradients(model, prior)
-    error = (view.rendered(copy).array - view.pixels) * view.weights
-    loss = dr.mean(dr.square(error))
-    dr.backward(0.5 * dr.sum(dr.square(error)))
+    copy, shift = with_gradients(model, prior), [dr.zeros(mi.Float, len(model)) for _ in slopes]
+    dr.enable_grad(shift)
+    drawn = view.rendered(copy, shift).array
+    values = LOSSES[error](drawn, view.target.pixels, view.target.weights, view.size)
+    loss = dr.mean(dr.detach(values))
+    dr.backward(0.5 * dr.sum(values))
     step, moved, kept = mi.Float(t), {}, []
     for name, buffer, rate, known in zip(prior.lam, buffers, rates, information, strict=True):
         value, slope = dr.detach(getattr(copy, name)), dr.grad(getattr(copy, name))
         offset = prior.along(name, value - getattr(prior.start, name))
         pull = prior.lam[name] * prior.share
         gradient = prior.along(name, slope) + mi.TensorXf(pull * offset.array, offset.shape)
-        loss += weighted_squares(pull, offset.array) / len(view.pixels)
+        loss += weighted_squares(pull, offset.array) / len(view.target)
         along_normal = offset.shape != value.shape
         found, after = OPTIMISERS[optimiser].step(
             offset if along_normal else value, gradient, known, buffer, rate, step
         )
         moved[name] = value + prior.across(name, found - offset) if along_normal else found
         kept.append(after)
-    return _in_bounds(replace(model, **moved)), kept, dr.detach(loss)
+    if slopes:
+        slopes = [total + new for total, new in zip(slopes, view.slopes(shift), strict=True)]
+    return _in_bounds(replace(model, **moved)), kept, dr.detach(loss), slopes
 
 
 def fit(
@@ -137,57 +148,66 @@ def fit(
         value / unit of the parameter)^2: a number, or except for means an array that broadcasts to
         the parameter's shape. Default 0.
     normals: directions of means that move along them [N,3], of any length but 0.
-    learns: masks of the Gaussians that learn a kind of parameter, broadcast to its shape ([N],
-        [N,1] or, for colours, [N,K,1]). The others keep their values, except colours below
-        COLOUR_MIN. Default: all learn.
+    learns: masks of the Gaussians that learn a kind of parameter, or factors of its rate, broadcast
+        to its shape ([N], [N,1] or, for colours, [N,K,1]). The others keep their values, except
+        colours below COLOUR_MIN. Default: all learn.
 
-    Raises InputError if a parameter is not finite, the optimiser is unknown, `start` has another
-    shape, means are to move without normals or without a rate, or a required alpha is missing.
+    Raises InputError if a parameter is not finite, optimiser or loss are unknown, `start` has
+    another shape, means are to move without normals or without a rate, or a required alpha is
+    missing.
     """
     settings = settings or TrainSettings()
     optimiser = row_named(OPTIMISERS, settings.optimiser, "optimiser")
-    control = row_named(DENSITIES, settings.density, "density")
-    if control and (settings.means != "free" or learns):
+    density = row_named(DENSITIES, settings.density, "density")
+    factors = {kind: np.asarray(factor) for kind, factor in (learns or {}).items()}
+    alike = all(factor.ndim == 0 or len(factor) == 1 for factor in factors.values())
+    if density and (settings.means != "free" or not alike):
         raise InputError("density: Gaussians can move only where all learn free means")
     kinds = learned(settings.means).values()
     if missing := [kind for kind in kinds if kind not in settings.rates]:
         raise InputError(
             f"train.rates: has no rate of {missing[0]}, which is learned; give one, metres"
         )
-    model, means, weight = as_drjit(gaussians), settings.means, settings.alpha_weight
-    goal = objective(gaussians, cameras, targets, start, lam, cache, means, normals, weight)
-    shapes = [offset.shape for offset, _ in goal.offsets(model)]
-    masks = [
-        filled((learns or {}).get(kind, 1.0), shape)
-        for kind, shape in zip(kinds, shapes, strict=True)
+    model, how = as_drjit(gaussians), (settings.means, normals, settings.alpha_weight)
+    goal = objective(gaussians, cameras, targets, start, lam, cache, *how, settings.loss)
+    buffers = [
+        [dr.zeros(mi.TensorXf, offset.shape) for _ in range(optimiser.buffers)]
+        for offset, _ in goal.offsets(model)
     ]
-    buffers = [[dr.zeros(mi.TensorXf, shape) for _ in range(optimiser.buffers)] for shape in shapes]
-    information: list[Any] = [None] * len(shapes)
-    rng = generator(settings.seed, "train/order")
-    draws, until = generator(settings.seed, "train/density"), DENSITY_UNTIL * settings.passes
+    information: list[Any] = [None] * len(buffers)
+    rng, draws = (generator(settings.seed, f"train/{name}") for name in ("order", "density"))
+    times = density.times(settings.passes, len(cameras)) if density else ()
+    slopes: list[Any] = []
+    last, end = 0, max(times, default=0)
     losses, best, stop = [goal.loss(model)], model, None
     while stop is None:
         done = len(losses) - 1
-        fall = settings.decay ** (done / max(settings.passes - 1, 1))
-        rates = [
-            dr.opaque(mi.Float, settings.rates[kind] * fall) * mask
-            for kind, mask in zip(kinds, masks, strict=True)
-        ]
-        changes = control is not None and done % DENSITY_PASSES == 0 and 0 < done < until
-        if control and changes:
-            goal, model, buffers = controlled(control, goal, model, buffers, draws)
+        changes = density is not None and done in times
+        if density and changes:
+            found = None
+            if density.slopes:
+                between = last * len(cameras), done * len(cameras)
+                found = slopes_of(slopes, cameras, between, settings.most_gaussians)
+            goal, model, buffers = controlled(density, found, goal, model, buffers, draws)
+            slopes, last = [], done
+        if density and density.slopes and not slopes and done < end:
+            slopes = [dr.zeros(mi.Float, len(model)) for _ in range(2)]
+            dr.make_opaque(slopes)
         if optimiser.uses_information and (changes or done % INFORMATION_PASSES == 0):
             information = goal.largest_diagonal(model)
+        shapes = [offset.shape for offset, _ in goal.offsets(model)]
+        rates = _rates(settings, dict(zip(kinds, shapes, strict=True)), factors, done, len(cameras))
         order = rng.permutation(len(goal.photos))
-        model, buffers, loss = _pass(
-            goal, settings.optimiser, model, buffers, information, order, rates, done * len(order)
+        learning = buffers, information, rates, slopes
+        model, buffers, loss, slopes = _pass(
+            goal, settings.optimiser, model, order, *learning, done * len(order)
         )
         if loss <= min(losses[1:], default=np.inf):  # false for NaN
             best = model
         losses.append(loss)
         if on_pass:
             on_pass(done + 1, settings.passes)
-        tolerance = 0.0 if control and done < until else settings.tolerance
+        tolerance = 0.0 if done < end else settings.tolerance
         stop = stop_reason(losses, tolerance, settings.passes)
     passes = len(losses) - 1
     numpy = Gaussians(*(np.asarray(getattr(best, f.name)) for f in fields(best)))
@@ -195,18 +215,40 @@ def fit(
     return Fit(numpy, lowest, tuple(losses), passes, passes * len(goal.photos), stop)
 
 
+def _rates(
+    settings: TrainSettings,
+    shapes: Mapping[str, tuple[int, ...]],
+    factors: Mapping[str, np.ndarray],
+    done: int,
+    images: int,
+) -> list[Any]:
+    """Rate of each kind of parameter, of these shapes, after some passes over the images: a Float
+    of one number or one per parameter. factors: of the rates, as `learns` of `fit`."""
+    fall, found = settings.decay ** (done / max(settings.passes - 1, 1)), []
+    for kind, shape in shapes.items():
+        rate: Any = settings.rates[kind] * (1.0 if kind in settings.steady_rates else fall)
+        rate = rate * factors.get(kind, 1.0)
+        if kind == "colour" and settings.sh_steps:
+            degree = done * images // settings.sh_steps
+            rate = rate * (np.arange(shape[1]) < (degree + 1) ** 2)[:, None]
+        found.append(filled(rate, shape))
+    return found
+
+
 def _pass(
     goal: Objective,
     optimiser: str,
     model: Gaussians,
+    order: np.ndarray,
     buffers: list[list[Any]],
     information: list[Any],
-    order: np.ndarray,
     rates: list[Any],
+    slopes: list[Any],
     t: int,
-) -> tuple[Gaussians, list[list[Any]], float]:
-    """One step on each image in this order, after t steps. Returns the model, the buffers and the
-    mean loss of the steps: NaN if a parameter is no longer finite, which cannot be rendered."""
+) -> tuple[Gaussians, list[list[Any]], float, list[Any]]:
+    """One step on each image in this order, after t steps. Returns the model, the buffers, the mean
+    loss of the steps, NaN if a parameter is no longer finite, which cannot be rendered, and the
+    slopes."""
     losses = []
     for photo in (goal.photos[i] for i in order):
         t += 1
@@ -215,15 +257,14 @@ def _pass(
         except InputError:
             if _is_finite(model):  # raised for another reason, such as too many pairs
                 raise
-            return model, buffers, float("nan")
+            return model, buffers, float("nan"), slopes
         count = dr.opaque(mi.UInt32, t)
-        model, buffers, loss = _step(
-            optimiser, model, goal.prior, view, buffers, rates, count, information
-        )
+        given = view, buffers, rates, count, information, slopes
+        model, buffers, loss, slopes = _step(optimiser, goal.error, model, goal.prior, *given)
         losses.append(loss)
-    if not _is_finite(model):
-        return model, buffers, float("nan")
-    return model, buffers, float(np.mean([float(loss[0]) for loss in losses]))
+    finite = _is_finite(model)
+    mean = float(np.mean([float(loss[0]) for loss in losses])) if finite else float("nan")
+    return model, buffers, mean, slopes
 
 
 def _is_finite(model: Gaussians) -> bool:

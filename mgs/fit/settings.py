@@ -55,7 +55,11 @@ class TrainSettings(BaseModel):
     means: Literal["frozen", "normal", "free"] = "frozen"
     """How means move: frozen, as in the paper; normal, along the prior's normals; or free."""
     density: str = "fixed"
-    """Density control of free means: fixed, or relocate (move little-seen ones to large errors)."""
+    """Density control of free means: fixed, relocate (of little use to errors), adaptive (3DGS)."""
+    most_gaussians: Annotated[int, Field(ge=1, le=2**25)] = 200_000
+    """Number of Gaussians beyond which adaptive density adds none."""
+    loss: str = "squared"
+    """Loss: squared (difference of linear RGB), or l1-dssim (0.8 L1 + 0.2 D-SSIM of sRGB: 3DGS)."""
     optimiser: str = "natural"
     """Optimiser of the fit: natural (gradient divided by Fisher information) or adam."""
     passes: Annotated[int, Field(ge=1)] = PASSES
@@ -68,6 +72,10 @@ class TrainSettings(BaseModel):
     """Weight of alpha as a fourth channel in the loss, (sigma_rgb / sigma_alpha)^2; 0: not used."""
     decay: Positive = 0.1
     """Factor by which the rates fall over `passes`."""
+    steady_rates: tuple[str, ...] = ()
+    """Kinds of parameters whose rates do not fall."""
+    sh_steps: Annotated[int, Field(ge=0)] = 0
+    """Steps after which colours learn one more SH degree; 0: they learn all from the start."""
     seed: Annotated[int, Field(ge=0)] = 0
     """Seed of the order of images in each pass."""
 

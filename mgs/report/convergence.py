@@ -39,14 +39,15 @@ def remaining_decrease(
 
     Returns "phi" (`mgs.fit.objective`, squared pixel values); "predicted_decrease", a share of phi;
     and "converged", whether that is at most CONVERGED_SHARE. Raises InputError if a frame cannot be
-    read, or the fit relocated Gaussians, whose prior is not kept.
+    read, or the fit changed its Gaussians, whose prior is not kept, or had another loss.
     """
-    if settings.train.density != "fixed":
+    train = settings.train
+    if train.density != "fixed" or train.loss != "squared":
         raise InputError(
-            "--convergence: the fit relocated Gaussians, so its objective is not known; "
-            "leave it out, or fit with --density fixed"
+            "--convergence: is for a fixed number of Gaussians and squared differences; "
+            "leave it out, or fit with --density fixed --loss squared"
         )
-    images, train = last_images(settings, prior, frames), settings.train
+    images = last_images(settings, prior, frames)
     kinds = groups(settings.sh, train.means)
     by_kind = lam_by_kind(settings.regularisation(kinds), kinds)
     start = images.start(range(len(images))).with_degree(settings.sh)

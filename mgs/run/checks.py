@@ -58,7 +58,7 @@ class Checks:
             step["information_gain"] for step in steps if step["information_gain"] is not None
         ]
         start, coverage = problem.start, steps[-1]["coverage"]
-        drift = 0.0  # relocated Gaussians are not those of the start
+        drift = 0.0  # changed Gaussians are not those of the start
         if problem.settings.train.density == "fixed":
             drift = detectors.means_drift(fit.gaussians.means, start.means, start.log_scales)
         indicators = detectors.step_indicators(views, fit.losses, coverage, scores, drift)

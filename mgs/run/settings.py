@@ -220,7 +220,7 @@ def settings_in(file: Path) -> dict[str, Any]:
 BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 """Words for the limits of pydantic's numbers."""
 
-NO_OPTION = ("warm_rate", "tolerance", "decay", "dataset", "prior")
+NO_OPTION = ("warm_rate", "tolerance", "decay", "steady_rates", "sh_steps", "dataset", "prior")
 """Settings without an option of their own."""
 
 
@@ -237,10 +237,11 @@ def option_of(parts: list[str], value: Any) -> str:
 def check_settings(settings: NbvSettings, frames: int) -> None:
     """Raises InputError where settings do not go together, or a dataset has too few frames.
 
-    Unknown are: a policy, an estimator without a diagonal, an optimiser; an estimator or a policy
-    that has no columns of learned means; seeds and budget beyond the number of frames.
+    Unknown are: a policy, an estimator without a diagonal, an optimiser, a loss; an estimator or a
+    policy that has no columns of learned means; seeds and budget beyond the number of frames.
     """
-    from mgs.fit.density import DENSITIES  # loads Dr.Jit, as the next two
+    from mgs.fit.density import DENSITIES  # loads Dr.Jit, as the next three
+    from mgs.fit.losses import LOSSES
     from mgs.fit.optimisers import OPTIMISERS
     from mgs.splat import ESTIMATORS
 
@@ -255,6 +256,7 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
         message = f"{fixed[0]} has no information about means; leave out either"
         raise InputError(f"--means {settings.train.means}: {message}")
     row_named(OPTIMISERS, settings.train.optimiser, "--optimiser")
+    row_named(LOSSES, settings.train.loss, "--loss")
     control = row_named(DENSITIES, settings.train.density, "--density")
     if control and (settings.train.means != "free" or settings.budget > 0):
         needs = "needs free means and all images at once; give `mgs fit --means free`"

@@ -1,0 +1,102 @@
+"""Losses of a fit, by name: what each pixel value adds, given a render and an image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from mgs.metrics import SSIM_SIGMA, SSIM_WINDOW
+
+DSSIM_SHARE = 0.2
+"""Share of the dissimilarity in `l1_dssim` (Kerbl et al. 2023)."""
+
+SSIM_CONSTANTS = 0.01**2, 0.03**2
+"""Constants of SSIM for values from 0 to 1 (Wang et al. 2004)."""
+
+_offsets = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
+_window = np.exp(-0.5 * (_offsets / SSIM_SIGMA) ** 2)
+TAPS = [*zip(_offsets.tolist(), (_window / _window.sum()).tolist(), strict=True)]
+"""(offset in pixels, weight) of the Gaussian window of SSIM along an axis."""
+
+Size = tuple[int, int, int]
+"""Width, height and channels of an image."""
+
+Loss = Callable[[Any, Any, Any, Size], Any]
+"""loss(drawn, pixels, weights, size) -> what each pixel value adds, Float [H*W*C]. Render and image
+are linear RGB, with alpha if there are four channels; weights are factors of the differences."""
+
+
+def squared(drawn: Any, pixels: Any, weights: Any, size: Size) -> Any:
+    """Squared difference."""
+    return dr.square((drawn - pixels) * weights)
+
+
+def l1_dssim(drawn: Any, pixels: Any, weights: Any, size: Size) -> Any:
+    """0.8 |x - y| + 0.2 (1 - SSIM(x, y)) of the images encoded as sRGB (Kerbl et al. 2023).
+
+    Alpha is not encoded. SSIM takes values beyond the border as 0, as the authors' program does.
+    """
+    y = _encoded(pixels, size)
+    x = y + (_encoded(drawn, size) - y) * weights
+    dissimilar = 1 - similarity(x, y, size)
+    return dr.lerp(dr.abs(x - y), dissimilar, DSSIM_SHARE)
+
+
+LOSSES: dict[str, Loss] = {"squared": squared, "l1-dssim": l1_dssim}
+"""Losses by name."""
+
+
+def _encoded(values: Any, size: Size) -> Any:
+    """Colours, linear RGB, as sRGB. The curve goes on above 1, where a render can be."""
+    curve = 1.055 * dr.power(dr.maximum(values, 0.0031308), 1 / 2.4) - 0.055
+    encoded = dr.select(values <= 0.0031308, 12.92 * values, curve)
+    colour = dr.arange(mi.UInt32, len(values)) % size[2] < 3
+    return dr.select(colour, encoded, values)
+
+
+def similarity(x: Any, y: Any, size: Size) -> Any:
+    """Structural similarity of each pixel value (Wang et al. 2004), Float [H*W*C]. Differentiable
+    in x."""
+    c1, c2 = SSIM_CONSTANTS
+    mean_x, xx, xy = dr.custom(_Blur, (x, x * x, x * y), size)
+    mean_y, yy = _blurred((y, y * y), size)
+    product, squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
+    agreement = (2 * product + c1) * (2 * (xy - product) + c2)
+    return agreement / ((squares + c1) * (xx + yy - squares + c2))
+
+
+class _Blur(dr.CustomOp):
+    """`_blurred` as a Dr.Jit AD operation. The window is symmetric, so the derivative is a blur."""
+
+    def eval(self, images: tuple[Any, ...], size: Size) -> Any:
+        self.size = size
+        return _blurred(images, size)
+
+    def forward(self) -> None:
+        self.set_grad_out(_blurred(self.grad_in("images"), self.size))
+
+    def backward(self) -> None:
+        self.set_grad_in("images", _blurred(self.grad_out(), self.size))
+
+
+def _blurred(images: tuple[Any, ...], size: Size) -> tuple[Any, ...]:
+    """Images convolved with the window of SSIM, 0 beyond the border."""
+    width, height, channels = size
+    index = dr.arange(mi.Int32, width * height * channels)
+    column, row = index // channels % width, index // (channels * width)
+    for place, length, stride in ((column, width, channels), (row, height, channels * width)):
+        dr.eval(images)
+        sums = [dr.zeros(mi.Float, len(index)) for _ in images]
+        for offset, weight in TAPS:
+            inside = (place + offset >= 0) & (place + offset < length)
+            at = index + offset * stride
+            sums = [
+                dr.fma(dr.gather(mi.Float, image, at, inside), weight, total)
+                for image, total in zip(images, sums, strict=True)
+            ]
+        images = tuple(sums)
+    return images
