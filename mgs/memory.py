@@ -109,6 +109,22 @@ def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:
     return copy
 
 
+def adopted(values: Any) -> np.ndarray:
+    """A float32 array for Dr.Jit: itself if it lies in memory as `padded` makes it, else a copy."""
+    values = np.asarray(values, np.float32)
+    memory = values.base
+    if (
+        isinstance(memory, np.ndarray)
+        and memory.flags.c_contiguous
+        and values.flags.c_contiguous
+        and values.ctypes.data % ALIGNMENT == 0
+    ):
+        end = memory.ctypes.data + memory.nbytes
+        if values.ctypes.data + values.nbytes + PADDING * values.itemsize <= end:
+            return values
+    return padded(values)
+
+
 def kept_within(
     budget: int, make: Callable[[Any], Value], size: Callable[[Value], int]
 ) -> Callable[[Any], Value]:

@@ -24,7 +24,7 @@ from mgs.data.frames import Frame
 from mgs.data.importers import import_source
 from mgs.data.sources import read_source
 from mgs.fit import objective
-from mgs.memory import PADDING, kept_within, padded
+from mgs.memory import PADDING, adopted, kept_within, padded
 from mgs.prior.build import build_prior, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run import operations, problem
@@ -42,6 +42,17 @@ def test_results_are_kept_within_the_budget() -> None:
     for _ in range(3):
         assert [int(get(key)[0]) for key in range(4)] == [0, 1, 2, 3]
     assert made == {0: 1, 1: 1, 2: 3, 3: 3}
+
+
+def test_only_arrays_with_room_behind_them_are_not_copied() -> None:
+    known = padded(np.ones((4, 3)))
+    assert adopted(known) is known
+    plain = np.ones((4, 64), np.float32)
+    for values in (plain, plain[-1:], known[:, :2], known.T, known.astype(np.float64), [1.0, 2.0]):
+        copy = adopted(values)
+        assert copy.dtype == np.float32
+        assert np.array_equal(copy, values)
+        assert not np.shares_memory(copy, values)
 
 
 class Live:

@@ -17,6 +17,7 @@ from mgs.data.frames import SURVEY_FOLDER, Frame, as_captured
 from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.errors import InputError
 from mgs.files import THERE, check_new_folder, read_json, write_json
+from mgs.memory import padded
 from mgs.notebook import html, thumbnails
 
 PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
@@ -311,7 +312,8 @@ def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
 def target_of(frame: Frame, with_alpha: bool = False) -> np.ndarray:
     """Target of a fit [H,W,4]: colour and weight of `Frame.target`; [H,W,5] with alpha appended.
 
-    Raises InputError if the mask is empty, since a fit to black would remove the rock.
+    It is `padded`, so that a fit uses its memory in place of a copy. Raises InputError if the mask
+    is empty, since a fit to black would remove the rock.
     """
     if not frame.mask().any():
         raise InputError(
@@ -319,4 +321,5 @@ def target_of(frame: Frame, with_alpha: bool = False) -> np.ndarray:
             "correct it, or remove the frame"
         )
     rgba, weight = frame.target()
-    return np.dstack([rgba[..., :3], weight, *([rgba[..., 3]] if with_alpha else [])])
+    alpha = [rgba[..., 3]] if with_alpha else []
+    return padded(np.dstack([rgba[..., :3], weight, *alpha]))

@@ -293,7 +293,7 @@ def _image_statistics(model: Gaussians, view: View) -> list[Any]:
         copy = replace(model, sh=dr.copy(dr.detach(model.sh)))
         dr.enable_grad(copy.sh)
         drawn = view.rendered(copy).array
-        residual = dr.detach((drawn - view.pixels) * view.weights)
+        residual = dr.detach((drawn - view.target.pixels) * view.target.weights)
         dr.backward(dr.sum(drawn * dr.square(residual) if squared else drawn))
         slope = dr.grad(copy.sh).array
         found.append(sum(dr.gather(mi.Float, slope, first + c) for c in range(3)) / (3 * SH_C0))

@@ -103,7 +103,7 @@ def _step(
     copy, shift = with_gradients(model, prior), [dr.zeros(mi.Float, len(model)) for _ in slopes]
     dr.enable_grad(shift)
     drawn = view.rendered(copy, shift).array
-    values = LOSSES[error](drawn, view.pixels, view.weights, view.size)
+    values = LOSSES[error](drawn, view.target.pixels, view.target.weights, view.size)
     loss = dr.mean(dr.detach(values))
     dr.backward(0.5 * dr.sum(values))
     step, moved, kept = mi.Float(t), {}, []
@@ -112,7 +112,7 @@ def _step(
         offset = prior.along(name, value - getattr(prior.start, name))
         pull = prior.lam[name] * prior.share
         gradient = prior.along(name, slope) + mi.TensorXf(pull * offset.array, offset.shape)
-        loss += weighted_squares(pull, offset.array) / len(view.pixels)
+        loss += weighted_squares(pull, offset.array) / len(view.target)
         along_normal = offset.shape != value.shape
         found, after = OPTIMISERS[optimiser].step(
             offset if along_normal else value, gradient, known, buffer, rate, step

@@ -40,7 +40,7 @@ from mgs.camera import Camera
 from mgs.errors import InputError, row_named
 from mgs.fit.losses import LOSSES
 from mgs.gaussians import Gaussians, learned
-from mgs.memory import IMAGE_BYTES, Deferred, kept_within, padded
+from mgs.memory import IMAGE_BYTES, Deferred, adopted, kept_within, padded
 from mgs.splat import ListCache, as_drjit, fisher, groups
 from mgs.splat.blocks import BlockLists
 from mgs.splat.information import unit_normals
@@ -53,30 +53,62 @@ Vector = list[Any]
 `mgs.gaussians.learned`; [N] for means that move along their normals."""
 
 
+@dataclass
+class Target:
+    """Target of a fit as the kernels take it.
+
+    values: mi.Float [H*W*S], with S = 3 to 5 channels as in `mgs.fit.fitting.fit`.
+    scale: factors of the C channels that are compared, mi.Float [C]: colours, and with C = 4 alpha.
+    stored: S.
+    """
+
+    values: Any
+    scale: Any
+    stored: int
+
+    def __len__(self) -> int:
+        """H*W*C, the number of values that are compared."""
+        return len(self.values) // self.stored * len(self.scale)
+
+    @property
+    def pixels(self) -> Any:
+        """Values that are compared, mi.Float [H*W*C]."""
+        pixel, channel = self._places()
+        channel = dr.select(channel == 3, 4, channel)
+        return dr.gather(mi.Float, self.values, pixel * self.stored + channel)
+
+    @property
+    def weights(self) -> Any:
+        """Factors of the differences to `pixels`, mi.Float [H*W*C]."""
+        pixel, channel = self._places()
+        scale = dr.gather(mi.Float, self.scale, channel)
+        if self.stored == 3:
+            return scale
+        return dr.gather(mi.Float, self.values, pixel * self.stored + 3) * scale
+
+    def _places(self) -> tuple[Any, Any]:
+        """Pixel and channel of each value that is compared, mi.UInt32 [H*W*C]."""
+        index, channels = dr.arange(mi.UInt32, len(self)), len(self.scale)
+        return index // channels, index % channels
+
+
 @dataclass(frozen=True)
 class Photo:
-    """An image to fit to.
-
-    camera, array: its camera, as an object and for the kernels.
-    pixels: mi.Float [H*W*C], with C = 3 channels, or 4 with alpha.
-    weights: factors of the differences to the pixels, mi.Float [H*W*C].
-    """
+    """An image to fit to: its camera, as an object and for the kernels (`array`), and target."""
 
     camera: Camera
     array: Any
-    pixels: Any
-    weights: Any
+    target: Target
 
     @property
     def size(self) -> tuple[int, int, int]:
         """Width, height and number of channels."""
-        width, height = self.camera.width, self.camera.height
-        return width, height, len(self.pixels) // (width * height)
+        return self.camera.width, self.camera.height, len(self.target.scale)
 
     @property
     def nbytes(self) -> int:
-        """Memory of pixels and weights, bytes."""
-        return 4 * (len(self.pixels) + len(self.weights))
+        """Memory of the target, bytes."""
+        return 4 * len(self.target.values)
 
 
 @dataclass
@@ -85,8 +117,7 @@ class View:
     model."""
 
     camera: Any
-    pixels: Any
-    weights: Any
+    target: Target
     size: tuple[int, int, int]
     lists: BlockLists
     packed: Any
@@ -94,7 +125,7 @@ class View:
     @property
     def recorded_sizes(self) -> tuple[int, ...]:
         """Sizes that a recording holds as constants (`mgs.splat.recording.frozen`)."""
-        return len(self.lists.splat), len(self.lists.block), *self.size
+        return len(self.lists.splat), len(self.lists.block), *self.size, self.target.stored
 
     def rendered(self, model: Gaussians, shift: Sequence[Any] = ()) -> Any:
         """Pixels of a model, TensorXf [H,W,C], differentiable.
@@ -115,7 +146,7 @@ class View:
         """
         width, height, _ = self.size
         along_x, along_y = (
-            dr.grad(s) * (size / len(self.pixels))
+            dr.grad(s) * (size / len(self.target))
             for s, size in zip(shift, (width, height), strict=True)
         )
         pairs = dr.gather(mi.UInt32, self.lists.slot_end - self.lists.slot_start, self.lists.place)
@@ -182,15 +213,15 @@ class Objective:
         )
         errors = []
         for photo in self.photos:
-            drawn = _rendered(model, photo, self.cache)
-            values = LOSSES[self.error](drawn, photo.pixels, photo.weights, photo.size)
-            errors.append(dr.mean(values) + penalty / len(photo.pixels))
+            drawn, target = _rendered(model, photo, self.cache), photo.target
+            values = LOSSES[self.error](drawn, target.pixels, target.weights, photo.size)
+            errors.append(dr.mean(values) + penalty / len(target))
             dr.eval(errors[-1])  # frees the rendered image
         return float(np.mean([float(error[0]) for error in errors]))
 
     def phi(self, model: Gaussians) -> float:
         """Phi, squared pixel values."""
-        return 0.5 * sum(len(photo.pixels) for photo in self.photos) * self.loss(model)
+        return 0.5 * sum(len(photo.target) for photo in self.photos) * self.loss(model)
 
     def gradient(self, model: Gaussians) -> Vector:
         """Derivative of Phi by the learned parameters."""
@@ -255,7 +286,7 @@ class Objective:
     def view(self, model: Gaussians, photo: Photo) -> View:
         """A photo with the block lists of a model. Raises InputError as `ListCache.get`."""
         lists, packed = self.cache.get(photo.camera, _project(model, photo.array))
-        return View(photo.array, photo.pixels, photo.weights, photo.size, lists, packed)
+        return View(photo.array, photo.target, photo.size, lists, packed)
 
     def offsets(self, model: Gaussians) -> list[tuple[Any, Any]]:
         """(offset from the start, lam) of each learned array."""
@@ -291,7 +322,7 @@ def objective(
         raise ValueError(f"there are {len(cameras)} cameras, but {len(targets)} targets")
 
     def photo(i: int) -> Photo:
-        return _photo(cameras[i], np.asarray(targets[i], np.float32), alpha_weight)
+        return _photo(cameras[i], targets[i], alpha_weight)
 
     photos = Deferred(range(len(cameras)), kept_within(IMAGE_BYTES, photo, lambda p: p.nbytes))
     start = gaussians if start is None else start
@@ -330,20 +361,16 @@ def filled(values: float | np.ndarray, shape: tuple[int, ...]) -> Any:
 def _photo(camera: Camera, target: np.ndarray, alpha_weight: float) -> Photo:
     """A `Photo` from a target of `fit`. Raises InputError if alpha has a weight and the target has
     no alpha."""
-    pixels, channels = target[..., :3], target.shape[-1]
-    known = target[..., 3:4] if channels > 3 else np.ones((), np.float32)
-    weights = np.broadcast_to(known, pixels.shape)
+    scale, stored = [1.0, 1.0, 1.0], target.shape[-1]
     if alpha_weight:
-        if channels < 5:
+        if stored < 5:
             raise InputError(
-                f"target: has {channels} channels, and with a weight for alpha it needs 5, "
+                f"target: has {stored} channels, and with a weight for alpha it needs 5, "
                 "alpha as the last"
             )
-        pixels = np.dstack([pixels, target[..., 4]])
-        weights = np.dstack([weights, np.float32(np.sqrt(alpha_weight)) * weights[..., 0]])
-    return Photo(
-        camera, camera_array(camera), *(mi.Float(padded(a).ravel()) for a in (pixels, weights))
-    )
+        scale.append(np.sqrt(alpha_weight))
+    values, factors = mi.Float(adopted(target).ravel()), mi.Float(padded(scale))
+    return Photo(camera, camera_array(camera), Target(values, factors, stored))
 
 
 @one_at_a_time
@@ -426,7 +453,7 @@ def _project(model: Gaussians, camera: Any) -> Any:
 def _image_gradient(model: Gaussians, prior: ParameterPrior, view: View) -> Vector:
     """Derivative of half the summed squared error of one image."""
     copy = with_gradients(model, prior)
-    error = (view.rendered(copy).array - view.pixels) * view.weights
+    error = (view.rendered(copy).array - view.target.pixels) * view.target.weights
     dr.backward(0.5 * dr.sum(dr.square(error)))
     return _gradients(copy, prior)
 
@@ -439,7 +466,7 @@ def _image_curvature(model: Gaussians, prior: ParameterPrior, view: View, vector
         dr.set_grad(getattr(copy, name), prior.across(name, tangent))
     rendered = view.rendered(copy)
     dr.forward_to(rendered)
-    product = dr.detach(dr.grad(rendered).array) * dr.square(view.weights)
+    product = dr.detach(dr.grad(rendered).array) * dr.square(view.target.weights)
     copy = with_gradients(model, prior)
     dr.backward(dr.sum(view.rendered(copy).array * product))
     return _gradients(copy, prior)

@@ -23,9 +23,8 @@ from mgs.splat.projection import Splats, camera_array, project
 from mgs.splat.recording import one_at_a_time
 from mgs.splat.walking import PIXELS, pack, sums_by_splat
 
-CACHE_BYTES = 1 << 30
-"""Default budget of a `ListCache`, bytes: enough for 100 cameras of 100,000 Gaussians at
-640x480."""
+CACHE_BYTES = 1 << 28
+"""Default budget of a `ListCache`, bytes: enough for 33 cameras of 100,000 Gaussians at 640x480."""
 
 
 @dataclass
