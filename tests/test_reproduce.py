@@ -22,7 +22,7 @@ from mgs.run.folder import read_checkpoint
 from mgs.study import case, flights, free_fit, reproduce, setups
 from mgs.study.case import Case, Scene, Size
 from mgs.study.oracle import foretold
-from mgs.study.reproduce import FREE_FIT, ReproduceSize, Run, RunSize
+from mgs.study.reproduce import ReproduceSize, Run, RunSize
 from mgs.study.rocks import Rock
 from mgs.study.setups import SetupSize
 from mgs.study.sweep import cell_folder, run_cells
@@ -247,13 +247,14 @@ def test_a_timed_run_has_a_process_of_its_own(quick, tmp_path):
         run_cells(tmp_path, wrong.cells(), silent)
 
 
-def test_a_free_fit_is_measured_on_all_views(quick, tmp_path, monkeypatch):
+def test_3dgs_is_measured_on_all_views(quick, tmp_path, monkeypatch):
     monkeypatch.setattr(free_fit, "in_new_process", lambda task, out, *how: task(*how))
     monkeypatch.setattr(free_fit, "PASSES", 3)
-    run = Run(Rock("boulder", 1), ONE, FREE_FIT, seeds=8, budget=0)
-    *before, cell = run.cells()
+    row = "3DGS, random points, twice the steps"
+    *before, cell = Run(Rock("boulder", 1), ONE, row, seeds=8, budget=0).cells()
     found = run_cells(tmp_path, [*before, cell], silent)[cell.name]
     assert cell.alone
+    assert found["gaussians"] > 0
     assert found["images"] == found["all"]["count"] == 8
     assert found["test"]["count"] == 3
     assert found["held_out"]["psnr"] is None
@@ -322,7 +323,7 @@ def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, m
         return timed(root, out, dataset, prior, settings)
 
     monkeypatch.setattr(case, "time_policy", told)
-    monkeypatch.setattr(free_fit, "time_free_fit", told)
+    monkeypatch.setattr(free_fit, "time_3dgs", told)
     out, table = tmp_path / "out", tmp_path / "out/results/table1.md"
     done(capsys, out, "--only", "table1")
     rows = {row["row"]: row for row in rows_of(out / "results/table1.csv")}
@@ -332,7 +333,8 @@ def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, m
         "random, draw 2": "6",
         "coverage, fewer images": "5",
         "all views": "8",
-        "all views, as 3DGS": "8",
+        "3DGS": "8",
+        "3DGS, random points": "8",
     }
     text = table.read_text()
     theirs = "| the paper's D-Optimal NBV, on its rock | 54 | – | – | – | 25.97 | 0.9654 |"
@@ -350,7 +352,7 @@ def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, m
     ending = "--policy d-optimal --batch 2 --seed-views 4 --budget 2 --random-seed 0"
     assert rows["d-optimal"]["command"].endswith(ending)
     batches = [settings.get("batch") for settings in asked]
-    assert batches == [None] * 6 + [2] * 5  # the fit to all views is no run
+    assert batches == [None] * 7 + [2] * 5  # 3DGS is no run
     assert "--only table1 --batch 2`" in table.read_text()
 
 
@@ -368,7 +370,7 @@ def test_table_1_is_there_for_the_rows_that_are_done(quick, tmp_path, capsys, mo
     assert done_rows == ["d-optimal", "random, draw 1"]
     text = (out / "results/table1.md").read_text()
     assert "| random, mean of 1 | 6 |" in text
-    left = "random, draw 2; coverage, fewer images; all views; all views, as 3DGS"
+    left = "random, draw 2; coverage, fewer images; all views; 3DGS; 3DGS, random points"
     assert f"Not done yet: {left}.\n" in text
 
 

@@ -79,7 +79,7 @@ class Slopes:
     gradient: norm of the derivative of an image's mean loss by a Gaussian's centre in the image, in
         units of half its width and height, mean over the images that show the Gaussian [N].
     before, step: number of steps made until the last call and until now.
-    extent: size of the scene, metres. most: largest number of Gaussians.
+    extent: size of the scene, metres (`extent_of`). most: largest number of Gaussians.
     """
 
     gradient: np.ndarray
@@ -192,17 +192,18 @@ def _size(model: Gaussians) -> np.ndarray:
     return np.exp(model.log_scales.max(1).astype(np.float64))
 
 
+def extent_of(cameras: Sequence[Camera]) -> float:
+    """Size of a scene, metres: 1.1 times the radius of the camera positions about their mean."""
+    positions = np.array([camera.position for camera in cameras])
+    return 1.1 * float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
+
+
 def slopes_of(
     sums: list[Any], cameras: Sequence[Camera], steps: tuple[int, int], most: int
 ) -> Slopes:
-    """`Slopes` from the sums of `View.slopes` between two numbers of steps.
-
-    The extent is 1.1 times the radius of the camera positions about their mean.
-    """
-    positions = np.array([camera.position for camera in cameras])
-    radius = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
+    """`Slopes` from the sums of `View.slopes` between two numbers of steps."""
     norms, views = (np.array(total) for total in sums)
-    return Slopes(norms / np.maximum(views, 1), *steps, 1.1 * radius, most)
+    return Slopes(norms / np.maximum(views, 1), *steps, extent_of(cameras), most)
 
 
 def _adaption_times(passes: int, images: int) -> list[int]:

@@ -87,7 +87,7 @@ def initial_gaussians(
     a file of a frame cannot be read, and as `mesh_depth`.
     """
     if prior.numbers.get("from") == "random":
-        return _scattered(prior, frames, gains)
+        return round_gaussians(prior.points, frames, gains)
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)
     colours = colours or colours_of(prior)
@@ -109,11 +109,13 @@ def initial_gaussians(
     return _with_backing(surface, prior), seen
 
 
-def _scattered(
-    prior: Prior, frames: Sequence[Frame], gains: np.ndarray | None
+def round_gaussians(
+    points: np.ndarray, frames: Sequence[Frame], gains: np.ndarray | None = None
 ) -> tuple[Gaussians, np.ndarray]:
-    """Round, nearly transparent Gaussians at random points, and whether a pixel shows them."""
-    points = prior.points
+    """Round, nearly transparent Gaussians at points [N,3], and whether a frame shows them [N].
+
+    gains: as in `initial_gaussians`.
+    """
     total, count = np.zeros((len(points), 3)), np.zeros(len(points))
     for k, frame in enumerate(frames):
         pixels, z = frame.camera.project(points)

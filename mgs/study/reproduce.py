@@ -34,15 +34,18 @@ TABLE_POLICIES = (
 SLOW_POLICIES = ("block-d",)
 """Last policies of Table I: a choice by 11x11 blocks takes 20 seconds at the paper's size."""
 
-ALL_VIEWS, FEWER, AS_3DGS = "all views", "coverage, fewer images", "all views, as 3DGS"
-"""Rows of Table I that are no policies: `uniform` until no frame is left; coverage with
-FEWER_IMAGES fewer images, as the paper counts; and a fit that is not held to a surface."""
+ALL_VIEWS, FEWER = "all views", "coverage, fewer images"
+"""Rows of Table I that are no policies: `uniform` until no frame is left; and coverage with
+FEWER_IMAGES fewer images, as the paper counts."""
 
 FEWER_IMAGES = 4
 
-FREE_FIT = "free-fit"
-OTHER_TASKS = {FREE_FIT: "mgs.study.free_fit:time_free_fit"}
-"""Tasks of runs that have no policy of `mgs nbv`."""
+ALL_3DGS: dict[str, dict[str, Any]] = {
+    "3DGS": {},
+    "3DGS, random points": {"random": True},
+    "3DGS, random points, twice the steps": {"random": True, "passes": 2},
+}
+"""Rows of Table I for 3DGS, which sees all views: settings of `mgs.study.free_fit.time_3dgs`."""
 
 RING = {"kind": "circle", "distances": [1]}
 """Orbit of Table I and of the numbers of seeds: the paper's."""
@@ -53,13 +56,14 @@ FIGURE_POLICIES = ("paper", "d-optimal", "coverage", "uniform")
 
 @dataclass(frozen=True)
 class RunSize:
-    """Images of the dataset, Gaussians of the prior, views chosen beyond the seeds, and how many of
-    these are chosen before the model is fitted again."""
+    """Images of the dataset, Gaussians of the prior, views chosen beyond the seeds, how many of
+    these are chosen before the model is fitted again, and number of rows for 3DGS."""
 
     images: Size
     gaussians: int
     budget: int
     batch: int = 1
+    rows_3dgs: int = 2
 
 
 TABLE_ROCK = Rock("boulder", 0)
@@ -96,7 +100,7 @@ SIZES = {
         RunSize(Size(320, 240, 32, 12), 10_000, 8), SetupSize(), SetupSize(gaussians=6000)
     ),
     "paper": ReproduceSize(
-        RunSize(Size(640, 480, 100, 24, spp=16), 100_000, 50),
+        RunSize(Size(640, 480, 100, 24, spp=16), 100_000, 50, rows_3dgs=3),
         SetupSize(320, 240, 24, 16),
         SetupSize(320, 240, 24, 16),
     ),
@@ -123,7 +127,8 @@ class Run:
 
     def cells(self) -> list[Cell]:
         """Cells of the run; the last is the run itself."""
-        task = OTHER_TASKS.get(self.policy, "mgs.study.case:time_policy")
+        is_3dgs = self.policy in ALL_3DGS
+        task = "mgs.study.free_fit:time_3dgs" if is_3dgs else "mgs.study.case:time_policy"
         return self.case.with_task(self.name, task, alone=True, settings=self.settings())
 
     @property
@@ -135,7 +140,8 @@ class Run:
         views += f"-by{settings['batch']}" if "batch" in settings else ""
         version = "".join(f"-{digest[:8]}" for digest in policy_record(self.policy).values())
         where = f"timed/{self.rock.name}/ring-{shape}"
-        return f"{where}/{self.label}{version}-{views}"
+        label = self.label.replace(", ", "-").replace(" ", "-")
+        return f"{where}/{label}{version}-{views}"
 
     @property
     def label(self) -> str:
@@ -143,18 +149,18 @@ class Run:
         return policy_file.label(self.policy)
 
     def settings(self) -> dict[str, Any]:
-        """Settings of `mgs nbv`; without a policy for OTHER_TASKS."""
-        settings: dict[str, Any] = {}
-        if self.policy not in OTHER_TASKS:
+        """Settings of `mgs nbv`, or of 3DGS."""
+        settings = ALL_3DGS.get(self.policy, {})
+        if self.policy not in ALL_3DGS:
             batch = {"batch": self.size.batch} if self.size.batch > 1 else {}
             settings = {"policy": self.policy, **batch}
         budget = self.size.budget if self.budget is None else self.budget
-        settings |= {"seeds": self.seeds, "budget": budget}
-        return settings | {"seed": self.rock.index + 1000 * self.draw}
+        views = {"seeds": self.seeds, "budget": budget}
+        return settings | views | {"seed": self.rock.index + 1000 * self.draw}
 
     def command(self) -> str:
-        """The `mgs nbv` that does the same in the study's folder; empty for OTHER_TASKS."""
-        if self.policy in OTHER_TASKS:
+        """The `mgs nbv` that does the same in the study's folder; empty for 3DGS."""
+        if self.policy in ALL_3DGS:
             return ""
         folders = self.cells()[-1].arguments
         options = " ".join(f"{flag(key)} {value}" for key, value in self.settings().items())
@@ -173,7 +179,8 @@ def table_runs(size: ReproduceSize) -> dict[str, Run]:
     runs[FEWER] = Run(TABLE_ROCK, one, "coverage", budget=one.budget - FEWER_IMAGES)
     runs[ALL_VIEWS] = Run(TABLE_ROCK, one, "uniform", budget=one.images.frames - SEEDS)
     runs |= {policy: Run(TABLE_ROCK, one, policy) for policy in SLOW_POLICIES}
-    runs[AS_3DGS] = Run(TABLE_ROCK, one, FREE_FIT, seeds=one.images.frames, budget=0)
+    for row in list(ALL_3DGS)[: one.rows_3dgs]:
+        runs[row] = Run(TABLE_ROCK, one, row, seeds=one.images.frames, budget=0)
     return runs
 
 
