@@ -59,7 +59,9 @@ def test_the_datasets_own_prior_is_the_default(dataset, tmp_path):
 
 def test_every_setting_of_the_fit_is_recorded_with_its_seed(dataset, prior, tmp_path):
     settings, _ = started(dataset, tmp_path / "run", prior, budget=2, seed=7)
-    assert settings["train"] == TrainSettings(seed=7, alpha_weight=ALPHA_WEIGHT).model_dump(mode="json")
+    assert settings["train"] == TrainSettings(seed=7, alpha_weight=ALPHA_WEIGHT).model_dump(
+        mode="json"
+    )
     assert settings["seed"] == 7
     settings, _ = started(dataset, tmp_path / "own", prior, budget=1, seed=3, train={"seed": 7})
     assert settings["train"]["seed"] == 7
