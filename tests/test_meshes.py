@@ -11,8 +11,9 @@ import trimesh
 from program import command, said
 from refusals import refused
 
+from mgs.data import meshes
 from mgs.data.dataset import Dataset
-from mgs.data.meshes import Mesh
+from mgs.data.meshes import Mesh, read_mesh
 from mgs.errors import InputError
 from mgs.prior.build import load_prior, prior_from_mesh
 from mgs.prior.settings import PriorSettings
@@ -84,6 +85,32 @@ def test_bad_mesh_is_one_line(dataset, tmp_path, case, capsys):
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match=re.escape(message)):
         load_rock(tmp_path / name, Rock())
+
+
+def test_a_plain_ply_is_read_as_trimesh_reads_it(tmp_path, monkeypatch):
+    path, ball = tmp_path / "a.ply", trimesh.creation.icosphere(subdivisions=2)
+    vertices, faces = ball.vertices + 0.1, np.vstack([ball.faces, ball.faces[:3, ::-1]])
+
+    def write(vertices, faces):
+        trimesh.Trimesh(vertices, faces, process=False).export(path)
+
+    write(vertices, faces)
+    assert meshes._plain_ply(path)
+    fast = read_mesh(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(meshes, "_plain_ply", lambda path: None)
+        slow = read_mesh(path)
+    for name in ("vertices", "faces", "seen"):
+        assert np.array_equal(getattr(fast, name), getattr(slow, name))
+    write(vertices, faces + 1)
+    with pytest.raises(InputError, match="names vertex"):
+        read_mesh(path)
+    write(np.where(vertices > 1, np.nan, vertices), faces)
+    with pytest.raises(InputError, match="is NaN"):
+        read_mesh(path)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(InputError, match="not a readable mesh"):
+        read_mesh(path)
 
 
 def test_a_mesh_that_is_small_and_far_away_is_one_line(tmp_path):

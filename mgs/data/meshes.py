@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -34,6 +35,13 @@ TEXTURES = (
     "emissiveTexture",
 )
 """Attributes of trimesh's materials that are images."""
+
+PLAIN_PLY = re.compile(
+    rb"ply\nformat binary_little_endian 1.0\n(?:comment [^\n]*\n)*element vertex (\d{1,9})\n"
+    rb"property float x\nproperty float y\nproperty float z\nelement face (\d{1,9})\n"
+    rb"property list uchar int vertex_indices\nend_header\n"
+)
+"""Header of a PLY file with vertices and triangles only."""
 
 FURTHEST = 1e15
 """Largest coordinate of a mesh, metres: the squares of areas must fit float32."""
@@ -101,26 +109,33 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
         raise InputError(
             f"{path}: not a readable mesh ({reason}); export it again as GLB, OBJ or PLY"
         ) from None
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+    if not isinstance(mesh, trimesh.Trimesh):
         raise InputError(f"{path}: has no faces; give a triangle mesh, not a point cloud")
-    if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
+    _check(path, mesh.vertices, mesh.faces)
+    return mesh
+
+
+def _check(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Raise InputError as `load_mesh` for unusable vertices and faces."""
+    if len(faces) == 0:
+        raise InputError(f"{path}: has no faces; give a triangle mesh, not a point cloud")
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         raise InputError(f"{path}: its vertices or faces have no three numbers; export it again")
-    if not np.isfinite(mesh.vertices).all():
-        first = int(np.argwhere(~np.isfinite(mesh.vertices))[0][0])
+    if not np.isfinite(vertices).all():
+        first = int(np.argwhere(~np.isfinite(vertices))[0][0])
         raise InputError(f"{path}: vertex {first} is NaN or infinite; repair the mesh")
-    absent = (mesh.faces < 0) | (mesh.faces >= len(mesh.vertices))
+    absent = (faces < 0) | (faces >= len(vertices))
     if absent.any():
         face, corner = np.argwhere(absent)[0]
-        named = f"vertex {mesh.faces[face, corner]} of {len(mesh.vertices)}"
+        named = f"vertex {faces[face, corner]} of {len(vertices)}"
         raise InputError(f"{path}: face {face} names {named}; repair the mesh")
-    if np.abs(mesh.vertices).max() > FURTHEST:
+    if np.abs(vertices).max() > FURTHEST:
         raise InputError(
             f"{path}: has vertices further than {FURTHEST:g} m from the origin; "
             "repair or scale the mesh"
         )
-    if not face_crosses(np.asarray(mesh.vertices, np.float64), mesh.faces).any():
+    if not face_crosses(np.asarray(vertices, np.float64), faces).any():
         raise InputError(f"{path}: none of its faces has an area; repair the mesh")
-    return mesh
 
 
 def _load(path: Path) -> Any:
@@ -158,6 +173,27 @@ def _check_textures(path: Path, mesh: Any) -> None:
             check_pixels(path, *image.size)
 
 
+def _plain_ply(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices and faces of a PLY file as `mgs.prior.build.save_prior` writes it, None of any other
+    file. (It takes 0.6 s to import trimesh.)"""
+    if path.suffix != ".ply" or not path.is_file():
+        return None
+    with reading(path), path.open("rb") as file, decoding(path):
+        header = PLAIN_PLY.match(file.read(1024))
+        if header is None:
+            return None
+        start, n, m = header.end(), int(header[1]), int(header[2])
+        if path.stat().st_size - start != 12 * n + 13 * m:
+            return None
+        file.seek(start)
+        data = file.read()
+    vertices = np.frombuffer(data, "<f4", 3 * n).reshape(n, 3)
+    lists = np.frombuffer(data, [("count", "u1"), ("faces", "<i4", 3)], m, 12 * n)
+    if (lists["count"] != 3).any():
+        return None
+    return vertices, lists["faces"]
+
+
 def read_mesh(path: str | Path) -> Mesh:
     """Read a triangle mesh in world coordinates, metres, as one clean surface, all of it seen.
 
@@ -165,9 +201,14 @@ def read_mesh(path: str | Path) -> Mesh:
     taken as they are. Faces without area, repeated faces and unused vertices are removed. Faces are
     wound as their neighbours, and outwards. Raises InputError as `load_mesh`.
     """
-    mesh = load_mesh(path)
-    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    if Path(path).suffix.lower() in GLTF:
+    path = Path(path)
+    if known := _plain_ply(path):
+        _check(path, *known)
+    else:
+        mesh = load_mesh(path)
+        known = mesh.vertices, mesh.faces
+    vertices, faces = np.asarray(known[0], np.float64), np.asarray(known[1], np.int64)
+    if path.suffix.lower() in GLTF:
         vertices = vertices @ WORLD_FROM_GLTF[:3, :3].T
     faces = faces[distinct_faces(vertices, faces)]
     place = _places(vertices)
