@@ -58,17 +58,22 @@ class Target:
     """Target of a fit as the kernels take it.
 
     values: mi.Float [H*W*S], with S = 3 to 5 channels as in `mgs.fit.fitting.fit`.
-    scale: factors of the C channels that are compared, mi.Float [C]: colours, and with C = 4 alpha.
+    alpha_factor: factor of the differences in alpha, mi.Float [1]; None: alpha is not compared.
     stored: S.
     """
 
     values: Any
-    scale: Any
+    alpha_factor: Any
     stored: int
+
+    @property
+    def channels(self) -> int:
+        """Number C of channels that are compared: three colours, and alpha."""
+        return 3 if self.alpha_factor is None else 4
 
     def __len__(self) -> int:
         """H*W*C, the number of values that are compared."""
-        return len(self.values) // self.stored * len(self.scale)
+        return len(self.values) // self.stored * self.channels
 
     @property
     def pixels(self) -> Any:
@@ -80,16 +85,18 @@ class Target:
     @property
     def weights(self) -> Any:
         """Factors of the differences to `pixels`, mi.Float [H*W*C]."""
-        pixel, channel = self._places()
-        scale = dr.gather(mi.Float, self.scale, channel)
         if self.stored == 3:
-            return scale
-        return dr.gather(mi.Float, self.values, pixel * self.stored + 3) * scale
+            return dr.full(mi.Float, 1, len(self))
+        pixel, channel = self._places()
+        known = dr.gather(mi.Float, self.values, pixel * self.stored + 3)
+        if self.alpha_factor is None:
+            return known
+        return known * dr.select(channel == 3, self.alpha_factor, 1)
 
     def _places(self) -> tuple[Any, Any]:
         """Pixel and channel of each value that is compared, mi.UInt32 [H*W*C]."""
-        index, channels = dr.arange(mi.UInt32, len(self)), len(self.scale)
-        return index // channels, index % channels
+        index = dr.arange(mi.UInt32, len(self))
+        return index // self.channels, index % self.channels
 
 
 @dataclass(frozen=True)
@@ -103,7 +110,7 @@ class Photo:
     @property
     def size(self) -> tuple[int, int, int]:
         """Width, height and number of channels."""
-        return self.camera.width, self.camera.height, len(self.target.scale)
+        return self.camera.width, self.camera.height, self.target.channels
 
     @property
     def nbytes(self) -> int:
@@ -361,16 +368,16 @@ def filled(values: float | np.ndarray, shape: tuple[int, ...]) -> Any:
 def _photo(camera: Camera, target: np.ndarray, alpha_weight: float) -> Photo:
     """A `Photo` from a target of `fit`. Raises InputError if alpha has a weight and the target has
     no alpha."""
-    scale, stored = [1.0, 1.0, 1.0], target.shape[-1]
+    factor, stored = None, target.shape[-1]
     if alpha_weight:
         if stored < 5:
             raise InputError(
                 f"target: has {stored} channels, and with a weight for alpha it needs 5, "
                 "alpha as the last"
             )
-        scale.append(np.sqrt(alpha_weight))
-    values, factors = mi.Float(adopted(target).ravel()), mi.Float(padded(scale))
-    return Photo(camera, camera_array(camera), Target(values, factors, stored))
+        factor = dr.opaque(mi.Float, float(np.sqrt(alpha_weight)))
+    values = mi.Float(adopted(target).ravel())
+    return Photo(camera, camera_array(camera), Target(values, factor, stored))
 
 
 @one_at_a_time
