@@ -21,3 +21,9 @@ def linear_from_srgb(srgb: ArrayLike) -> NDArray[np.float32]:
     """Convert sRGB in [0,1] of any shape to linear RGB (IEC 61966-2-1)."""
     c = np.asarray(srgb, np.float32)
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def linear_from_pixels(pixels: np.ndarray) -> NDArray[np.float32]:
+    """Convert sRGB pixels of 8 or 16 bits (uint8, uint16) to linear RGB, by a table."""
+    most = np.iinfo(pixels.dtype).max
+    return linear_from_srgb(np.arange(most + 1, dtype=np.float32) / most)[pixels]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mgs.camera import MAX_PIXELS, MAX_SIDE
-from mgs.colour import linear_from_srgb, srgb_from_linear
+from mgs.colour import linear_from_pixels, srgb_from_linear
 from mgs.errors import InputError
 from mgs.files import atomic_path, not_writable, reading
 from mgs.memory import check_room, decoding
@@ -202,8 +202,7 @@ def read_rgba(path: str | Path) -> np.ndarray:
 def read_png(path: str | Path) -> np.ndarray:
     """Read an sRGB image of 8 or 16 bits as linear RGB float32 [H,W,3], without alpha. Raises
     InputError as `read_rgba`."""
-    rgba = read_rgba(path)
-    return linear_from_srgb(rgba[..., :3].astype(np.float32) / np.iinfo(rgba.dtype).max)
+    return linear_from_pixels(read_rgba(path)[..., :3])
 
 
 def read_mask(path: str | Path) -> np.ndarray:

@@ -190,7 +190,7 @@ def _mask_and_rock(
     alpha = layer[..., 3]
     if given is None and shot.mask is None and ((alpha > 0) & (alpha < full)).any():
         given = rgba
-    rock = None if given is None else undo(premultiplied(given.astype(np.float32) / full), True)
+    rock = None if given is None else undo(premultiplied(given), True)
     if shot.mask is not None:
         mask = read_fitting(read_mask, shot.mask, shot.camera)
         return undo(mask.astype(np.uint8) * 255, True) >= 128, rock

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from mgs.colour import linear_from_srgb, srgb_from_linear
+from mgs.colour import linear_from_pixels, srgb_from_linear
 from mgs.images import read_rgba, write_png
 
 
@@ -26,14 +26,14 @@ def write_rock_image(path: str | Path, rgba: np.ndarray) -> None:
 def read_rock_image(path: str | Path) -> np.ndarray:
     """Read an sRGB PNG with straight alpha, 8 or 16 bits, as linear RGB premultiplied by alpha, and
     alpha: float32 [H,W,4]. Raises InputError as `mgs.images.read_rgba`."""
-    pixels = read_rgba(path)
-    return premultiplied(pixels.astype(np.float32) / np.iinfo(pixels.dtype).max)
+    return premultiplied(read_rgba(path))
 
 
-def premultiplied(rgba: np.ndarray) -> np.ndarray:
-    """sRGB with straight alpha [H,W,4], 0 to 1 -> linear RGB premultiplied by alpha."""
-    alpha = rgba[..., 3:]
-    colour = linear_from_srgb(rgba[..., :3]) * alpha
+def premultiplied(pixels: np.ndarray) -> np.ndarray:
+    """sRGB with straight alpha [H,W,4], uint8 or uint16 -> linear RGB premultiplied by alpha, and
+    alpha, float32."""
+    alpha = pixels[..., 3:].astype(np.float32) / np.iinfo(pixels.dtype).max
+    colour = linear_from_pixels(pixels[..., :3]) * alpha
     return np.concatenate([colour, alpha], axis=-1, dtype=np.float32)
 
 
