@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -196,3 +197,9 @@ def opengl_from_opencv(world_to_camera: ArrayLike) -> NDArray[np.float64]:
     """Invert world_to_camera [4,4] (OpenCV) to nerfstudio's camera-to-world [4,4] (OpenGL)."""
     pose = np.linalg.inv(np.asarray(world_to_camera, np.float64))
     return np.asarray(pose @ _OPENGL_FROM_OPENCV, np.float64)
+
+
+def extent_of(cameras: Sequence[Camera]) -> float:
+    """Size of a scene, metres: 1.1 times the radius of the camera positions about their mean."""
+    positions = np.array([camera.position for camera in cameras])
+    return 1.1 * float(np.linalg.norm(positions - positions.mean(0), axis=1).max())

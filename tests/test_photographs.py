@@ -30,6 +30,7 @@ from mgs.data.sources import read_source
 from mgs.data.up import degrees_between, unit_up, up_of_cameras, upright
 from mgs.errors import InputError
 from mgs.files import read_json, write_json
+from mgs.fit import density
 from mgs.images import write_png
 from mgs.prior import hull
 from mgs.prior.build import build_prior, load_prior, prior_and_cloud
@@ -37,6 +38,7 @@ from mgs.prior.hull import visual_hull
 from mgs.prior.initial import initial_gaussians
 from mgs.prior.points import _grown, main_cluster, on_surface, reliable
 from mgs.prior.settings import PriorSettings
+from mgs.splat_files import load_gaussians
 
 Make = Callable[[str], Path]
 
@@ -464,6 +466,28 @@ def test_poses_alone_are_fitted_from_random_points(data, tmp_path, capfd):
     start, seen = initial_gaussians(load_prior(tmp_path / "d/prior"), frames)
     assert seen.mean() > 0.9
     assert np.allclose(start.opacities, 0.1)
+
+
+def test_a_fit_with_adaptive_density_is_a_run_as_3dgs(data, tmp_path, capfd, monkeypatch):
+    bare(tmp_path / "d", data)
+    command("prior", tmp_path / "d", "--gaussians", "300")
+    for name, value in (("FROM", 0), ("STEPS", 10)):
+        monkeypatch.setattr(density, f"ADAPTION_{name}", value)
+    fitted = ["fit", tmp_path / "d", "--density", "adaptive", "--out", tmp_path / "run"]
+    assert exit_code(*fitted, "--most-gaussians", 0) == 2
+    one_line(capfd.readouterr().err, "--most-gaussians 0: must be at least 1", tmp_path / "run")
+    assert exit_code(*fitted, "--loss", "l3") == 2
+    one_line(capfd.readouterr().err, "choose one of squared, l1-dssim", tmp_path / "run")
+    command(*fitted, "--passes", 8, "--most-gaussians", 310, "--rate", "mean=0.01")
+    settings = read_json(tmp_path / "run/config.json")["settings"]
+    train = settings["train"]
+    assert (settings["sh"], train["means"], train["optimiser"]) == (3, "free", "adam")
+    assert train["rates"]["mean"] == 0.01
+    assert train["rates"]["scale"] == 5e-3
+    count = len(load_gaussians(tmp_path / "run/gaussians.ply"))
+    assert 0 < count <= 310
+    assert count != 300
+    command("eval", tmp_path / "run")
 
 
 def test_test_views_get_masks_too(data, tmp_path):

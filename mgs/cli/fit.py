@@ -16,27 +16,18 @@ from mgs.cli.options import DatasetFolder, Force, option, parse_gaussians
 
 PANELS = {
     "Fitting": (
-        *(
-            "passes",
-            "means",
-            "sh",
-            "density",
-            "most_gaussians",
-            "loss",
-            "exposure",
-            "alpha_weight",
-            "optimiser",
-            "rates",
-        ),
+        "passes", "means", "sh", "density", "most_gaussians", "loss", "exposure", "alpha_weight",
+        "optimiser", "rates",
     ),
     "Advanced": ("pixel_noise", "prior_std", "seed"),
-}
+}  # fmt: skip
 """Settings with an option of the same name, as `mgs.cli.nbv.PANELS`."""
 
 DEFAULTS = {
-    "passes": " Default: 30 with free means from photographs, else 10.",
-    "means": " Default: free from photographs, else frozen.",
-    "sh": " Default: 1 with free means from photographs, else 0.",
+    "passes": " Default: 30 with adaptive density or free means from photographs, else 10.",
+    "means": " Default: free from photographs or with adaptive density, else frozen.",
+    "sh": " Default: 3 with adaptive density, 1 with free means from photographs, else 0.",
+    "density": " The defaults of adaptive are all those of 3DGS.",
 }
 """Help of the settings that `mgs.run.nbv.start_fit` decides by the prior."""
 

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.special import comb, logit
 
-from mgs.camera import Camera
+from mgs.camera import Camera, extent_of
 from mgs.colour import SH_C0
 from mgs.fit.objective import Objective, View
 from mgs.gaussians import Gaussians
@@ -190,12 +190,6 @@ def adapt(
 def _size(model: Gaussians) -> np.ndarray:
     """Largest standard deviation of each Gaussian, metres [N]."""
     return np.exp(model.log_scales.max(1).astype(np.float64))
-
-
-def extent_of(cameras: Sequence[Camera]) -> float:
-    """Size of a scene, metres: 1.1 times the radius of the camera positions about their mean."""
-    positions = np.array([camera.position for camera in cameras])
-    return 1.1 * float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
 
 
 def slopes_of(

@@ -30,7 +30,7 @@ from mgs.fit.objective import (
 from mgs.fit.optimisers import INFORMATION_PASSES, OPTIMISERS
 from mgs.fit.settings import TrainSettings
 from mgs.fit.stopping import StopReason, stop_reason
-from mgs.gaussians import Gaussians, learned
+from mgs.gaussians import MAX_SH_DEGREE, Gaussians, learned
 from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit
 from mgs.splat.recording import frozen
@@ -148,9 +148,9 @@ def fit(
         value / unit of the parameter)^2: a number, or except for means an array that broadcasts to
         the parameter's shape. Default 0.
     normals: directions of means that move along them [N,3], of any length but 0.
-    learns: masks of the Gaussians that learn a kind of parameter, or factors of its rate, broadcast
-        to its shape ([N], [N,1] or, for colours, [N,K,1]). The others keep their values, except
-        colours below COLOUR_MIN. Default: all learn.
+    learns: masks of the Gaussians that learn a kind of parameter, broadcast to its shape ([N],
+        [N,1] or, for colours, [N,K,1]). The others keep their values, except colours below
+        COLOUR_MIN. Default: all learn.
 
     Raises InputError if a parameter is not finite, optimiser or loss are unknown, `start` has
     another shape, means are to move without normals or without a rate, or a required alpha is
@@ -159,9 +159,7 @@ def fit(
     settings = settings or TrainSettings()
     optimiser = row_named(OPTIMISERS, settings.optimiser, "optimiser")
     density = row_named(DENSITIES, settings.density, "density")
-    factors = {kind: np.asarray(factor) for kind, factor in (learns or {}).items()}
-    alike = all(factor.ndim == 0 or len(factor) == 1 for factor in factors.values())
-    if density and (settings.means != "free" or not alike):
+    if density and (settings.means != "free" or learns):
         raise InputError("density: Gaussians can move only where all learn free means")
     kinds = learned(settings.means).values()
     if missing := [kind for kind in kinds if kind not in settings.rates]:
@@ -196,7 +194,8 @@ def fit(
         if optimiser.uses_information and (changes or done % INFORMATION_PASSES == 0):
             information = goal.largest_diagonal(model)
         shapes = [offset.shape for offset, _ in goal.offsets(model)]
-        rates = _rates(settings, dict(zip(kinds, shapes, strict=True)), factors, done, len(cameras))
+        of_kind = dict(zip(kinds, shapes, strict=True))
+        rates = _rates(settings, of_kind, learns or {}, done, len(cameras))
         order = rng.permutation(len(goal.photos))
         learning = buffers, information, rates, slopes
         model, buffers, loss, slopes = _pass(
@@ -218,19 +217,21 @@ def fit(
 def _rates(
     settings: TrainSettings,
     shapes: Mapping[str, tuple[int, ...]],
-    factors: Mapping[str, np.ndarray],
+    learns: Mapping[str, np.ndarray],
     done: int,
     images: int,
 ) -> list[Any]:
     """Rate of each kind of parameter, of these shapes, after some passes over the images: a Float
-    of one number or one per parameter. factors: of the rates, as `learns` of `fit`."""
+    of one number or one per parameter. learns: as in `fit`."""
     fall, found = settings.decay ** (done / max(settings.passes - 1, 1)), []
     for kind, shape in shapes.items():
         rate: Any = settings.rates[kind] * (1.0 if kind in settings.steady_rates else fall)
-        rate = rate * factors.get(kind, 1.0)
-        if kind == "colour" and settings.sh_steps:
-            degree = done * images // settings.sh_steps
-            rate = rate * (np.arange(shape[1]) < (degree + 1) ** 2)[:, None]
+        rate = rate * learns.get(kind, 1.0)
+        if kind == "colour" and shape[1] > 1:
+            degree = done * images // settings.sh_steps if settings.sh_steps else MAX_SH_DEGREE
+            factors = np.where(np.arange(shape[1]) > 0, settings.directional_rate, 1.0)
+            factors[(degree + 1) ** 2 :] = 0
+            rate = rate * factors[:, None]
         found.append(filled(rate, shape))
     return found
 

@@ -76,7 +76,28 @@ class TrainSettings(BaseModel):
     """Kinds of parameters whose rates do not fall."""
     sh_steps: Annotated[int, Field(ge=0)] = 0
     """Steps after which colours learn one more SH degree; 0: they learn all from the start."""
+    directional_rate: Annotated[float, Field(ge=0, le=1)] = 1.0
+    """Rate of colours of SH degree 1 and more, over that of degree 0."""
     seed: Annotated[int, Field(ge=0)] = 0
     """Seed of the order of images in each pass."""
 
     _every_kind = field_validator("rates", mode="before")(lambda given: complete(given, RATES))
+
+
+def as_3dgs(extent: float) -> dict[str, Any]:
+    """Values of `TrainSettings` as in Kerbl et al. 2023, for any number of passes.
+
+    extent: of the scene, metres (`mgs.camera.extent_of`).
+    """
+    steady = {"colour": 2.5e-3, "scale": 5e-3, "rotation": 1e-3, "opacity": 5e-2}
+    return {
+        "means": "free",
+        "density": "adaptive",
+        "loss": "l1-dssim",
+        "optimiser": "adam",
+        "rates": steady | {"mean": 1.6e-4 * extent},
+        "steady_rates": tuple(steady),
+        "decay": 0.01,
+        "sh_steps": 1000,
+        "directional_rate": 1 / 20,
+    }

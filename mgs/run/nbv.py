@@ -10,9 +10,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mgs import runtime
+from mgs.camera import extent_of
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError, row_named
 from mgs.files import THERE, Ours, atomic_folder, reading
+from mgs.fit.settings import as_3dgs
+from mgs.gaussians import MAX_SH_DEGREE
 from mgs.policy.from_file import in_file, is_function, label, name_of, source_of
 from mgs.policy.registry import policy_of
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
@@ -172,14 +175,20 @@ def start_fit(
     """`start_run` of a run that takes all images at once and chooses none.
 
     By default means are free where the prior comes from photographs (`LOOSE`), with FREE_PASSES
-    passes, FREE_DECAY, colours of degree FREE_SH and a looser prior, else frozen. Arguments and
-    errors as `start_run`.
+    passes, FREE_DECAY, colours of degree FREE_SH and a looser prior, else frozen. With adaptive
+    density, settings and degree are by default those of 3DGS (`as_3dgs`). Arguments and errors as
+    `start_run`.
     """
     root = Path(dataset)
     loaded, train = load_dataset(root), dict(settings.pop("train", {}))
     found = Path(prior) if prior is not None else root / "prior"
     known = gaussians is None and (prior is not None or (found / "prior.json").is_file())
     source = load_prior(found).numbers.get("from") if known else source_of_prior(loaded.survey())
+    if train.get("density") == "adaptive":
+        recipe = as_3dgs(extent_of([frame.camera for frame in loaded.frames]))
+        rates = recipe["rates"] | train.get("rates", {})
+        train = {"passes": FREE_PASSES} | recipe | train | {"rates": rates}
+        settings.setdefault("sh", MAX_SH_DEGREE)
     train.setdefault("means", "free" if source in LOOSE else "frozen")
     loose = 1.0
     if train["means"] == "free" and source in LOOSE:

@@ -220,7 +220,16 @@ def settings_in(file: Path) -> dict[str, Any]:
 BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 """Words for the limits of pydantic's numbers."""
 
-NO_OPTION = ("warm_rate", "tolerance", "decay", "steady_rates", "sh_steps", "dataset", "prior")
+NO_OPTION = (
+    "warm_rate",
+    "tolerance",
+    "decay",
+    "steady_rates",
+    "sh_steps",
+    "directional_rate",
+    "dataset",
+    "prior",
+)
 """Settings without an option of their own."""
 
 

@@ -10,17 +10,14 @@ less than 30,000 steps it changes during the first half of the steps.
 
 from __future__ import annotations
 
-import math
 import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from mgs.camera import extent_of
 from mgs.data.dataset import load_dataset, target_of
-from mgs.fit.density import extent_of
 from mgs.fit.fitting import fit
-from mgs.fit.settings import TrainSettings
+from mgs.fit.settings import TrainSettings, as_3dgs
 from mgs.memory import IMAGE_BYTES, Deferred, kept_within
 from mgs.prior.build import load_prior
 from mgs.prior.initial import round_gaussians
@@ -32,17 +29,8 @@ from mgs.study.case import in_new_process, peak_megabytes, test_views_of
 PASSES = 150
 """Passes over all images: 15,000 steps for the 100 images of the paper."""
 
-DEGREE, DEGREE_STEPS = 3, 1000
-"""Degree of the spherical harmonics, and steps after which each degree begins to be learned."""
-
-RATES = {"colour": 2.5e-3, "scale": 5e-3, "rotation": 1e-3, "opacity": 5e-2}
-"""Learning rates of Kerbl et al., which do not fall."""
-
-DIRECTIONAL_RATE = 1 / 20
-"""Rate of colours of degree 1 and more, over that of degree 0."""
-
-MEAN_RATE, MEAN_DECAY = 1.6e-4, 0.01
-"""Learning rate of means, over the extent of the scene, and the factor by which it falls."""
+DEGREE = 3
+"""Degree of the spherical harmonics."""
 
 
 def time_3dgs(
@@ -61,25 +49,12 @@ def _fit(dataset: Path, prior: Path, settings: dict[str, Any]) -> dict[str, Any]
         points = scattered(data, PriorSettings(gaussians=len(points), seed=seed))[1]
     began = time.perf_counter()
     cameras = [frame.camera for frame in frames]
-    train = TrainSettings(
-        means="free",
-        density="adaptive",
-        loss="l1-dssim",
-        optimiser="adam",
-        passes=math.ceil(settings.get("passes", 1) * PASSES),
-        tolerance=0,
-        rates=RATES | {"mean": MEAN_RATE * extent_of(cameras)},
-        steady_rates=tuple(RATES),
-        decay=MEAN_DECAY,
-        sh_steps=DEGREE_STEPS,
-        seed=seed,
-    )
+    passes = settings.get("passes", 1) * PASSES
+    train = TrainSettings(**as_3dgs(extent_of(cameras)), passes=passes, tolerance=0, seed=seed)
     start = round_gaussians(points, frames)[0].with_degree(DEGREE)
     kept = kept_within(IMAGE_BYTES, lambda i: target_of(frames[i]), lambda target: target.nbytes)
     targets = Deferred(range(len(frames)), kept)
-    of_degree = np.where(np.arange((DEGREE + 1) ** 2) > 0, DIRECTIONAL_RATE, 1.0)
-    learns = {"colour": of_degree[None, :, None]}
-    model = fit(start, cameras, targets, train, learns=learns).gaussians
+    model = fit(start, cameras, targets, train).gaussians
     seconds, peak = time.perf_counter() - began, peak_megabytes()
     tests = test_views_of(data).frames
     metrics = evaluate_model(model, frames, [frame.name for frame in frames], test_frames=tests)
