@@ -11,6 +11,7 @@ never trained on; and the test views (`Dataset.test_views`), the same for every 
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 from collections import deque
@@ -30,6 +31,7 @@ from mgs.errors import InputError
 from mgs.files import atomic_path, working_in, write_json
 from mgs.gaussians import Gaussians
 from mgs.images import PNG_LEVEL, read_png
+from mgs.memory import release
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_surface
 from mgs.provenance import versions
 from mgs.report.runs import read_metrics
@@ -226,6 +228,8 @@ def evaluate_run(
     on the run.
     """
     run = run if isinstance(run, Run) else open_run(run)
+    gc.collect()  # images and lists of the run itself, if it ended in this process
+    release()
     file, folder = run.folder / "metrics.json", run.folder / "renders"
     with working_in(run.folder):
         gaussians, dataset = run.state.gaussians, run.dataset
