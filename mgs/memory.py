@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import re
 import resource
 from collections.abc import Callable, Iterator, Sequence
@@ -34,18 +35,25 @@ def check_room(needed: float, what: str, instead: str) -> None:
     """Raise InputError if `what` needs more bytes than are free, with what to do `instead`.
 
     The system would kill the process without a message. Systems that do not report free memory are
-    trusted. The memory that Dr.Jit caches is released before anything is refused.
+    trusted. Memory kept for reuse is released before anything is refused.
     """
     if needed <= LITTLE or needed <= _spare():
         return
-    import drjit as dr
-
-    dr.flush_malloc_cache()
+    release()
     if needed > (spare := _spare()):
         raise InputError(
             f"{what} may take {needed / 2**30:,.1f} GiB, "
             f"and {spare / 2**30:,.1f} GiB are free; {instead}"
         )
+
+
+def release() -> None:
+    """Return freed memory, which Dr.Jit and the C library keep for reuse, to the system."""
+    import drjit as dr
+
+    dr.flush_malloc_cache()
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # of glibc only
+        trim(0)
 
 
 @contextmanager
