@@ -24,6 +24,9 @@ VIEW_BYTES = 1 << 29
 """Most memory of the information of views about one model that are kept for several choices, bytes:
 122 views of 100,000 Gaussians. That of others is computed again for each choice."""
 
+KEPT_BYTES = 1 << 29
+"""Memory of a process, bytes, up to which what is freed is kept for reuse, which is faster."""
+
 LITTLE = 1 << 30
 """Bytes up to which `check_room` checks nothing, to be quick for small images."""
 
@@ -47,8 +50,11 @@ def check_room(needed: float, what: str, instead: str) -> None:
         )
 
 
-def release() -> None:
-    """Return freed memory, which Dr.Jit and the C library keep for reuse, to the system."""
+def release(beyond: int = 0) -> None:
+    """Return freed memory, which Dr.Jit and the C library keep for reuse, to the system, if this
+    process holds more than `beyond` bytes."""
+    if _held(1) <= beyond:
+        return
     import drjit as dr
 
     dr.flush_malloc_cache()
@@ -68,8 +74,7 @@ def decoding(path: Path) -> Iterator[None]:
     spare = _spare()
     bounded = limits[0] == resource.RLIM_INFINITY and spare < float("inf")
     if bounded:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-        most = pages * resource.getpagesize() + int(spare)
+        most = int(_held(0) + spare)
         resource.setrlimit(resource.RLIMIT_AS, (most, limits[1]))
     try:
         yield
@@ -81,6 +86,16 @@ def decoding(path: Path) -> Iterator[None]:
     finally:
         if bounded:
             resource.setrlimit(resource.RLIMIT_AS, limits)
+
+
+def _held(kind: int) -> float:
+    """Bytes of this process: 0, of its address space; 1, in memory. Infinity if the system does not
+    report them."""
+    try:
+        pages = Path("/proc/self/statm").read_text(encoding="ascii").split()
+    except OSError:
+        return float("inf")
+    return float(pages[kind]) * resource.getpagesize()
 
 
 def _spare() -> float:

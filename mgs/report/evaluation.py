@@ -31,7 +31,7 @@ from mgs.errors import InputError
 from mgs.files import atomic_path, working_in, write_json
 from mgs.gaussians import Gaussians
 from mgs.images import PNG_LEVEL, read_png
-from mgs.memory import release
+from mgs.memory import KEPT_BYTES, release
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_surface
 from mgs.provenance import versions
 from mgs.report.runs import read_metrics
@@ -229,7 +229,7 @@ def evaluate_run(
     """
     run = run if isinstance(run, Run) else open_run(run)
     gc.collect()  # images and lists of the run itself, if it ended in this process
-    release()
+    release(KEPT_BYTES)
     file, folder = run.folder / "metrics.json", run.folder / "renders"
     with working_in(run.folder):
         gaussians, dataset = run.state.gaussians, run.dataset

@@ -15,7 +15,7 @@ from mgs.data.frames import Frame, as_captured
 from mgs.fit.fitting import Fit, fit
 from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians
-from mgs.memory import IMAGE_BYTES, kept_within, release
+from mgs.memory import IMAGE_BYTES, KEPT_BYTES, kept_within, release
 from mgs.metrics import colour_corrected, psnr
 from mgs.policy.criteria import lam_by_kind
 from mgs.prior.build import Prior
@@ -54,9 +54,9 @@ def operations_of(
         train: TrainSettings,
         on_pass: Callable[[int, int], None],
     ) -> Fit:
-        release()  # what scores took, and then what the fit took
+        release(KEPT_BYTES)  # what scores took, and then what the fit took
         found = fit(gaussians, cameras, targets, train, on_pass, cache, start, lam, normals)
-        release()
+        release(KEPT_BYTES)
         return found
 
     def estimate(gaussians: Gaussians, camera: Camera, estimator: str) -> np.ndarray:
