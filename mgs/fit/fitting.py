@@ -193,9 +193,9 @@ def fit(
             dr.make_opaque(slopes)
         if optimiser.uses_information and (changes or done % INFORMATION_PASSES == 0):
             information = goal.largest_diagonal(model)
-        shapes = [offset.shape for offset, _ in goal.offsets(model)]
-        of_kind = dict(zip(kinds, shapes, strict=True))
-        rates = _rates(settings, of_kind, learns or {}, done, len(cameras))
+        parts = zip(kinds, goal.offsets(model), strict=True)
+        shapes = {kind: offset.shape for kind, (offset, _) in parts}
+        rates = _rates(settings, shapes, learns or {}, done, len(cameras))
         order = rng.permutation(len(goal.photos))
         learning = buffers, information, rates, slopes
         model, buffers, loss, slopes = _pass(
@@ -227,7 +227,7 @@ def _rates(
     for kind, shape in shapes.items():
         rate: Any = settings.rates[kind] * (1.0 if kind in settings.steady_rates else fall)
         rate = rate * learns.get(kind, 1.0)
-        if kind == "colour" and shape[1] > 1:
+        if kind == "colour" and (settings.sh_steps or settings.directional_rate < 1):
             degree = done * images // settings.sh_steps if settings.sh_steps else MAX_SH_DEGREE
             factors = np.where(np.arange(shape[1]) > 0, settings.directional_rate, 1.0)
             factors[(degree + 1) ** 2 :] = 0

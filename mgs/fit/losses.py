@@ -17,10 +17,15 @@ DSSIM_SHARE = 0.2
 SSIM_CONSTANTS = 0.01**2, 0.03**2
 """Constants of SSIM for values from 0 to 1 (Wang et al. 2004)."""
 
-_offsets = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
-_window = np.exp(-0.5 * (_offsets / SSIM_SIGMA) ** 2)
-TAPS = [*zip(_offsets.tolist(), (_window / _window.sum()).tolist(), strict=True)]
-"""(offset in pixels, weight) of the Gaussian window of SSIM along an axis."""
+HALF = SSIM_WINDOW // 2
+"""Pixels of the window of SSIM on each side of its centre."""
+
+_window = np.exp(-0.5 * (np.arange(-HALF, HALF + 1) / SSIM_SIGMA) ** 2)
+WINDOW = (_window / _window.sum()).tolist()
+"""Weights of the window of SSIM along an axis."""
+
+STRIP = 8
+"""Values of an image that one lane makes."""
 
 Size = tuple[int, int, int]
 """Width, height and channels of an image."""
@@ -84,19 +89,29 @@ class _Blur(dr.CustomOp):
 
 
 def _blurred(images: tuple[Any, ...], size: Size) -> tuple[Any, ...]:
-    """Images convolved with the window of SSIM, 0 beyond the border."""
+    """Images convolved with the window of SSIM, 0 beyond the border.
+
+    A lane makes STRIP values of a row or column, which share what they read.
+    """
     width, height, channels = size
-    index = dr.arange(mi.Int32, width * height * channels)
-    column, row = index // channels % width, index // (channels * width)
-    for place, length, stride in ((column, width, channels), (row, height, channels * width)):
+    for length, stride in ((width, channels), (height, channels * width)):
         dr.eval(images)
-        sums = [dr.zeros(mi.Float, len(index)) for _ in images]
-        for offset, weight in TAPS:
-            inside = (place + offset >= 0) & (place + offset < length)
-            at = index + offset * stride
-            sums = [
-                dr.fma(dr.gather(mi.Float, image, at, inside), weight, total)
-                for image, total in zip(images, sums, strict=True)
+        lane = dr.arange(mi.Int32, -(-length // STRIP) * (width * height * channels // length))
+        line, first = lane % stride, lane // stride % -(-length // STRIP) * STRIP
+        line += lane // (stride * -(-length // STRIP)) * (stride * length)
+        blurred = tuple(dr.empty(mi.Float, len(image)) for image in images)
+        for image, out in zip(images, blurred, strict=True):
+            places = [first + k for k in range(-HALF, STRIP + HALF)]
+            near = [
+                dr.gather(mi.Float, image, line + at * stride, (at >= 0) & (at < length))
+                for at in places
             ]
-        images = tuple(sums)
+            for k in range(STRIP):
+                value, at = mi.Float(0), places[k + HALF]
+                for weight, part in zip(WINDOW, near[k:], strict=False):
+                    value = dr.fma(part, weight, value)
+                where = line + at * stride
+                dr.scatter(out, value, where, at < length, mode=dr.ReduceMode.NoConflicts)
+            dr.eval(out)  # several images in one kernel are three times slower
+        images = blurred
     return images
