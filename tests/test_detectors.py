@@ -59,7 +59,7 @@ BAD = {
     ),
     "pose": ({"views": one_bad(offset=0.2)}, "20.0 % of the rock's size"),
     "outlier": ({"views": (GOOD, GOOD, GOOD, replace(GOOD, error=0.2))}, "10.0 times"),
-    "means": ({"drift": 4.0}, "4.0 standard deviations"),
+    "means": ({"drift": 5.0}, "5.0 standard deviations"),
     "coverage": ({"coverage": 0.2}, "only 20 %"),
     "saturated": ({"gains": (0.5, 0.3, 0.01)}, "gained 2 %"),
 }
@@ -152,10 +152,10 @@ def test_a_perfect_render_explains_all_and_a_single_colour_nothing():
     assert view_indicators(target, ~mask, truth, FITS) == ViewIndicators(FITS, 0.0, 0.0)
 
 
-def test_drift_is_in_standard_deviations_of_a_gaussian():
-    start, log_scales = np.zeros((5, 3)), np.log(np.full((5, 3), 0.1))
-    assert means_drift(start, start, log_scales) == 0
-    assert means_drift(start + np.array([0.2, 0, 0]), start, log_scales) == pytest.approx(2)
+def test_drift_is_in_standard_deviations_of_the_prior():
+    start = np.zeros((5, 3))
+    assert means_drift(start, start, 0.1) == 0
+    assert means_drift(start + np.array([0.2, 0, 0]), start, 0.1) == pytest.approx(2)
 
 
 def test_an_image_without_known_colours_has_no_residual():

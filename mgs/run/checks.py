@@ -59,8 +59,9 @@ class Checks:
         ]
         start, coverage = problem.start, steps[-1]["coverage"]
         drift = 0.0  # changed Gaussians are not those of the start
-        if problem.settings.train.density == "fixed":
-            drift = detectors.means_drift(fit.gaussians.means, start.means, start.log_scales)
+        std = problem.settings.prior_std.get("mean")
+        if std and problem.settings.train.density == "fixed":
+            drift = detectors.means_drift(fit.gaussians.means, start.means, std)
         indicators = detectors.step_indicators(views, fit.losses, coverage, scores, drift)
         before_this = next(
             (step["indicators"] for step in reversed(steps[:-1]) if "indicators" in step), None
