@@ -100,4 +100,5 @@ def as_3dgs(extent: float) -> dict[str, Any]:
         "decay": 0.01,
         "sh_steps": 1000,
         "directional_rate": 1 / 20,
+        **COLOURS_ALONE,
     }
