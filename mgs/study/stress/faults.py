@@ -21,7 +21,7 @@ from mgs.data.dataset import target_of
 from mgs.data.frames import Frame
 from mgs.fit.settings import PASSES
 from mgs.gaussians import Gaussians
-from mgs.policy.criteria import coverage
+from mgs.policy.criteria import MEAN_STD, coverage
 from mgs.prior.build import Prior
 from mgs.run import detectors
 from mgs.run.detectors import DETECTORS
@@ -259,7 +259,8 @@ def indicators_of(
         margin = detectors.outline_margin(start, frame.camera)
         before = detectors.before_fit(mask, np.asarray(old.alpha), margin)
         views.append(detectors.view_indicators(target, mask, np.asarray(new.rgb), before))
-    drift = detectors.means_drift(fit.gaussians.means, start.means, start.log_scales)
+    std = MEAN_STD * lab.prior.spacing
+    drift = detectors.means_drift(fit.gaussians.means, start.means, std)
     seen = coverage(surface, lab.lam())
     return fit.gaussians, detectors.step_indicators(views, fit.losses, seen, [], drift)
 
