@@ -185,6 +185,7 @@ def test_a_good_run_has_no_warning_and_the_residual_of_new_images(rock, tmp_path
     )
     assert [line.get("warnings") for line in after.steps] == [None] * 3
     assert all("prior" in line["indicators"] for line in after.steps)
+    assert "saturated" in after.steps[-1]["indicators"]
     assert ["residual" in line for line in after.steps] == [False, True, True]
     frame = load_dataset(rock).frames[after.taken[-1]]
     target = target_of(frame)
@@ -198,6 +199,7 @@ def test_a_side_that_no_seed_saw_is_no_drift_of_the_exposure(rock, tmp_path):
     """Gaussians that no seed saw are grey, and the rock is not."""
     state = run_nbv(rock, tmp_path / "run", policy="farthest", budget=3, seeds=1).state
     assert not any("exposure" in warning for warning in warnings(state))
+    assert "saturated" not in state.steps[-1]["indicators"], "a policy that ignores gains"
 
 
 def test_a_warning_is_printed_recorded_and_on_the_page(rock, tmp_path):

@@ -10,9 +10,13 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.gaussians import Gaussians
+from mgs.policy.poses import POSE_POLICIES
 from mgs.run import detectors
 from mgs.run.problem import Problem
 from mgs.run.state import Learned
+
+GEOMETRIC = (*POSE_POLICIES, "cover")
+"""Policies that ignore how much a view tells, so one of small gain does not mean that all are."""
 
 
 class Checks:
@@ -54,9 +58,8 @@ class Checks:
             mask = np.unpackbits(packed, count=size).astype(bool).reshape(target.shape[:2])
             rendered = self.render(fit.gaussians, problem.cameras[i])[0]
             views.append(detectors.view_indicators(target, mask, rendered, before))
-        scores = [
-            step["information_gain"] for step in steps if step["information_gain"] is not None
-        ]
+        known = [] if problem.settings.policy in GEOMETRIC else steps
+        scores = [s["information_gain"] for s in known if s["information_gain"] is not None]
         start, coverage = problem.start, steps[-1]["coverage"]
         drift = 0.0  # changed Gaussians are not those of the start
         std = problem.settings.prior_std.get("mean")
