@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 POLICIES = ("directional-d", "paper", "d-optimal", "cover", "random")
 
 ORBIT, DISTANCES = "hemisphere", "1,1.5,2"
-"""Orbit of the frames: `synth_orbit`'s options. On a ring at one distance even spacing is as good as
-any choice."""
+"""Options of the orbit. On a ring at one distance even spacing is as good as any choice."""
 
 GAUSSIANS = 10_000
 """About one Gaussian per pixel of the rock at 320x240."""
