@@ -15,7 +15,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from program import command, exit_code, said
-from refusals import one_line
+from refusals import refused
 from scipy.ndimage import binary_dilation
 
 from mgs.camera import Camera, look_at
@@ -264,6 +264,7 @@ def test_a_refused_cloud_leaves_a_picture(data, tmp_path, capsys):
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 0.1))
 @example([0.0, 2.0**-24, -1.0])
+@example([0.0, 3.1e-6, -1.0])
 @example([0.0, 0.0, -1.0])
 def test_upright_is_the_rotation_that_turns_up_to_z(vector):
     up = unit_up(vector)
@@ -433,31 +434,29 @@ REFUSED: dict[str, tuple[Callable[[Path, Make], object], list[str], str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_used_is_one_line(case, data, tmp_path, capfd):
+def test_what_cannot_be_used_is_one_line(case, data, tmp_path, capsys):
     make, options, message = REFUSED[case]
     make(tmp_path / "d", data)
-    capfd.readouterr()
-    assert exit_code("prior", tmp_path / "d", "--gaussians", "300", *options) == 2
-    one_line(capfd.readouterr().err, message, tmp_path / "d/prior")
+    arguments = ["prior", tmp_path / "d", "--gaussians", "300", *options]
+    assert message in refused(capsys, arguments, tmp_path / "d/prior")
 
 
-def test_a_world_in_which_nothing_would_be_drawn_is_one_line(data, tmp_path, capfd):
+def test_a_world_in_which_nothing_would_be_drawn_is_one_line(data, tmp_path, capsys):
     """A prior has no unit, but the kernels draw nothing that is nearer than 0.01."""
     command("import", data("nerf-synthetic"), "--out", tmp_path / "d", "--unit", "0.005")
     command("prior", tmp_path / "d", "--gaussians", "300")
-    capfd.readouterr()
-    assert exit_code("nbv", tmp_path / "d", "--out", tmp_path / "run", "--budget", "1") == 2
+    capsys.readouterr()
     message = "m from it, and nothing nearer than 0.01 is drawn; import the data with --unit M"
-    one_line(capfd.readouterr().err, message, tmp_path / "run")
+    out = tmp_path / "run"
+    assert message in refused(capsys, ["nbv", tmp_path / "d", "--out", out, "--budget", 1], out)
 
 
-def test_poses_alone_are_fitted_from_random_points(data, tmp_path, capfd):
+def test_poses_alone_are_fitted_from_random_points(data, tmp_path, capsys):
     bare(tmp_path / "d", data)
     command("prior", tmp_path / "d", "--gaussians", "300")
-    assert "300 random points" in capfd.readouterr().out
+    assert "300 random points" in capsys.readouterr().out
     fitted = ["fit", tmp_path / "d", "--passes", "2", "--out", tmp_path / "run"]
-    assert exit_code(*fitted, "--means", "frozen") == 2
-    one_line(capfd.readouterr().err, "pass --means free", tmp_path / "run")
+    assert "pass --means free" in refused(capsys, [*fitted, "--means", "frozen"], tmp_path / "run")
     command(*fitted)
     settings = read_json(tmp_path / "run/config.json")["settings"]
     assert (settings["seeds"], settings["budget"], settings["train"]["means"]) == (10, 0, "free")
@@ -468,16 +467,18 @@ def test_poses_alone_are_fitted_from_random_points(data, tmp_path, capfd):
     assert np.allclose(start.opacities, 0.1)
 
 
-def test_a_fit_with_adaptive_density_is_a_run_as_3dgs(data, tmp_path, capfd, monkeypatch):
+def test_a_fit_with_adaptive_density_is_a_run_as_3dgs(data, tmp_path, capsys, monkeypatch):
     bare(tmp_path / "d", data)
     command("prior", tmp_path / "d", "--gaussians", "300")
     for name, value in (("FROM", 0), ("STEPS", 10)):
         monkeypatch.setattr(density, f"ADAPTION_{name}", value)
     fitted = ["fit", tmp_path / "d", "--density", "adaptive", "--out", tmp_path / "run"]
-    assert exit_code(*fitted, "--most-gaussians", 0) == 2
-    one_line(capfd.readouterr().err, "--most-gaussians 0: must be at least 1", tmp_path / "run")
-    assert exit_code(*fitted, "--loss", "l3") == 2
-    one_line(capfd.readouterr().err, "choose one of squared, l1-dssim", tmp_path / "run")
+    capsys.readouterr()
+    for option, value, message in (
+        ("--most-gaussians", 0, "--most-gaussians 0: must be at least 1"),
+        ("--loss", "l3", "choose one of squared, l1-dssim"),
+    ):
+        assert message in refused(capsys, [*fitted, option, value], tmp_path / "run")
     command(*fitted, "--passes", 8, "--most-gaussians", 310, "--rate", "mean=0.01")
     settings = read_json(tmp_path / "run/config.json")["settings"]
     train = settings["train"]

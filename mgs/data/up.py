@@ -61,7 +61,8 @@ def upright(up: Up) -> np.ndarray:
     if z < -1 + 1e-12:  # the shortest rotation is not unique: turn by half about x first
         half_turn = np.diag([1.0, -1.0, -1.0])
         return np.asarray(upright((x, -y, -z)) @ half_turn)
-    across = np.array([[x * x, x * y, 0.0], [x * y, y * y, 0.0], [0.0, 0.0, 0.0]]) / (1 + z)
+    above = 1 + z if z > -0.5 else (x * x + y * y) / (1 - z)  # near -1, 1 + z loses digits
+    across = np.array([[x * x, x * y, 0.0], [x * y, y * y, 0.0], [0.0, 0.0, 0.0]]) / above
     return np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [x, y, z]]) - across
 
 
