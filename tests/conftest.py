@@ -55,6 +55,20 @@ def coarse_arena():
         yield
 
 
+@pytest.fixture
+def short_fits(monkeypatch):
+    """Fits of runs have at most two passes: for tests that do not look at their quality."""
+    from mgs.run import operations
+
+    fit = operations.fit
+
+    def short(gaussians, cameras, targets, train, *rest):
+        few = train.model_copy(update={"passes": min(train.passes, 2)})
+        return fit(gaussians, cameras, targets, few, *rest)
+
+    monkeypatch.setattr(operations, "fit", short)
+
+
 @pytest.fixture(scope="session")
 def photographs():
     """The module tests/photographs.py, which needs packages of its own."""

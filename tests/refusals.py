@@ -33,13 +33,6 @@ def refused(capsys, arguments: list, out: Path | None = None) -> str:
     return lines[0]
 
 
-def one_line(error: str, message: str, out: Path) -> None:
-    """Check that an error is one line with this message, and that `out` was not made."""
-    assert message in error
-    assert "\n" not in error.strip()
-    assert not out.exists()
-
-
 def occupied(path: Path) -> Path:
     path.mkdir()
     (path / "precious.txt").write_text("keep me")

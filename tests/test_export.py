@@ -10,11 +10,11 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
+from program import command
 from refusals import refused
 from test_render_command import gaussians
 from test_splat_ply import RANGES, assert_close
 
-from mgs.cli.app import main
 from mgs.colour import srgb_from_linear
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
@@ -111,13 +111,11 @@ def test_up_becomes_y():
 def test_the_command_converts_and_keeps_what_is_there(tmp_path, capsys):
     model = gaussians(1)
     write_ply(tmp_path / "a.ply", model)
-    with pytest.raises(SystemExit) as stop:
-        main(["export", str(tmp_path / "a.ply"), "--out", str(tmp_path / "b.glb")])
-    assert stop.value.code == 0
+    given = ["export", tmp_path / "a.ply", "--out", tmp_path / "b.glb"]
+    command(*given)
     assert "wrote 40 Gaussians" in capsys.readouterr().out
     assert np.array_equal(load_gaussians(tmp_path / "b.glb").means, model.means)
-    again = ["export", tmp_path / "a.ply", "--out", tmp_path / "b.glb"]
-    assert "is there already" in refused(capsys, again, tmp_path)
+    assert "is there already" in refused(capsys, given, tmp_path)
 
 
 def glb(content: object, body: bytes = b"") -> bytes:

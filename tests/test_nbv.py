@@ -194,7 +194,6 @@ def test_evaluation_is_logged_and_changes_nothing(dataset, tmp_path):
     [
         ("fisher", 40),
         ("before the lines are written", 1),
-        ("while the checkpoint is written", 1),
         ("while the checkpoint is written", 3),
     ],
 )

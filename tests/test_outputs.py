@@ -54,12 +54,9 @@ COMMANDS_THAT_WRITE = list(writers(*[Path()] * 4))
 
 @pytest.mark.parametrize(
     ("command", "place"),
-    [
-        (command, place)
-        for command in COMMANDS_THAT_WRITE
-        for place in ("is there already", "read only")
-    ]
-    + [("render", place) for place in ("is a file", "under a file", "long name")],
+    [(command, "is there already") for command in COMMANDS_THAT_WRITE]
+    + [("render", place) for place in IN_THE_WAY if place != "is there already"]
+    + [("prior", "read only"), ("nbv", "read only")],
 )
 def test_output_that_is_in_the_way(capsys, dataset, prior, tmp_path, command, place):
     write_ply(tmp_path / "splats.ply", tiny.initial([]))

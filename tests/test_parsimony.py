@@ -1,4 +1,4 @@
-"""How much model a scene needs: N from what pixels resolve, the study of it, and a pruned run."""
+"""How much model a scene needs: N from what pixels resolve, and the study of it."""
 
 import csv
 import json
@@ -7,19 +7,14 @@ import numpy as np
 import pytest
 import synthetic
 from program import command
-from refusals import refused
 
 from mgs.camera import Camera, look_at
 from mgs.data.meshes import Mesh
 from mgs.errors import InputError
-from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD
+from mgs.policy.criteria import PIXEL_NOISE
 from mgs.prior.build import build_prior, prior_from_mesh
 from mgs.prior.resolution import PIXELS_PER_SAMPLE, resolution
 from mgs.prior.settings import PriorSettings
-from mgs.report.evaluation import evaluate_run
-from mgs.run.folder import read_checkpoint
-from mgs.run.nbv import run_nbv
-from mgs.splat_ply import read_ply
 from mgs.study import case, parsimony
 from mgs.study.case import Size
 from mgs.study.verdict import judged
@@ -182,26 +177,3 @@ def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, monkeypatch):
     assert all(one["actual"] <= one["noise"] * PIXEL_NOISE for one in pruned)
     assert [one["noise"] for one in pruned] == list(parsimony.PRUNE_NOISE)
     assert "boulder" in capsys.readouterr().out
-
-
-def test_a_run_is_pruned_beside_its_model(data, tmp_path, capsys):
-    run = tmp_path / "run"
-    run_nbv(data.root, run, gaussians=400, budget=1, policy="uniform")
-    informed = evaluate_run(run, pictures=False)["informed"]
-    assert {kind: number["of"] for kind, number in informed.items()} == {
-        "colour": 1200, "scale": 1200, "rotation": 1600, "opacity": 400
-    }  # fmt: skip
-    H = read_checkpoint(run).H
-    for kind, columns in (("colour", H[:, :3]), ("rotation", H[:, 6:10])):
-        expected = (columns > (PIXEL_NOISE / PRIOR_STD[kind]) ** 2).sum()
-        assert informed[kind]["informed"] == expected
-    assert 0 < informed["rotation"]["informed"] < 1600
-    whole = (run / "gaussians.ply").read_bytes()
-    command("prune", run)
-    said = capsys.readouterr().out
-    left = read_ply(run / "gaussians_pruned.ply")
-    assert 0 < len(left) < 400
-    assert f"400 Gaussians, {len(left)} stay" in said
-    assert "PSNR on the test views" in said
-    assert (run / "gaussians.ply").read_bytes() == whole
-    assert "noise 0.0 must be positive" in refused(capsys, ["prune", run, "--force", "--noise", 0])

@@ -1,5 +1,5 @@
 """A model with no more parameters than its images pay for: the evidence, the choice of a degree,
-and a refitted run."""
+a refitted run and a pruned one."""
 
 import dataclasses
 import shutil
@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plyfile import PlyData
 from program import change_settings, command
+from refusals import refused
 from scipy.stats import multivariate_normal
 
 from mgs.bench import surface_camera, surface_gaussians
@@ -19,7 +20,9 @@ from mgs.errors import InputError
 from mgs.fit.fitting import fit
 from mgs.fit.settings import TrainSettings
 from mgs.gaussians import LEARNED
+from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD
 from mgs.report import evidence
+from mgs.report.evaluation import evaluate_run
 from mgs.report.evidence import (
     BLOCKS,
     DIRECTIONAL,
@@ -266,6 +269,27 @@ def test_a_run_is_refitted_beside_its_model(run, capsys):
     assert lean > whole - 0.3
     assert f"{lean:.2f} dB, {whole:.2f} dB where all" in said
     assert f"own model {own:.2f} dB" in said
+
+
+def test_a_run_is_pruned_beside_its_model(run, capsys):
+    informed = evaluate_run(run, pictures=False)["informed"]
+    assert {kind: number["of"] for kind, number in informed.items()} == {
+        "colour": 1200, "scale": 1200, "rotation": 1600, "opacity": 400
+    }  # fmt: skip
+    H = open_run(run).state.H
+    for kind, columns in (("colour", H[:, :3]), ("rotation", H[:, 6:10])):
+        expected = (columns > (PIXEL_NOISE / PRIOR_STD[kind]) ** 2).sum()
+        assert informed[kind]["informed"] == expected
+    assert 0 < informed["rotation"]["informed"] < 1600
+    whole = (run / "gaussians.ply").read_bytes()
+    command("prune", run)
+    said = capsys.readouterr().out
+    left = read_ply(run / "gaussians_pruned.ply")
+    assert 0 < len(left) < 400
+    assert f"400 Gaussians, {len(left)} stay" in said
+    assert "PSNR on the test views" in said
+    assert (run / "gaussians.ply").read_bytes() == whole
+    assert "noise 0.0 must be positive" in refused(capsys, ["prune", run, "--force", "--noise", 0])
 
 
 def test_the_images_of_the_last_fit_are_those_of_the_run(run):

@@ -6,10 +6,10 @@ import struct
 import numpy as np
 import pytest
 from PIL import Image
+from program import command
 from refusals import refused
 
 from mgs.camera import Camera, look_at, opengl_from_opencv
-from mgs.cli import app
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.gaussians import Gaussians
 from mgs.images import read_exr
@@ -91,10 +91,7 @@ def pixels(path) -> np.ndarray:
 
 def run(folder, *arguments, ply="x.ply", out="out") -> None:
     """Render FOLDER/x.ply through FOLDER/transforms.json to FOLDER/out."""
-    places = [folder / ply, "--cameras", folder, "--out", folder / out]
-    with pytest.raises(SystemExit) as end:
-        app.main(["render", *map(str, places), *map(str, arguments)])
-    assert end.value.code in (0, None)
+    command("render", folder / ply, "--cameras", folder, "--out", folder / out, *arguments)
 
 
 @pytest.fixture

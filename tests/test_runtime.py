@@ -120,7 +120,6 @@ def test_start_raises_instead_of_aborting():
     assert f"{runtime.LIBRARY_VARIABLE} names it" in result.stdout
 
 
-LLVM = "llvm_ad_rgb"
 PREPARE = """
 import numpy as np, mitsuba as mi
 from mgs import runtime
@@ -133,30 +132,28 @@ from mgs.splat import fisher, render
 one = Gaussians(*(np.ones(shape, np.float32) for shape in ((1, 3), (1, 3), (1, 4), 1, (1, 1, 3))))
 camera = Camera(np.diag([20.0, 20.0, 1.0]), 16, 12, np.eye(4))
 mesh = Mesh(np.eye(3) + [0, 0, 2], np.array([[0, 1, 2]]), np.ones(1, bool))
+def said(call):
+    try:
+        call()
+        print(mi.variant())
+    except InputError as error:
+        print(mi.variant(), error)
 """
 
 
-@pytest.mark.parametrize(
-    ("set_before", "call", "printed"),
-    [
-        (LLVM, "runtime.start()", LLVM),
-        (None, "render(one, camera)", LLVM),
-        (None, "mesh_depth(mesh)(camera)", LLVM),
-        ("llvm_ad_spectral", "runtime.start()", "llvm_ad_spectral is set"),
-    ],
-)
-def test_the_users_variant_stays(set_before, call, printed):
-    """An unusable variant is refused in one line; without one, `start` sets ours."""
-    program = PREPARE + (f"mi.set_variant('{set_before}')\n" if set_before else "")
-    program += f"try:\n    {call}\n    print(mi.variant())\n"
-    done = python(f"{program}except InputError as error:\n    print(mi.variant(), error)")
-    assert printed in done.stdout, done.stderr
+def test_without_a_variant_a_call_sets_ours():
+    done = python(f"{PREPARE}said(lambda: render(one, camera))")
+    assert done.stdout == "llvm_ad_rgb\n", done.stderr
 
 
-def test_a_variant_without_derivatives_is_refused_by_every_call():
+def test_the_users_variant_stays_and_an_unusable_one_is_refused_by_every_call():
     calls = "runtime.start", "lambda: render(one, camera)", "lambda: fisher(one, camera)"
-    program = f"{PREPARE}\nmi.set_variant('scalar_rgb')\n"
-    program += f"for call in ({', '.join(calls)}, lambda: mesh_depth(mesh)):\n"
-    program += "    try:\n        call()\n"
-    done = python(f"{program}    except InputError as error:\n        print(mi.variant(), error)")
-    assert done.stdout.count(SCALAR) == 4, done.stderr
+    program = f"{PREPARE}mi.set_variant('llvm_ad_spectral')\nsaid(runtime.start)\n"
+    program += "mi.set_variant('scalar_rgb')\n"
+    program += f"for call in ({', '.join(calls)}, lambda: mesh_depth(mesh)):\n    said(call)\n"
+    done = python(f"{program}mi.set_variant('llvm_ad_rgb')\nsaid(runtime.start)")
+    first, *others, last = done.stdout.splitlines()
+    assert "llvm_ad_spectral is set" in first, done.stderr
+    assert len(others) == 4
+    assert all(line.startswith(SCALAR) for line in others)
+    assert last == "llvm_ad_rgb"

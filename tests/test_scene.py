@@ -205,25 +205,6 @@ def test_the_rock_alone_is_the_image_inside_and_its_own_colour_at_the_rim(ball):
     assert green == pytest.approx(true, abs=0.02)  # no grey of the ground
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("[rock]\nsiz = 1\n", "unknown key 'rock.siz'"),
-        ("[rock]\nsize = -1\n", "rock.size"),
-        ("[rock]\nspecular = 2\n", "rock.specular"),
-        ("[rock]\nroughness = 0\n", "rock.roughness"),
-        ("[rock\n", "not valid TOML"),
-        ("[orbit]\nkind = 'figure-eight'\n", "orbit.kind"),
-        ("[sky]\nturbidity = nan\n", "sky.turbidity"),
-    ],
-)
-def test_bad_scene_files(tmp_path, text, message):
-    (tmp_path / "s.toml").write_text(text)
-    with pytest.raises(InputError, match=message) as error:
-        load_scene_file(tmp_path / "s.toml")
-    assert "\n" not in str(error.value)
-
-
 def test_no_stones_where_the_rock_keeps_them_out():
     rock, rng = trimesh.creation.icosphere(subdivisions=1), np.random.default_rng(0)
     ground = make_ground(Arena(), rock, rng)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import tiny
 from PIL import Image
+from program import command
 from refusals import refused
 
-from mgs.cli.app import main
 from mgs.data.dataset import load_dataset
 from mgs.report import story
 from mgs.report.video import PATHS, camera_path, write_film
@@ -65,16 +65,10 @@ def test_a_film_has_its_frames_and_their_lengths(tmp_path, ending):
     assert found == [(0, 200), (120, 200), (250, 600)]
 
 
-def film(*arguments) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main(["video", *map(str, arguments)])
-    return stop.value.code
-
-
 @pytest.mark.parametrize(("beside", "count"), [("uncertainty", 5), ("truth", tiny.FRAMES)])
 def test_the_command_draws_pictures_side_by_side(run, tmp_path, beside, count):
     out = tmp_path / "a.png"
-    assert film(run, "--out", out, "--seconds", 1, "--fps", 5, "--beside", beside) == 0
+    command("video", run, "--out", out, "--seconds", 1, "--fps", 5, "--beside", beside)
     with Image.open(out) as image:
         assert image.n_frames == count
         assert image.size == (2 * tiny.WIDTH + 4, tiny.HEIGHT)
@@ -86,7 +80,7 @@ def test_the_story_has_a_frame_for_each_view(run, tmp_path, monkeypatch):
             yield replace(run.state, taken=run.state.taken[:count])
 
     monkeypatch.setattr(story, "models", models)
-    assert film(run, "--out", tmp_path / "a.gif", "--story") == 0
+    command("video", run, "--out", tmp_path / "a.gif", "--story")
     with Image.open(tmp_path / "a.gif") as image:
         assert image.n_frames > 1
         assert image.size[0] > 800
