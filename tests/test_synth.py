@@ -82,7 +82,7 @@ def test_the_rock_alone_agrees_with_image_and_mask(dataset):
         assert (alpha[~mask] < 1).all()
         assert 40 < ((alpha > 0) & (alpha < 1)).sum() < 400
         inside = (srgb_from_linear(values[alpha == 1]) for values in (rgba[..., :3], frame.rgb()))
-        np.testing.assert_allclose(*inside, atol=1.01 / 255)  # NumPy's powers differ in the last bit
+        np.testing.assert_allclose(*inside, atol=1.01 / 255)  # powers differ in the last bit
         assert not rgba[alpha == 0].any()
         np.testing.assert_array_equal(frame.masked_rgb(), rgba[..., :3])
 
