@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -458,6 +459,11 @@ def test_poses_alone_are_fitted_from_random_points(data, tmp_path, capsys):
     fitted = ["fit", tmp_path / "d", "--passes", "2", "--out", tmp_path / "run"]
     assert "pass --means free" in refused(capsys, [*fitted, "--means", "frozen"], tmp_path / "run")
     command(*fitted)
+    command("eval", tmp_path / "run")
+    capsys.readouterr()
+    command("report", tmp_path / "run", "--out", tmp_path / "report")
+    assert re.search(r"^ fit +10 ", capsys.readouterr().out, re.MULTILINE)
+    assert not (tmp_path / "report/gain.png").exists()
     settings = read_json(tmp_path / "run/config.json")["settings"]
     assert (settings["seeds"], settings["budget"], settings["train"]["means"]) == (10, 0, "free")
     assert (settings["sh"], settings["train"]["decay"]) == (0, 0.02)

@@ -30,6 +30,8 @@ SHOWN = {
 }
 """Columns of `print_quality` with and without test views: as many as fit into 80 characters."""
 
+MOST_NAMES = 8
+"""Most seed views that are named in a line, not counted."""
 
 MEASURED = {
     f"{prefix}{key}": f"{name}\n{views}"
@@ -149,7 +151,9 @@ def passes(line: Mapping[str, Any]) -> str:
 
 def step_line(line: Mapping[str, Any]) -> str:
     """A step in one line, for a log."""
-    parts = [f"step {line['step']}: {line['name'] or ', '.join(line['seed_names'])}"]
+    names = [line["name"]] if line["name"] else line["seed_names"]
+    views = ", ".join(names) if len(names) <= MOST_NAMES else f"{len(names)} views"
+    parts = [f"step {line['step']}: {views}"]
     parts.append(f"coverage {100 * line['coverage']:.2f} %")
     if "loss" in line:
         parts.append(f"{passes(line)} passes")

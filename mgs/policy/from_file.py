@@ -77,8 +77,11 @@ def absolute(name: str) -> str:
     return str(Path(name).resolve()) if in_file(name) else name
 
 
-def label(name: str) -> str:
-    """The name of a policy without the folder of its file, or its module."""
+def label(name: str, budget: int = 1) -> str:
+    """The name of a policy without the folder of its file, or its module; "fit" if no view is to be
+    chosen, as in a run of `mgs fit`."""
+    if budget == 0:
+        return "fit"
     if is_function(name):
         return name.rpartition(".")[2]
     return Path(name).name if in_file(name) else name

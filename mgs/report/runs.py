@@ -71,7 +71,7 @@ class _Metrics(BaseModel):
 class RunFiles:
     """Contents of the files of a run folder.
 
-    policy: its name. steps: the lines of steps.jsonl (`mgs.run.folder` lists their keys). metrics:
+    policy: its name, or "fit" (`mgs.policy.from_file.label`). steps: the lines of steps.jsonl (`mgs.run.folder` lists their keys). metrics:
     metrics.json (`mgs.report.evaluation.evaluate_model`), None if the run was not evaluated.
     settings, versions: those in config.json.
     """
@@ -132,7 +132,7 @@ def read_run(folder: str | PathLike[str]) -> RunFiles:
     settings = validated(_Settings, config["settings"], folder / "config.json")
     steps = _read_steps(folder)
     metrics = read_metrics(folder)
-    name, versions = label(settings.policy), config.get("versions")
+    name, versions = label(settings.policy, settings.budget), config.get("versions")
     versions = versions if isinstance(versions, dict) else {}
     return RunFiles(folder, name, steps, metrics, config["settings"], versions)
 

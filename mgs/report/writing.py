@@ -27,11 +27,11 @@ from mgs.report.runs import (
 from mgs.report.tables import comparison_rows, markdown_table
 from mgs.splat_ply import read_ply
 
-FIGURES = ("orbit", "gain", "coverage", "comparison", "psnr")
+FIGURES = ("orbit", "coverage", "comparison", "gain", "psnr")
 
 
 def report_files(kind: str) -> list[str]:
-    """Names of the files of a report; the last figure is only in some."""
+    """Names of the files of a report; the last two figures are only in some."""
     return [*(f"{name}.{kind}" for name in FIGURES), "table.md", "table.json"]
 
 
@@ -43,8 +43,9 @@ def write_report(
     runs: run folders, or what `compare_runs` read of them. kind: format of the figures, one of
     `mgs.plotting.FORMATS`.
 
-    - orbit.png, gain.png, coverage.png (`mgs.report.figures`);
+    - orbit.png and coverage.png (`mgs.report.figures`);
     - comparison.png: a view as `shown_view` chooses it;
+    - gain.png, if a run has chosen views;
     - psnr.png: only if all runs were evaluated after some of their steps; over the test views, or
       without them over all views;
     - table.md and table.json (`mgs.report.tables.comparison_rows`).
@@ -59,7 +60,7 @@ def write_report(
         check_measured(run)
     out, dataset = Path(out), compared.dataset
     frame, truth, renders, captions = _comparison(compared)
-    paths = {name: out / f"{name}.{kind}" for name in FIGURES[:-1]}
+    paths = {name: out / f"{name}.{kind}" for name in FIGURES[:-2]}
 
     first = next(iter(compared.runs.values()))
     positions = np.array([frame.camera.position for frame in dataset.frames])
@@ -71,7 +72,9 @@ def write_report(
         label: [step["information_gain"] for step in run.steps[1:]]
         for label, run in compared.runs.items()
     }
-    figures.gain_figure(paths["gain"], gains)
+    if any(gains.values()):
+        paths["gain"] = out / f"gain.{kind}"
+        figures.gain_figure(paths["gain"], gains)
     figures.coverage_figure(paths["coverage"], step_curves(compared.runs, "coverage"))
     figures.comparison_figure(paths["comparison"], truth, renders, frame.name, captions)
     every = "views taken so far" if dataset.on_demand else "all views"

@@ -158,8 +158,8 @@ class Run:
 
     @property
     def label(self) -> str:
-        """Name of the policy."""
-        return label(self.settings.policy)
+        """Name of the policy; "fit" if the run chooses no view."""
+        return label(self.settings.policy, self.settings.budget)
 
 
 def open_run(folder: str | Path) -> Run:
