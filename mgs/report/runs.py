@@ -71,9 +71,9 @@ class _Metrics(BaseModel):
 class RunFiles:
     """Contents of the files of a run folder.
 
-    policy: its name, or "fit" (`mgs.policy.from_file.label`). steps: the lines of steps.jsonl (`mgs.run.folder` lists their keys). metrics:
-    metrics.json (`mgs.report.evaluation.evaluate_model`), None if the run was not evaluated.
-    settings, versions: those in config.json.
+    policy: its name, or "fit". steps: the lines of steps.jsonl (`mgs.run.folder` lists their keys).
+    metrics: metrics.json (`mgs.report.evaluation.evaluate_model`), None if the run was not
+    evaluated. settings, versions: those in config.json.
     """
 
     folder: Path
