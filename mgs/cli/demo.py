@@ -67,11 +67,11 @@ def demo(
     def heading(text: str) -> None:
         console.rule(f"{text}   [dim]{time.monotonic() - started:.0f} s", align="left")
 
-    heading(f"1/5 a photoreal orbit: 32 frames with depth and masks, and {TEST_VIEWS} test views")
+    heading(f"1/4 a photoreal orbit: 32 frames with depth and masks, and {TEST_VIEWS} test views")
     if not (dataset / "transforms.json").is_file():
         views: dict[str, Any] = {"orbit": ORBIT, "distances": DISTANCES, "test_views": TEST_VIEWS}
         synth_orbit(dataset, seed=seed, **views)
-    heading(f"2/5 the prior: {GAUSSIANS:,} Gaussians on the rock's mesh")
+    heading(f"2/4 the prior: {GAUSSIANS:,} Gaussians on the rock's mesh")
     if not (folder / "prior.json").is_file():
         prior(dataset, out=folder, gaussians=str(GAUSSIANS), seed=seed)
     opened: list[Run] = []
@@ -81,13 +81,14 @@ def demo(
             continue
         settings: Any = {"policy": policy, "budget": BUDGET, "seed": seed, "evaluate_every": 1}
         opened.append(start_and_print(dataset, run, console, prior=folder, **settings))
-    heading(f"3/5 next best views by {len(runs)} policies, 4 seeds and {BUDGET} views each")
-    for done in completed(opened, console):
-        heading(f"3/5 {done.label}")
+    heading(f"3/4 next best views by {len(runs)} policies, 4 seeds and {BUDGET} views each")
+    for done in completed(opened, console):  # meanwhile the next runs go on
+        heading(f"3/4 {done.label}")
         resume_and_print(done, console, pictures=True)
-    heading("4/5 what the views say about each Gaussian")
-    diagnose(runs[:1], force=True)
-    heading("5/5 the report")
+        if done is opened[0]:
+            console.print("what its views say about each Gaussian:")
+            diagnose(runs[:1], force=True)
+    heading("4/4 the report")
     compared = compare_runs(runs)
     written = write_report(report, compared)
     print_quality(console, comparison_rows(compared))
@@ -123,9 +124,8 @@ def completed(runs: list[Run], console: Console) -> Iterator[Run]:
 
 
 def complete(run: Path, others: list[Path]) -> None:
-    """Run or resume a run, and evaluate it. others: get the fit to the seeds, the same for every
-    policy, if they have none yet."""
-    from mgs.report.evaluation import evaluate_run
+    """Run or resume a run. others: get the fit to the seeds, the same for every policy, if they
+    have none yet."""
     from mgs.run.folder import write_checkpoint
     from mgs.run.nbv import resume_nbv
 
@@ -135,7 +135,6 @@ def complete(run: Path, others: list[Path]) -> None:
                 write_checkpoint(other, state)
 
     resume_nbv(run, share)
-    evaluate_run(run)
 
 
 def steps_done(run: Path) -> int:
