@@ -357,19 +357,20 @@ def _meter(
     means, values = [], []
     for index in chosen:
         meter_seed = derive_seed(seed, f"meter {index}")
-        rendered = scene.render(cameras[index], 2, meter_seed, denoise=False)
-        if not rendered.mask.any():
+        rgb, _, _ = scene.light(cameras[index], 2, meter_seed)
+        depth, mask = scene.cast(cameras[index])
+        if not mask.any():
             raise InputError(
                 f"scene: the rock is hidden in frame {index}; "
                 "raise orbit.altitude, or lower rock.buried"
             )
-        means.append(float(rendered.rgb[rendered.mask].mean()))
+        means.append(float(rgb[mask].mean()))
         if not np.isfinite(means[-1]):
             raise InputError(
                 f"scene: the rock has pixels that are NaN or infinite in frame {index}; "
                 "repair its mesh"
             )
-        values.append(rendered.rgb.max(-1)[rendered.depth > 0])
+        values.append(rgb.max(-1)[depth > 0])
     wanted = ROCK_EXPOSURE / float(np.mean(means))
     if np.quantile(np.concatenate(values), 1 - MAX_CLIPPED) * wanted <= 1:
         return wanted

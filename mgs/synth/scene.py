@@ -135,15 +135,21 @@ class MitsubaScene:
         """The part of `render` that Mitsuba computes."""
         from mgs.synth.rock_layer import render_layers
 
-        self.params["sensor.to_world"] = mi.Transform4f(_to_world(camera))
-        self.params.update()
-        light = render_layers(self.scene, self.path, spp, seed)
+        light = self.light(camera, spp, seed)
         depth, mask = self.cast(camera)
         alpha = self.coverage(camera, mask, light[2])
         guides = None
         if denoise:
             guides = render_layers(self.scene, self.guides, GUIDES_PER_SAMPLE * spp, seed)
         return Traced(light, guides, alpha, depth, mask)
+
+    def light(self, camera: Camera, spp: int, seed: int) -> Layers:
+        """Path-trace one frame and nothing else; the camera stays."""
+        from mgs.synth.rock_layer import render_layers
+
+        self.params["sensor.to_world"] = mi.Transform4f(_to_world(camera))
+        self.params.update()
+        return render_layers(self.scene, self.path, spp, seed)
 
     def cast(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """z-depth, float32 [H,W], metres, 0 = sky, and rock mask, bool, at pixel centres."""
