@@ -141,8 +141,10 @@ def synthesise(
         frames = orbit_frames(out, cameras)
         dome = evaluation_cameras(settings, size, test_views, rock)
         tests = orbit_frames(out / TEST_FOLDER, dome, "tv")
-        glb = to_glb(rock)  # before the scene adds its attributes to the mesh
-        world = MitsubaScene(settings, rock, cameras[0], seed)
+        own = rock.copy(include_cache=True)  # the scene adds its attributes to the mesh
+        with ThreadPoolExecutor(1) as pool:
+            glb = pool.submit(to_glb, own)
+            world = MitsubaScene(settings, rock, cameras[0], seed)
         if not denoise:
             say(
                 f"pyoidn is not installed: {spp} samples per pixel in place of denoising; "
@@ -152,7 +154,7 @@ def synthesise(
         if not (out / "config.json").is_file():
             write_json(out / "config.json", resolved)
         with atomic_path(out / "rock.glb") as temporary:
-            temporary.write_bytes(glb)
+            temporary.write_bytes(glb.result())
         photographer = Photographer(world, exposure, spp, seed, denoise)
         views = tests if on_demand else [*frames, *tests]
         _render_frames(photographer, views, progress)
