@@ -466,7 +466,8 @@ def test_poses_alone_are_fitted_from_random_points(data, tmp_path, capsys):
     assert not (tmp_path / "report/gain.png").exists()
     settings = read_json(tmp_path / "run/config.json")["settings"]
     assert (settings["seeds"], settings["budget"], settings["train"]["means"]) == (10, 0, "free")
-    assert (settings["sh"], settings["train"]["decay"]) == (0, 0.02)
+    train = settings["train"]
+    assert (settings["sh"], train["decay"], train["loss"]) == (0, 0.02, "l1-dssim")
     frames = load_dataset(tmp_path / "d").frames
     start, seen = initial_gaussians(load_prior(tmp_path / "d/prior"), frames)
     assert seen.mean() > 0.9

@@ -99,6 +99,7 @@ def as_3dgs(extent: float) -> dict[str, Any]:
         "rates": steady | {"mean": 1.6e-4 * extent},
         "steady_rates": tuple(steady),
         "decay": 0.01,
+        "tolerance": 0.0,
         "sh_steps": 1000,
         "directional_rate": 1 / 20,
         **COLOURS_ALONE,

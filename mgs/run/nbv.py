@@ -49,9 +49,9 @@ CAPTURE_TEST_VIEWS = 12
 FREE_PASSES = 30
 """Passes of a fit of free means to all images. A chosen constant."""
 
-FREE_DECAY = 0.02
-"""`TrainSettings.decay` of such a fit: its last passes average over the images. A chosen constant
-(docs/fit.md)."""
+FREE_TRAIN = {"passes": FREE_PASSES, "decay": 0.02, "tolerance": 0.0, "loss": "l1-dssim"}
+"""`TrainSettings` of such a fit, chosen on two rocks (docs/fit.md). All passes are made, as the
+last ones, with low rates, average over the images."""
 
 FREE_SH = {"points": 1, "hull": 1, "random": 0}
 """`NbvSettings.sh` of such a fit by the source of its prior. Chosen constants (docs/fit.md)."""
@@ -174,10 +174,9 @@ def start_fit(
 ) -> Run:
     """`start_run` of a run that takes all images at once and chooses none.
 
-    By default means are free where the prior comes from photographs (`LOOSE`), with FREE_PASSES
-    passes, FREE_DECAY, colours of degree FREE_SH and a looser prior, else frozen. With adaptive
-    density, settings and degree are by default those of 3DGS (`as_3dgs`). Arguments and errors as
-    `start_run`.
+    By default means are free where the prior comes from photographs (`LOOSE`), with FREE_TRAIN,
+    colours of degree FREE_SH and a looser prior, else frozen. With adaptive density, settings and
+    degree are by default those of 3DGS (`as_3dgs`). Arguments and errors as `start_run`.
     """
     root = Path(dataset)
     loaded, train = load_dataset(root), dict(settings.pop("train", {}))
@@ -193,7 +192,7 @@ def start_fit(
     loose = 1.0
     if train["means"] == "free" and source in LOOSE:
         loose = LOOSE[source]
-        train = {"passes": FREE_PASSES, "decay": FREE_DECAY} | train
+        train = FREE_TRAIN | train
         settings.setdefault("sh", FREE_SH[source])
     every = {"seeds": len(loaded), "budget": 0, "train": train, "loose": loose}
     return start_run(
