@@ -27,7 +27,7 @@ DEFAULTS = {
     "passes": " Default: 30 with adaptive density or free means from photographs, else 10.",
     "means": " Default: free from photographs or with adaptive density, else frozen.",
     "sh": " Default: 3 with adaptive density, 1 with free means from photographs, else 0.",
-    "loss": " Default: l1-dssim with adaptive density or free means from photographs, else squared.",
+    "loss": " Default: squared with frozen means, l1-dssim with free ones from photographs.",
     "density": " The defaults of adaptive are all those of 3DGS.",
 }
 """Help of the settings that `mgs.run.nbv.start_fit` decides by the prior."""
