@@ -14,7 +14,10 @@ the colour 0.5 + SH_C0 sh0: 3DGS adds 0.5, so zero coefficients are grey."""
 def srgb_from_linear(linear: ArrayLike) -> NDArray[np.float32]:
     """Convert linear RGB of any shape to sRGB (IEC 61966-2-1). Clips to [0,1] first."""
     c = np.clip(np.asarray(linear, np.float32), 0, 1)
-    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055).astype(np.float32)
+    srgb = np.asarray(12.92 * c)
+    bright = c > 0.0031308  # around a rock alone all is black, and powers are slow
+    srgb[bright] = 1.055 * c[bright] ** (1 / 2.4) - 0.055
+    return srgb
 
 
 def linear_from_srgb(srgb: ArrayLike) -> NDArray[np.float32]:

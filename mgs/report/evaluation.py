@@ -227,6 +227,8 @@ def evaluate_run(
     Raises InputError as `open_run`, if the test views cannot be read, and if another process works
     on the run.
     """
+    from mgs.splat import as_drjit
+
     run = run if isinstance(run, Run) else open_run(run)
     gc.collect()  # images and lists of the run itself, if it ended in this process
     release(KEPT_BYTES)
@@ -240,7 +242,7 @@ def evaluate_run(
         metrics = _measured_before(file, subject)
         if metrics is None:
             found = evaluate_model(
-                gaussians,
+                as_drjit(gaussians),
                 frames,
                 trained,
                 test_frames=test_frames,

@@ -25,7 +25,7 @@ from mgs.run.inputs import prior_digest
 from mgs.run.live import Live, live_capture
 from mgs.run.problem import Operations
 from mgs.run.settings import NbvSettings
-from mgs.splat import ListCache, fisher, groups, render
+from mgs.splat import ListCache, as_drjit, fisher, groups, render
 
 
 def operations_of(
@@ -162,10 +162,10 @@ def psnr_over(
         return [psnr(one, image, mask) for one in srgb for mask in (known, rock)]
 
     def measured(gaussians: Gaussians, chosen: Sequence[int]) -> dict[str, np.ndarray]:
+        model, rows = as_drjit(gaussians), []
         with ThreadPoolExecutor(1) as beside:  # compares a view while the next one is rendered
-            rows = []
             for i in chosen:
-                drawn = render(gaussians, as_captured(frames[i]).camera, cache=cache).rgb
+                drawn = render(model, as_captured(frames[i]).camera, cache=cache).rgb
                 # A copy: another thread must not free memory of Dr.Jit (`evaluate_model`).
                 rows.append(beside.submit(compared, i, np.array(drawn)))
         table = np.array([row.result() for row in rows]).reshape(-1, len(names))

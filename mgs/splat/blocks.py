@@ -13,6 +13,7 @@ neighbouring blocks are near one another in memory. The position of a splat is c
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -95,7 +96,7 @@ class BlockLists:
     blocks_x: Any
     footprints: Footprints
 
-    @property
+    @cached_property
     def nbytes(self) -> int:
         """Memory held, bytes."""
         return 4 * (2 * len(self.splat) + 11 * len(self.slot_start) + 3 * len(self.block))

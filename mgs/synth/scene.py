@@ -189,7 +189,7 @@ class MitsubaScene:
         unit = (rays / length[:, None]).T
         directions = mi.Vector3f(*(mi.Float(padded(column)) for column in unit))
         dr.make_opaque(origin)  # a literal would compile a new kernel for every camera
-        hit = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, directions))
+        hit = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, directions), coherent=True)
         dr.eval(hit)  # otherwise each array read below would trace the rays again
         z = np.where(hit.is_valid().numpy(), hit.t.numpy() / length, 0)
         return z.astype(np.float32), (hit.shape == mi.ShapePtr(self.rock)).numpy()
