@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -468,6 +469,9 @@ def test_poses_alone_are_fitted_from_random_points(data, tmp_path, capsys):
     assert (settings["seeds"], settings["budget"], settings["train"]["means"]) == (10, 0, "free")
     train = settings["train"]
     assert (settings["sh"], train["decay"], train["loss"]) == (0, 0.02, "l1-dssim")
+    indicators = json.loads((tmp_path / "run/steps.jsonl").read_text())["indicators"]
+    assert "residual" in indicators
+    assert not indicators.keys() & {"prior", "pose", "coverage"}
     frames = load_dataset(tmp_path / "d").frames
     start, seen = initial_gaussians(load_prior(tmp_path / "d/prior"), frames)
     assert seen.mean() > 0.9

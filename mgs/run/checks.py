@@ -66,6 +66,9 @@ class Checks:
         if std and problem.settings.train.density == "fixed":
             drift = detectors.means_drift(fit.gaussians.means, start.means, std)
         indicators = detectors.step_indicators(views, fit.losses, coverage, scores, drift)
+        if start.opacities.max() < 0.5:  # random points: no surface to compare with
+            for name in ("prior", "pose", "coverage"):
+                indicators.pop(name, None)
         before_this = next(
             (step["indicators"] for step in reversed(steps[:-1]) if "indicators" in step), None
         )
