@@ -73,12 +73,12 @@ def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
     rows = comparison_rows(compared)
     print_quality(Console(), rows)
     for row, run in zip(rows, compared.runs.values(), strict=True):
-        if run.chosen:
+        if run.settings["budget"]:
             path = f"a path of {row['path']:.2f} {row['unit']}"
             typer.echo(f"{row['policy']}: {path}; the run has ended: {why_ended(run.ended or {})}")
     for file in written:
         typer.echo(f"wrote {file}")
-    chosen = any(run.chosen for run in compared.runs.values())
+    chosen = any(run.settings["budget"] for run in compared.runs.values())
     if chosen and not any(file.stem == "psnr" for file in written):
         typer.echo(
             "PSNR against images is left out: make all runs with --evaluate-every to have it"

@@ -50,7 +50,7 @@ def _fit(dataset: Path, prior: Path, settings: dict[str, Any]) -> dict[str, Any]
     began = time.perf_counter()
     cameras = [frame.camera for frame in frames]
     passes = settings.get("passes", 1) * PASSES
-    train = TrainSettings(**as_3dgs(extent_of(cameras)), passes=passes, tolerance=0, seed=seed)
+    train = TrainSettings(**as_3dgs(extent_of(cameras)), passes=passes, seed=seed)
     start = round_gaussians(points, frames)[0].with_degree(DEGREE)
     kept = kept_within(IMAGE_BYTES, lambda i: target_of(frames[i]), lambda target: target.nbytes)
     targets = Deferred(range(len(frames)), kept)
