@@ -10,6 +10,7 @@ import pytest
 import tiny
 import typer
 from program import command
+from refusals import refused
 
 from mgs.cli.app import app
 from mgs.errors import InputError
@@ -17,7 +18,7 @@ from mgs.fit.settings import ALPHA_WEIGHT, COLOURS_ALONE, TrainSettings
 from mgs.prior.settings import PriorSettings
 from mgs.run.nbv import start_run
 from mgs.run.settings import PRESETS, NbvSettings, with_defaults
-from mgs.study import case, chart, timing
+from mgs.study import case, chart, photographs, timing
 
 DEFAULTS = {**NbvSettings.model_fields, **TrainSettings.model_fields}
 
@@ -205,3 +206,33 @@ def test_a_chart_is_measured_once_and_written(small, tmp_path, capsys):
     assert [row["total_passes"] for row in written["fit"]["rows"]] == [2, 1]
     assert written["run"]["claims"][0]["runs"] == 1
     assert "| **fast**: " in (out / "run.md").read_text()
+
+
+def test_photographs_are_charted_beside_another_program(dataset, tmp_path, capsys, monkeypatch):
+    tiny.write_dataset(dataset / "test", frames=3)
+    monkeypatch.setitem(photographs.PASSES, "quick", (1, 2))
+    peer, out = tmp_path / "other.csv", tmp_path / "chart"
+    charted = ["chart", out, "--only", "photographs", "--dataset", dataset, "--gaussians", "60"]
+    for text in (
+        "",
+        "seconds,psnr\n",
+        "seconds,psnr\n1,x\n",
+        "seconds\n1\n",
+        "seconds,psnr\n0,9\n",
+    ):
+        peer.write_text(text)
+        assert "one row or more; correct it" in refused(capsys, [*charted, "--peer", peer], out)
+    assert "give --dataset" in refused(capsys, charted[:4], out)
+    peer.write_text("seconds,step,psnr\n0.5,9,20\n2,50,21.5\n")
+    command(*charted, "--peer", peer)
+    record = json.loads((out / "photographs.json").read_text())
+    ours, others = record["rows"][:2], record["rows"][2:]
+    assert [row["passes"] for row in ours] == [1, 2]
+    assert all(row["seconds"] > 0 and row["psnr"] > 5 for row in ours)
+    assert others == [
+        {"program": "other", "seconds": 0.5, "psnr": 20},
+        {"program": "other", "seconds": 2, "psnr": 21.5},
+    ]
+    assert parsed(record["command"])["peer"] == [peer]
+    assert all(parsed(row["command"])["passes"] == row["passes"] for row in ours)
+    assert (out / "photographs.png").stat().st_size > 10_000

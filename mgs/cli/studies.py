@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mgs import runtime
-from mgs.cli.options import argument, option
+from mgs.cli.options import argument, option, parse_gaussians
 from mgs.errors import InputError, row_named
 from mgs.files import check_new_folder, check_writable, folder_locked, read_json, write_json
 from mgs.provenance import command_line
@@ -188,24 +188,43 @@ def chart(
     preset: Annotated[
         str, option("quick: about ten minutes on two quiet cores. full: hours.", "--scale")
     ] = "quick",
-    only: Annotated[str | None, option("fit or run. Default: both.")] = None,
+    only: Annotated[str | None, option("fit, run or photographs. Default: fit,run.")] = None,
     repeats: Annotated[
         int | None,
         option("Timings of each point; the median counts. Default: quick 2, full 3.", min=1),
+    ] = None,
+    gaussians: Annotated[
+        list[str] | None,
+        option("Number of Gaussians of photographs; repeat for more.", metavar="N|auto"),
+    ] = None,
+    peer: Annotated[
+        list[Path] | None,
+        option("CSV of another program on photographs: `seconds`, `psnr`; repeat for more."),
     ] = None,
 ) -> None:
     """Chart speed against accuracy of single fits and of whole runs.
 
     Writes a CSV, JSON, Markdown and PNG file for fits (fit.*) and for runs (run.*); each row names
     the command that makes it again. Points are timed one by one: let nothing else run meanwhile.
+    `--only photographs --dataset DATASET` times `mgs fit` with more and more passes.
     """
     from mgs.study.chart import KINDS, SIZES, check_dataset, run_chart
+    from mgs.study.photographs import NAME, chart_photographs, read_peer
     from mgs.study.sweep import names_of
 
-    kinds = names_of(only, KINDS)
+    kinds = names_of(only or ",".join(KINDS), (*KINDS, NAME))
+    counts = [parse_gaussians(count) or "auto" for count in gaussians or ["auto"]]
+    for file in peer or []:
+        read_peer(file)
     check_dataset(dataset)
+    if NAME in kinds and dataset is None:
+        raise InputError(f"--only {NAME}: needs photographs; give --dataset DATASET")
     with _study(out, SIZES, preset) as (_, console, report):
-        found = run_chart(out, preset, kinds, repeats, dataset, report)
+        if NAME in kinds and dataset is not None:
+            kinds.remove(NAME)
+            rows = chart_photographs(out, preset, dataset, counts, peer or [], report)
+            console.print(f"{NAME}: {len(rows)} rows in {out / f'{NAME}.csv'}", soft_wrap=True)
+        found = run_chart(out, preset, kinds, repeats, dataset, report) if kinds else {}
     for kind, (rows, claims) in found.items():
         console.print(f"{kind}: {len(rows)} rows in {out / f'{kind}.csv'}", soft_wrap=True)
         _print_claims(console, claims)
