@@ -91,7 +91,7 @@ def chart_photographs(
     rows: list[Row] = []
     for (count, passes), cell in zip(asked, cells, strict=True):
         result = found[cell.name]
-        words = ["mgs", "fit", given, "--gaussians", str(count), "--passes", str(passes)]
+        words = ["mgs", "fit", str(dataset), "--gaussians", str(count), "--passes", str(passes)]
         about = {"program": f"mgs, {result['gaussians']:,} Gaussians", "passes": passes}
         rows.append(about | result | {"command": shlex.join([*words, "--out", "RUN"])})
     words = ["mgs", "chart", str(out), "--only", NAME, "--scale", preset, "--dataset", str(dataset)]
