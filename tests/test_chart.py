@@ -219,10 +219,15 @@ def test_photographs_are_charted_beside_another_program(dataset, tmp_path, capsy
         "seconds,psnr\n1,x\n",
         "seconds\n1\n",
         "seconds,psnr\n0,9\n",
+        "seconds,psnr\n1,inf\n",
     ):
         peer.write_text(text)
         assert "one row or more; correct it" in refused(capsys, [*charted, "--peer", peer], out)
     assert "give --dataset" in refused(capsys, charted[:4], out)
+    for option in (["--peer", peer], ["--gaussians", 60]):
+        peer.write_text("seconds,psnr\n1,20\n")
+        said = refused(capsys, ["chart", out, "--dataset", dataset, *option], out)
+        assert f"{option[0]}: is of photographs alone" in said
     peer.write_text("seconds,step,psnr\n0.5,9,20\n2,50,21.5\n")
     command(*charted, "--peer", peer)
     record = json.loads((out / "photographs.json").read_text())

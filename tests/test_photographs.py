@@ -464,7 +464,8 @@ def test_poses_alone_are_fitted_from_random_points(data, tmp_path, capsys):
     capsys.readouterr()
     command("report", tmp_path / "run", "--out", tmp_path / "report")
     assert re.search(r"^ fit +10 ", capsys.readouterr().out, re.MULTILINE)
-    assert not (tmp_path / "report/gain.png").exists()
+    written = {path.name for path in (tmp_path / "report").iterdir()}
+    assert written == {"comparison.png", "table.md", "table.json"}
     settings = read_json(tmp_path / "run/config.json")["settings"]
     assert (settings["seeds"], settings["budget"], settings["train"]["means"]) == (10, 0, "free")
     train = settings["train"]

@@ -32,7 +32,7 @@ from mgs.report.runs import compare_runs, read_run
 from mgs.run import recording
 from mgs.run.folder import open_run
 
-FIGURES = ("orbit", "coverage", "comparison", "gain", "psnr")
+FIGURES = ("orbit", "gain", "coverage", "comparison", "psnr")
 
 
 @pytest.fixture(scope="module")

@@ -217,6 +217,9 @@ def chart(
     for file in peer or []:
         read_peer(file)
     check_dataset(dataset)
+    if NAME not in kinds and (gaussians or peer):
+        option_given = "--gaussians" if gaussians else "--peer"
+        raise InputError(f"{option_given}: is of photographs alone; give --only {NAME}, too")
     if NAME in kinds and dataset is None:
         raise InputError(f"--only {NAME}: needs photographs; give --dataset DATASET")
     with _study(out, SIZES, preset) as (_, console, report):

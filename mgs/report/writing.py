@@ -27,11 +27,14 @@ from mgs.report.runs import (
 from mgs.report.tables import comparison_rows, markdown_table
 from mgs.splat_ply import read_ply
 
-FIGURES = ("orbit", "coverage", "comparison", "gain", "psnr")
+CHOICES = ("orbit", "gain", "coverage")
+"""Figures of the chosen views."""
+
+FIGURES = (*CHOICES, "comparison", "psnr")
 
 
 def report_files(kind: str) -> list[str]:
-    """Names of the files of a report; the last two figures are only in some."""
+    """Names of the files of a report; `write_report` says which are not in all."""
     return [*(f"{name}.{kind}" for name in FIGURES), "table.md", "table.json"]
 
 
@@ -43,9 +46,8 @@ def write_report(
     runs: run folders, or what `compare_runs` read of them. kind: format of the figures, one of
     `mgs.plotting.FORMATS`.
 
-    - orbit.png and coverage.png (`mgs.report.figures`);
+    - orbit.png, gain.png, coverage.png (`mgs.report.figures`): only if a run has chosen views;
     - comparison.png: a view as `shown_view` chooses it;
-    - gain.png, if a run has chosen views;
     - psnr.png: only if all runs were evaluated after some of their steps; over the test views, or
       without them over all views;
     - table.md and table.json (`mgs.report.tables.comparison_rows`).
@@ -60,22 +62,11 @@ def write_report(
         check_measured(run)
     out, dataset = Path(out), compared.dataset
     frame, truth, renders, captions = _comparison(compared)
-    paths = {name: out / f"{name}.{kind}" for name in FIGURES[:-2]}
-
-    first = next(iter(compared.runs.values()))
-    positions = np.array([frame.camera.position for frame in dataset.frames])
-    means = read_ply(first.folder / "gaussians.ply").means
-    choices = {label: (run.seeds, run.chosen) for label, run in compared.runs.items()}
-    up = up_of(first.settings.get("prior", ""), dataset)
-    figures.orbit_figure(paths["orbit"], positions, means, choices, up, dataset.unit)
-    gains = {
-        label: [step["information_gain"] for step in run.steps[1:]]
-        for label, run in compared.runs.items()
-    }
-    if any(gains.values()):
-        paths["gain"] = out / f"gain.{kind}"
-        figures.gain_figure(paths["gain"], gains)
-    figures.coverage_figure(paths["coverage"], step_curves(compared.runs, "coverage"))
+    chosen = any(run.chosen for run in compared.runs.values())
+    paths = {name: out / f"{name}.{kind}" for name in CHOICES if chosen}
+    if chosen:
+        _draw_choices(paths, compared)
+    paths["comparison"] = out / f"comparison.{kind}"
     figures.comparison_figure(paths["comparison"], truth, renders, frame.name, captions)
     every = "views taken so far" if dataset.on_demand else "all views"
     if panels := _psnr_panels(compared.runs, every):
@@ -87,6 +78,22 @@ def write_report(
         temporary.write_text(markdown_table(rows), encoding="utf-8")
     write_json(out / "table.json", rows)
     return [*paths.values(), out / "table.md", out / "table.json"]
+
+
+def _draw_choices(paths: Mapping[str, Path], compared: Comparison) -> None:
+    """Draw CHOICES into these files."""
+    dataset, first = compared.dataset, next(iter(compared.runs.values()))
+    positions = np.array([frame.camera.position for frame in dataset.frames])
+    means = read_ply(first.folder / "gaussians.ply").means
+    choices = {label: (run.seeds, run.chosen) for label, run in compared.runs.items()}
+    up = up_of(first.settings.get("prior", ""), dataset)
+    figures.orbit_figure(paths["orbit"], positions, means, choices, up, dataset.unit)
+    gains = {
+        label: [step["information_gain"] for step in run.steps[1:]]
+        for label, run in compared.runs.items()
+    }
+    figures.gain_figure(paths["gain"], gains)
+    figures.coverage_figure(paths["coverage"], step_curves(compared.runs, "coverage"))
 
 
 def _comparison(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import shlex
 import shutil
 import time
@@ -26,7 +27,7 @@ PASSES = {"quick": (5, 15, 30), "full": (5, 15, 30, 60)}
 """Passes of the fits, by scale."""
 
 NUMBERS = ("seconds", "cpu_seconds", "psnr", "ssim")
-"""Columns of another program's CSV."""
+"""Columns that are read from the CSV of another program."""
 
 COLUMNS: dict[str, Content] = {
     "program": "program",
@@ -52,13 +53,19 @@ def measure(root: Path, out: Path, dataset: str, gaussians: Any, passes: int) ->
 
 
 def read_peer(file: Path) -> list[Row]:
-    """Rows of another program: a CSV with columns `seconds` and `psnr` (dB, on the same test views)
-    and optionally `cpu_seconds`. Its name is the file's. Raises InputError for another content."""
+    """Read the rows of another program, which is named as its file.
+
+    The file is a CSV with the columns `seconds` and `psnr`, dB on the test views. The others of
+    NUMBERS are optional. Raises InputError for other contents.
+    """
     with reading(file):
-        lines = list(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))
+        lines = list(
+            csv.DictReader(file.read_text(encoding="utf-8", errors="replace").splitlines())
+        )
     try:
         numbers = [{k: float(v) for k, v in line.items() if k in NUMBERS} for line in lines]
-        if not numbers or not all(row["seconds"] > 0 and row["psnr"] > 0 for row in numbers):
+        found = [row[key] for row in numbers for key in ("seconds", "psnr")]
+        if not found or not all(0 < number < math.inf for number in found):
             raise ValueError
     except (KeyError, TypeError, ValueError):
         columns = "a column `seconds` and one `psnr`, positive numbers"
@@ -99,12 +106,15 @@ def chart_photographs(
     words += [word for file in peers for word in ("--peer", str(file))]
     text = table(COLUMNS, rows + others)
     write_table(out, NAME, rows + others, text, shlex.join(words), preset=preset)
-    draw(out / f"{NAME}.png", rows + others)
+    draw(out / f"{NAME}.png", rows + others, dataset.absolute().name)
     return rows
 
 
-def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Draw seconds against PSNR, a line for each program. Raises InputError as `save_figure`."""
+def draw(path: Path, rows: Sequence[Mapping[str, Any]], dataset: str) -> None:
+    """Draw seconds against PSNR, a line for each program. dataset: its name, for the title.
+
+    Raises InputError as `save_figure`.
+    """
     import matplotlib
 
     names = list(dict.fromkeys(row["program"] for row in rows))
@@ -116,6 +126,6 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
             axes.plot(*zip(*of, strict=True), markersize=5, **look)
         logarithmic(axes)
         axes.set(xlabel="seconds", ylabel="PSNR on the test views (dB)")
-        axes.set_title("What a second buys: fits of photographs")
+        axes.set_title(f"What a second buys: fits of {dataset}")
         axes.legend(loc="lower right", fontsize=9)
         save_figure(figure, path)
