@@ -216,21 +216,15 @@ def _check_variant() -> None:
         _check_libllvm()
 
 
-def processes(count: int, threads: int | None = None) -> ProcessPoolExecutor:
-    """Executor of `count` new processes, which end silently at Ctrl-C and with this process.
-
-    Several runs of small kernels are faster in a process each than on several threads, which mostly
-    wait. threads: Dr.Jit's in each process; by default as many as there are cores.
-    """
+def processes(count: int) -> ProcessPoolExecutor:
+    """Executor of `count` new processes, which end silently at Ctrl-C and with this process."""
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
-    return ProcessPoolExecutor(
-        count, get_context("spawn"), initializer=_begin_process, initargs=(threads,)
-    )
+    return ProcessPoolExecutor(count, get_context("spawn"), initializer=_begin_process)
 
 
-def _begin_process(threads: int | None) -> None:
+def _begin_process() -> None:
     """Begin a process of `processes`."""
     from multiprocessing import parent_process
 
@@ -245,11 +239,6 @@ def _begin_process(threads: int | None) -> None:
         os._exit(1)
 
     Thread(target=wait, daemon=True).start()
-    if threads:
-        start()
-        import drjit as dr
-
-        dr.set_thread_count(threads)
 
 
 def processor() -> dict[str, str | int]:

@@ -100,13 +100,20 @@ def demo(
 def completed(runs: list[Run], console: Console) -> Iterator[Run]:
     """Complete runs, as many at once as there are cores, each in a process; yield them in order.
 
-    Raises InputError as `resume_nbv`, and if a process is killed.
+    The last ones, fewer than the cores, have several threads each. Raises InputError as
+    `resume_nbv`, and if a process is killed.
     """
     left = [run.folder for run in runs if not (run.folder / "metrics.json").is_file()]
     cores = len(os.sched_getaffinity(0))
     count = max(1, min(len(left), cores))
-    with runtime.processes(count, cores // count) as pool:
-        working = {folder: pool.submit(complete, folder, left[count:]) for folder in left}
+    last = len(left) % count or count
+    with runtime.processes(count) as pool:
+        working = {
+            folder: pool.submit(
+                complete, folder, left[count:], cores // (count if k < len(left) - last else last)
+            )
+            for k, folder in enumerate(left)
+        }
         try:
             for run in runs:
                 with progress_bar("steps", console) as progress:
@@ -123,9 +130,12 @@ def completed(runs: list[Run], console: Console) -> Iterator[Run]:
             pool.shutdown(cancel_futures=True)
 
 
-def complete(run: Path, others: list[Path]) -> None:
+def complete(run: Path, others: list[Path], threads: int) -> None:
     """Run or resume a run. others: get the fit to the seeds, the same for every policy, if they
-    have none yet."""
+    have none yet. threads: of Dr.Jit. A run's kernels are small, so many threads mostly wait."""
+    runtime.start()
+    import drjit as dr
+
     from mgs.run.folder import write_checkpoint
     from mgs.run.nbv import resume_nbv
 
@@ -134,6 +144,7 @@ def complete(run: Path, others: list[Path]) -> None:
             if len(state.steps) == 1 and not (other / "checkpoint.npz").is_file():
                 write_checkpoint(other, state)
 
+    dr.set_thread_count(threads)
     resume_nbv(run, share)
 
 
