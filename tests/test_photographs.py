@@ -137,18 +137,16 @@ def test_a_finer_grid_and_masks_in_blocks_give_the_same_hull(tmp_path, monkeypat
 
 def test_masks_that_do_not_fit_are_one_line_that_names_a_frame(tmp_path):
     dataset = floating(tmp_path / "d", lattice(12))
-    wrong = np.zeros((72, 96), bool)
-    wrong[:5, :5] = True
-    write_png(dataset.frames[7].mask_path, wrong)
-    message = r"share no point in space \(the best lies outside 1 of 12, such as kf_0007"
-    with pytest.raises(InputError, match=message):
-        visual_hull(dataset.frames)
+    for where, words in ((slice(5), "share no point in space"), (slice(36, 40), "carve away most")):
+        wrong = np.zeros((72, 96), bool)
+        wrong[where, where] = True
+        write_png(dataset.frames[7].mask_path, wrong)
+        with pytest.raises(InputError, match=rf"{words}.*; kf_0007 carves (9\d|100)% of what few"):
+            visual_hull(dataset.frames)
     # With scattered pixels the grid reaches beyond all images, where no mask is against a point.
     for k, frame in enumerate(dataset.frames):
         write_png(frame.mask_path, np.random.default_rng(k).random((72, 96)) < 0.01)
-    with pytest.raises(
-        InputError, match=r"share no point in space \(the best lies outside \d+ of 12"
-    ):
+    with pytest.raises(InputError, match="share no point in space"):
         visual_hull(dataset.frames)
 
 
