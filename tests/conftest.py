@@ -1,6 +1,5 @@
 """Shared set-up: sets the variant before any test module imports kernels, and common fixtures."""
 
-import importlib
 import os
 import shutil
 from pathlib import Path
@@ -67,9 +66,3 @@ def short_fits(monkeypatch):
         return fit(gaussians, cameras, targets, few, *rest)
 
     monkeypatch.setattr(operations, "fit", short)
-
-
-@pytest.fixture(scope="session")
-def photographs():
-    """The module tests/photographs.py, which needs packages of its own."""
-    return importlib.import_module("photographs")

@@ -306,7 +306,7 @@ def test_images_are_set_apart_as_test_views(dataset, tmp_path, capsys):
     command(*arguments, out)
     (out / "transforms.json").unlink()  # as if it had been interrupted before its end
     command(*arguments, out)
-    assert said(capsys)[0].count("images, which are never candidates; wrote") == 2
+    assert said(capsys)[0].count("images, which are never fitted; wrote") == 2
     made = load_dataset(out)
     tests = made.test_views()
     names = [frame.name for frame in dataset.frames]
@@ -325,8 +325,9 @@ def test_images_are_set_apart_as_test_views(dataset, tmp_path, capsys):
 
 def test_masks_by_projecting_a_mesh_or_from_files(dataset, tmp_path):
     edit(dataset.root, without_masks)
-    for path in list((dataset.root / "masks").iterdir())[::2]:
-        path.rename(path.with_name(f"{path.name}.png"))  # as COLMAP names them: 0001.jpg.png
+    for k, path in enumerate(list((dataset.root / "masks").iterdir())):
+        name = (path.name, f"{path.stem}_mask.png", f"{path.name}.png")[k % 3]
+        path.rename(path.with_name(name))
     true = [
         synthetic.cast(f.camera, [(synthetic.CENTRE, synthetic.AXES)])[1] for f in dataset.frames
     ]

@@ -25,7 +25,8 @@ from mgs.data.importers import import_source
 from mgs.data.sources import read_source
 from mgs.fit import objective
 from mgs.memory import PADDING, adopted, kept_within, padded
-from mgs.prior.build import build_prior, save_prior
+from mgs.prior import hull
+from mgs.prior.build import build_prior, prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run import operations, problem
 from mgs.run.nbv import run_nbv
@@ -75,7 +76,7 @@ class Live:
 def rock(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     root = tmp_path_factory.mktemp("rock") / "dataset"
     dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(9, 48, 36))
-    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=300)))
+    save_prior(root / "prior", prior_from_mesh(root / "rock.glb", PriorSettings(gaussians=300)))
     return dataset
 
 
@@ -117,6 +118,7 @@ def test_commands_before_a_run_hold_few_images_at_once(
     from mgs.data.masks import make_masks
     from mgs.data.meshes import read_mesh
 
+    monkeypatch.setattr(hull, "COARSE", 16)
     live, read, rgb, mask = Live(), importers.read_rgba, Frame.rgb, Frame.mask
     monkeypatch.setattr(importers, "read_rgba", lambda path: live.watch(np.array(read(path))))
     monkeypatch.setattr(Frame, "rgb", lambda frame: live.watch(rgb(frame).copy()))

@@ -53,7 +53,7 @@ def quick(monkeypatch, coarse_arena, short_fits):
         return make_rock(rock.model_copy(update={"detail": rock.size / 30}), rng)
 
     monkeypatch.setattr(rendering, "make_rock", coarse)
-    monkeypatch.setattr(hull, "COARSE", 24)
+    monkeypatch.setattr(hull, "COARSE", 14)
 
 
 @pytest.fixture

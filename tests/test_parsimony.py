@@ -74,9 +74,8 @@ def write_data(root, size=(48, 36)):
     return synthetic.write_dataset(root, synthetic.orbit_cameras(12, *size))
 
 
-@pytest.mark.parametrize("asked", [[], ["--gaussians", "auto"]], ids=["default", "auto"])
-def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys, asked):
-    command("prior", data.root, "--out", tmp_path / "p", *asked)
+def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys):
+    command("prior", data.root, "--out", tmp_path / "p")
     numbers = json.loads((tmp_path / "p/prior.json").read_text())
     pixel = numbers["resolution"]["pixel"]
     assert numbers["spacing"] == pytest.approx(PIXELS_PER_SAMPLE * pixel, rel=0.01)

@@ -9,7 +9,7 @@ import synthetic
 from program import command
 
 from mgs.data.dataset import load_dataset, write_transforms
-from mgs.prior.build import build_prior, save_prior
+from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.study.output import Panel
 from mgs.study.stress import faults, run
@@ -79,11 +79,12 @@ def test_claims_and_cells_of_all_experiments_are_complete():
 def root(tmp_path_factory):
     """Folder with the dataset and the prior of a small rock."""
     folder = tmp_path_factory.mktemp("study")
-    dataset = synthetic.write_dataset(folder / "dataset", synthetic.orbit_cameras(10, 48, 36))
+    synthetic.write_dataset(folder / "dataset", synthetic.orbit_cameras(10, 48, 36))
     cameras = synthetic.orbit_cameras(3, 48, 36, altitude=2.0)
     tests = synthetic.write_dataset(folder / "dataset/test", cameras)
     write_transforms(folder / "dataset/test", tests.frames)
-    save_prior(folder / "prior", build_prior(dataset, PriorSettings(gaussians=300)))
+    mesh = folder / "dataset/rock.glb"
+    save_prior(folder / "prior", prior_from_mesh(mesh, PriorSettings(gaussians=300)))
     return folder
 
 

@@ -137,7 +137,7 @@ def import_data(
     if stops and max(stops) - min(stops) > EXPOSURE_DIFFERS:
         notes.print(
             f"mgs: by their EXIF, exposure differs by up to {max(stops) - min(stops):.1f} stops "
-            "between photographs; `mgs nbv --exposure` estimates a gain for each"
+            "between photographs; `mgs fit --exposure` estimates a gain for each"
         )
     camera = result.frames[0].camera
     if camera.width * camera.height > MANY_PIXELS:
@@ -157,7 +157,7 @@ def import_data(
     )
     if tests is not None:
         console.print(
-            f"test views: {len(tests.shots)} images, which are never candidates; "
+            f"test views: {len(tests.shots)} images, which are never fitted; "
             f"wrote {out / TEST_FOLDER}"
         )
     _tidy([*found.shots, *(tests.shots if tests else ())], unpacked)

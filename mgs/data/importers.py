@@ -41,13 +41,13 @@ def import_source(
 ) -> Dataset:
     """Write a source as a dataset into `out`: new, empty, or left by an interrupted import of it.
 
-    masks: folder of mask files named as the images (0001.png, or 0001.jpg.png for 0001.jpg). mesh:
-    mesh file whose projection gives the masks, world coordinates. By default masks come from the
-    source's mask files or the images' alpha. Rock images come from the source, or from an alpha
-    with intermediate values that gives the mask; with `masks` or `mesh` there are none. Images,
-    depth and masks are undistorted to a pinhole camera in which every pixel is valid, then reduced
-    by blocks of `downscale` x `downscale`. up: as `Dataset`. tests: shots of the same world, which
-    become the test views. on_frame: called (done, total) before each frame.
+    masks: folder of mask files named as the images (0001.png, 0001_mask.png or 0001.jpg.png for
+    0001.jpg). mesh: mesh file whose projection gives the masks, world coordinates. By default masks
+    come from the source's mask files or the images' alpha. Rock images come from the source, or
+    from an alpha with intermediate values that gives the mask; with `masks` or `mesh` there are
+    none. Images, depth and masks are undistorted to a pinhole camera in which every pixel is valid,
+    then reduced by blocks of `downscale` x `downscale`. up: as `Dataset`. tests: shots of the same
+    world, which become the test views. on_frame: called (done, total) before each frame.
 
     When an interrupted import continues, a finished frame is made again only if one of its files
     is newer; the result is the same bit for bit. A finished import is loaded as it is. Raises
@@ -101,7 +101,9 @@ def _mask_file(masks: Path, shot: Shot) -> Path:
     """Mask file of a shot. Raises InputError if there is none."""
     if not masks.is_dir():
         raise InputError(f"{masks}: no such folder; give the folder of the masks")
-    for name in (shot.image.stem, shot.name, shot.image.name):  # the last: COLMAP's 0001.jpg.png
+    stem, full = shot.image.stem, shot.image.name
+    # The last two: as Metashape exports masks, and as COLMAP names them.
+    for name in (stem, shot.name, f"{stem}_mask", full):
         if path := find_image(masks, name):
             return path
     raise InputError(f"{masks}: no mask for image {shot.image.name}; name masks as their images")

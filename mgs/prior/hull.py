@@ -42,6 +42,9 @@ LEAST_VIEWS = 3
 AGREEMENT = 0.8
 """Least median share of a mask that the hull must fill; above 0.95 where masks and poses fit."""
 
+FEW = 0.1
+"""Share of the frames with a point in their image that may carve it by mistake."""
+
 
 @dataclass(frozen=True)
 class Hull:
@@ -71,11 +74,9 @@ def visual_hull(
     points = lo + edge / cells * nodes.reshape(-1, 3)
     field = _inside(views, points, 2 * NEAR_SURFACE * edge / cells).reshape(nodes.shape[:3])
     if field.max() <= 0:
-        against = _against(frames, views, points)
         raise InputError(
-            f"prior: the masks share no point in space (the best lies outside {len(against)} of "
-            f"{len(frames)}, such as {against[0]}'s); poses and masks do not fit, or the object "
-            "moved; correct or remove frames"
+            f"prior: the masks share no point in space; {_odd_one(frames, views, points)}; "
+            "correct its mask or pose, or remove its photograph"
         )
     for _ in range(REFINEMENTS):
         field, cells = _refined(field), 2 * cells
@@ -87,7 +88,7 @@ def visual_hull(
     vertices, faces, _, _ = marching_cubes(solid, 0.0, gradient_direction="ascent")
     vertices = lo + cell * (vertices.astype(np.float64) - 1)
     mesh = Mesh(vertices, faces.astype(np.int64), np.ones(len(faces), bool))
-    filled = _checked_agreement(frames, views, mesh)
+    filled = _checked_agreement(frames, views, mesh, points)
     share = {"hull_fills_masks": np.nanmean(filled), "hull_fills_least": np.nanmin(filled)}
     return Hull(mesh, cell, {"hull_cell": cell} | {key: float(share[key]) for key in share})
 
@@ -176,17 +177,17 @@ def _inside(views: Sequence[_View], points: np.ndarray, reach: float) -> np.ndar
     return np.where(outside, -reach, np.minimum(least, reach)).astype(np.float32)
 
 
-def _against(frames: Sequence[Frame], views: Sequence[_View], points: np.ndarray) -> list[str]:
-    """Names of the frames that carve the point, of [N,3], that the fewest carve."""
-    carved, count = np.zeros(len(points), int), np.zeros(len(points), int)
-    for view in views:
-        value = view(points)
-        carved += value <= 0
-        count += np.isfinite(value)
-    carved[count < min(LEAST_VIEWS, len(views))] = len(views)
-    best = points[[np.argmin(carved)]]
-    values = [view(best)[0] for view in views]
-    return [f.name for f, value in zip(frames, values, strict=True) if not 0 < value < np.inf]
+def _odd_one(frames: Sequence[Frame], views: Sequence[_View], points: np.ndarray) -> str:
+    """Words for the frame that carves most of the points [N,3] that no other, or FEW, carve."""
+    values = np.stack([view(points) for view in views])
+    carved, seen = values <= 0, np.isfinite(values).sum(axis=0)
+    above = carved.sum(axis=0) - np.maximum(FEW * seen, 1)
+    above[seen < min(LEAST_VIEWS, len(views))] = len(views)
+    share = carved[:, above <= max(above.min(), 0)].mean(axis=1)
+    return (
+        f"{frames[int(share.argmax())].name} carves {share.max():.0%} of what few others carve "
+        f"(the median frame {np.median(share):.0%})"
+    )
 
 
 def _refined(field: np.ndarray) -> np.ndarray:
@@ -208,8 +209,11 @@ def _largest(field: np.ndarray) -> np.ndarray:
     return np.where((pieces == sizes.argmax()) | (field <= 0), field, -np.abs(field))
 
 
-def _checked_agreement(frames: Sequence[Frame], views: Sequence[_View], mesh: Mesh) -> np.ndarray:
-    """Share of each mask that the mesh fills. Raises InputError if too small."""
+def _checked_agreement(
+    frames: Sequence[Frame], views: Sequence[_View], mesh: Mesh, points: np.ndarray
+) -> np.ndarray:
+    """Share of each mask that the mesh fills. Raises InputError if too small; points [N,3] of the
+    coarse grid tell which frame is wrong."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     depth = mesh_depth(mesh)
@@ -219,10 +223,10 @@ def _checked_agreement(frames: Sequence[Frame], views: Sequence[_View], mesh: Me
         filled.append((depth(view.camera)[mask] > 0).mean() if mask.any() else np.nan)
     agreement = np.array(filled)
     if not np.nanmedian(agreement) >= AGREEMENT:
-        worst = frames[int(np.nanargmin(agreement))].name
         raise InputError(
-            f"prior: the masks carve away most of the object (the hull fills "
-            f"{np.nanmedian(agreement):.0%} of a mask, {np.nanmin(agreement):.0%} in frame "
-            f"{worst}); poses and masks do not fit, correct or remove frames"
+            "prior: the masks carve away most of the object (the hull fills "
+            f"{np.nanmedian(agreement):.0%} of the median mask); "
+            f"{_odd_one(frames, views, points)}; "
+            "correct its mask or pose, or remove its photograph"
         )
     return agreement
