@@ -56,7 +56,7 @@ main()
 """
 """The program; it kills itself before it writes the eighth PNG file (mask or image)."""
 
-pytestmark = pytest.mark.usefixtures("coarse_arena")
+pytestmark = pytest.mark.usefixtures("coarse_arena", "coarse_priors")
 
 
 @pytest.fixture(scope="module")

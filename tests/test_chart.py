@@ -208,6 +208,7 @@ def test_a_chart_is_measured_once_and_written(small, tmp_path, capsys):
     assert "| **fast**: " in (out / "run.md").read_text()
 
 
+@pytest.mark.usefixtures("coarse_priors")
 def test_photographs_are_charted_beside_another_program(dataset, tmp_path, capsys, monkeypatch):
     tiny.write_dataset(dataset / "test", frames=3)
     monkeypatch.setitem(photographs.PASSES, "quick", (1, 2))

@@ -18,6 +18,8 @@ from mgs import __version__
 from mgs.cli.app import COMMANDS, app
 from mgs.splat_ply import write_ply
 
+pytestmark = pytest.mark.usefixtures("coarse_priors")
+
 
 def read_only(tmp_path: Path) -> Path:
     """A folder nobody may write to: root is not held back by permissions, so for root it is the
