@@ -1,7 +1,5 @@
 """On-demand datasets: a frame is rendered when a run takes it; the run is otherwise the same."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil

@@ -1,7 +1,5 @@
 """The real operations together: dataset, prior, next best views, evaluation, diagnosis, report."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Memory is bounded without a change of results, and no array is read beyond its end."""
 
-from __future__ import annotations
-
 import gc
 import re
 import subprocess

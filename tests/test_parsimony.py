@@ -131,14 +131,6 @@ def test_the_automatic_choice_is_compared_with_the_smallest_that_is_as_good():
     assert parsimony._holds({"loss": 0.0, "over_smallest": 2}) == "no: too many parameters"
 
 
-def test_every_need_of_a_cell_is_a_cell():
-    for size in parsimony.SIZES.values():
-        cells = parsimony.cells_of(size)
-        names = {cell.name for cell in cells}
-        assert all(set(cell.needs) <= names for cell in cells)
-        assert all(json.loads(json.dumps(cell.arguments)) == cell.arguments for cell in cells)
-
-
 @pytest.mark.slow
 def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, monkeypatch):
     calls = []

@@ -1,7 +1,5 @@
 """Photographs without depth: hull, points, both; up, units, masks of the prior; bad input."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Why a run ends: the rules, the loop with the operations of tests/tiny.py, the messages."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import tiny
