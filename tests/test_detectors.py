@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from mgs.cli.nbv import resume_and_print
 from mgs.data.dataset import load_dataset, target_of, write_transforms
 from mgs.images import write_png
-from mgs.prior.build import build_prior, load_prior, save_prior
+from mgs.prior.build import load_prior, prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.report.page_facts import measured, read_shown
 from mgs.report.runs import read_run
@@ -169,8 +169,8 @@ def test_an_image_without_known_colours_has_no_residual():
 def rock(tmp_path_factory):
     """A dataset of an ellipsoid that can be fitted well, with its prior."""
     root = tmp_path_factory.mktemp("rock") / "dataset"
-    dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(10, 64, 48))
-    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=600)))
+    synthetic.write_dataset(root, synthetic.orbit_cameras(10, 64, 48))
+    save_prior(root / "prior", prior_from_mesh(root / "rock.glb", PriorSettings(gaussians=600)))
     return root
 
 
@@ -197,7 +197,8 @@ def test_a_good_run_has_no_warning_and_the_residual_of_new_images(rock, tmp_path
 
 def test_a_side_that_no_seed_saw_is_no_drift_of_the_exposure(rock, tmp_path):
     """Gaussians that no seed saw are grey, and the rock is not."""
-    state = run_nbv(rock, tmp_path / "run", policy="farthest", budget=3, seeds=1).state
+    given = {"policy": "farthest", "budget": 3, "seeds": 1, "train": {"passes": 15}}
+    state = run_nbv(rock, tmp_path / "run", **given).state
     assert not any("exposure" in warning for warning in warnings(state))
     assert "saturated" not in state.steps[-1]["indicators"], "a policy that ignores gains"
 
@@ -217,7 +218,8 @@ def test_a_warning_is_printed_recorded_and_on_the_page(rock, tmp_path):
 def test_a_prior_in_the_wrong_place_is_noticed_at_the_seeds(rock, tmp_path):
     prior = load_prior(rock / "prior")
     save_prior(tmp_path / "prior", replace(prior, points=prior.points + np.array([0.4, 0, 0])))
-    state = run_nbv(rock, tmp_path / "run", prior=tmp_path / "prior", budget=0, seeds=5).state
+    given = {"prior": tmp_path / "prior", "budget": 0, "seeds": 5, "train": {"passes": 2}}
+    state = run_nbv(rock, tmp_path / "run", **given).state
     assert any("the prior's outline and the masks disagree" in said for said in warnings(state))
 
 
@@ -269,7 +271,8 @@ def test_a_spoiled_dataset_has_the_warning_for_its_fault(rock, tmp_path, spoil):
     frames = list(load_dataset(root).frames)
     spoil(frames)
     write_transforms(root, frames)
-    said = warnings(run_nbv(root, run, prior=rock / "prior", budget=1, seeds=9).state)
+    given = {"prior": rock / "prior", "budget": 1, "seeds": 9, "train": {"passes": 15}}
+    said = warnings(run_nbv(root, run, **given).state)
     assert any(words in warning for warning in said), said
     others = set(SPOILED.values()) - {words}
     assert not any(word in warning for warning in said for word in others), said
