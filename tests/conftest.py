@@ -1,6 +1,5 @@
 """Shared set-up: sets the variant before any test module imports kernels, and common fixtures."""
 
-import importlib
 import os
 import shutil
 from pathlib import Path
@@ -55,6 +54,17 @@ def coarse_arena():
         yield
 
 
+@pytest.fixture(scope="module")
+def coarse_priors():
+    """Surfaces of few cells, which are most of a prior's cost: for tests that do not look at it."""
+    from mgs.prior import hull, surface
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(hull, "COARSE", 14)
+        patched.setattr(surface, "POISSON_DEPTHS", (5, 5))
+        yield
+
+
 @pytest.fixture
 def short_fits(monkeypatch):
     """Fits of runs have at most two passes: for tests that do not look at their quality."""
@@ -67,9 +77,3 @@ def short_fits(monkeypatch):
         return fit(gaussians, cameras, targets, few, *rest)
 
     monkeypatch.setattr(operations, "fit", short)
-
-
-@pytest.fixture(scope="session")
-def photographs():
-    """The module tests/photographs.py, which needs packages of its own."""
-    return importlib.import_module("photographs")

@@ -15,7 +15,7 @@ from mgs.cli.nbv import resume_and_print
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset, target_of, write_transforms
 from mgs.images import write_png
-from mgs.prior.build import build_prior, load_prior, save_prior
+from mgs.prior.build import load_prior, prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate_model
 from mgs.report.page_facts import measured, read_shown
@@ -167,8 +167,8 @@ def test_drift_is_in_standard_deviations_of_the_prior():
 def rock(tmp_path_factory):
     """A dataset of an ellipsoid that can be fitted well, with its prior."""
     root = tmp_path_factory.mktemp("rock") / "dataset"
-    dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(10, 64, 48))
-    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=600)))
+    synthetic.write_dataset(root, synthetic.orbit_cameras(10, 64, 48))
+    save_prior(root / "prior", prior_from_mesh(root / "rock.glb", PriorSettings(gaussians=600)))
     return root
 
 
@@ -229,7 +229,8 @@ def test_the_excess_of_the_last_views_is_scaled_by_the_gains():
 
 def test_a_side_that_no_seed_saw_is_no_drift_of_the_exposure(rock, tmp_path):
     """Gaussians that no seed saw are grey, and the rock is not."""
-    state = run_nbv(rock, tmp_path / "run", policy="farthest", budget=3, seeds=1).state
+    given = {"policy": "farthest", "budget": 3, "seeds": 1, "train": {"passes": 15}}
+    state = run_nbv(rock, tmp_path / "run", **given).state
     assert not any("exposure" in warning for warning in warnings(state))
     assert "saturated" not in state.steps[-1]["indicators"], "a policy that ignores gains"
 
@@ -249,7 +250,8 @@ def test_a_warning_is_printed_recorded_and_on_the_page(rock, tmp_path):
 def test_a_prior_in_the_wrong_place_is_noticed_at_the_seeds(rock, tmp_path):
     prior = load_prior(rock / "prior")
     save_prior(tmp_path / "prior", replace(prior, points=prior.points + np.array([0.4, 0, 0])))
-    state = run_nbv(rock, tmp_path / "run", prior=tmp_path / "prior", budget=0, seeds=5).state
+    given = {"prior": tmp_path / "prior", "budget": 0, "seeds": 5, "train": {"passes": 2}}
+    state = run_nbv(rock, tmp_path / "run", **given).state
     assert any("the prior's outline and the masks disagree" in said for said in warnings(state))
 
 
@@ -301,7 +303,8 @@ def test_a_spoiled_dataset_has_the_warning_for_its_fault(rock, tmp_path, spoil):
     frames = list(load_dataset(root).frames)
     spoil(frames)
     write_transforms(root, frames)
-    said = warnings(run_nbv(root, run, prior=rock / "prior", budget=1, seeds=9).state)
+    given = {"prior": rock / "prior", "budget": 1, "seeds": 9, "train": {"passes": 15}}
+    said = warnings(run_nbv(root, run, **given).state)
     assert any(words in warning for warning in said), said
     others = set(SPOILED.values()) - {words}
     assert not any(word in warning for warning in said for word in others), said

@@ -1,7 +1,5 @@
 """The real operations together: dataset, prior, next best views, evaluation, diagnosis, report."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -23,6 +21,8 @@ from mgs.run.operations import psnr_measure
 from mgs.splat import ListCache
 from mgs.splat_ply import read_ply
 from mgs.synth.rendering import write_contact_sheet
+
+pytestmark = pytest.mark.usefixtures("coarse_priors")
 
 VIEWS = ["--seed-views", "3", "--budget", "4", "--passes", "6", "--random-seed", "1"]
 STRUCK = """
@@ -58,7 +58,7 @@ def dataset(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def run(dataset):
+def run(dataset, coarse_priors):
     out = dataset.parent / "run"
     command("nbv", dataset, "--out", out, "--gaussians", 300, *VIEWS, "--evaluate-every", 2)
     return out
@@ -93,7 +93,7 @@ def test_learning_helps_and_so_do_more_images(dataset, run):
 def test_interrupted_in_the_middle_of_a_step_then_resumed(dataset, run, tmp_path):
     """The resumed process takes the same views, and its model is the same bit for bit."""
     out = tmp_path / "run"
-    arguments = ["nbv", dataset, "--out", out, "--gaussians", "300", *VIEWS]
+    arguments = ["nbv", dataset, "--out", out, "--prior", run / "prior", *VIEWS]
     process = subprocess.run(
         [sys.executable, "-c", STRUCK, *arguments, "--evaluate-every", "2"],
         capture_output=True,
@@ -154,6 +154,7 @@ def test_errors_are_predicted_and_calibrated(run):
     assert min(maps[f"sigma.{channel}"].min() for channel in "RGB") > 0
 
 
+@pytest.mark.usefixtures("short_fits")
 def test_demo_shows_the_table_and_the_pictures_and_can_be_repeated(tmp_path, capsys, monkeypatch):
     """All of `mgs demo` but the rendering of its dataset; the second time it changes nothing."""
     out = tmp_path / "demo"

@@ -285,6 +285,14 @@ def test_ssim_of_a_frame_leaves_out_its_border_and_ssim_of_a_mask_does_not():
     assert ssim(truth, wrong, np.ones((40, 40), bool)) < 1 - 1e-4
 
 
+FRAMES = 5
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    return tiny.write_dataset(tmp_path / "dataset", FRAMES)
+
+
 @pytest.fixture
 def work(monkeypatch):
     """A function: number of views measured, and number drawn, since its last call."""
@@ -312,7 +320,7 @@ def test_what_is_known_of_a_model_is_not_measured_again(dataset, prior, tmp_path
         return evaluate_run(run, say=said.append, **options)
 
     first = again(pictures=False)
-    assert work() == (12, 0)
+    assert work() == (FRAMES, 0)
     assert said == [f"wrote {run}/metrics.json"]
     assert {"depth_error", "see_through"} < set(first["all"])
     assert "alpha_mae" not in first["all"]
@@ -322,7 +330,7 @@ def test_what_is_known_of_a_model_is_not_measured_again(dataset, prior, tmp_path
     assert said[1:] == [kept]
     drawn = again()
     assert drawn == first | {"pictures": True} == json.loads((run / "metrics.json").read_text())
-    assert work() == (0, 12)
+    assert work() == (0, FRAMES)
     assert said.pop().endswith(f"dataset; wrote {run}/renders")
     pictures = listing(run / "renders")
     assert again() == again(pictures=False) == drawn
@@ -330,10 +338,10 @@ def test_what_is_known_of_a_model_is_not_measured_again(dataset, prior, tmp_path
     assert said.pop(-2).endswith(f"dataset, and {run}/renders")
     (run / "renders/kf_0003.png").unlink()
     again()
-    assert work() == (0, 12)
+    assert work() == (0, FRAMES)
     (run / "metrics.json").unlink()
     assert again() == drawn
-    assert work() == (12, 12)
+    assert work() == (FRAMES, FRAMES)
     assert listing(run / "renders") == pictures
 
 
@@ -361,7 +369,7 @@ def test_another_commit_keeps_the_metrics_and_another_version_does_not(
 ):
     run, versions = tiny.write_run(tmp_path / "run", dataset, prior), evaluation.versions()
     monkeypatch.setattr(evaluation, "versions", lambda: versions)
-    for name, measured in (("mgs", 12), ("commit", 0), ("mitsuba", 12)):
+    for name, measured in (("mgs", FRAMES), ("commit", 0), ("mitsuba", FRAMES)):
         versions[name] = "1234567"
         evaluate_run(run)
         assert work()[0] == measured
@@ -375,11 +383,11 @@ def test_what_has_changed_is_measured_again(dataset, prior, tmp_path, work, what
     CHANGES[what](run, dataset)
     work()
     after = evaluate_run(run, pictures=False)
-    assert work() == (12, 0)
+    assert work() == (FRAMES, 0)
     assert (after["all"] == before["all"]) == (what == "damaged")
     assert after["pictures"] is False  # those that are there may be of another model
     evaluate_run(run)
-    assert work() == (0, 12)
+    assert work() == (0, FRAMES)
 
 
 def test_a_run_is_measured_on_the_test_views_of_its_dataset(dataset, prior, tmp_path, work):
@@ -388,7 +396,7 @@ def test_a_run_is_measured_on_the_test_views_of_its_dataset(dataset, prior, tmp_
     tiny.write_dataset(dataset / "test", frames=3)
     work()
     after = evaluate_run(run, say=said.append)
-    assert work() == (15, 15)
+    assert work() == (FRAMES + 3, FRAMES + 3)
     assert after == json.loads((run / "metrics.json").read_text())
     assert (after["test"]["count"], len(after["test_views"])) == (3, 3)
     assert {key: after[key] for key in ("all", "held_out", "views")} == {
@@ -398,7 +406,7 @@ def test_a_run_is_measured_on_the_test_views_of_its_dataset(dataset, prior, tmp_
     assert work() == (0, 0)
     (run / "renders/test/kf_0002.png").unlink()
     assert evaluate_run(run) == after
-    assert work() == (0, 15)
+    assert work() == (0, FRAMES + 3)
     (dataset / "test/images/kf_0002.png").unlink()
     with pytest.raises(InputError, match=r"images/kf_0002\.png does not exist in .*test"):
         evaluate_run(run)

@@ -1,7 +1,5 @@
 """Exposure that differs between images: gains are found, and fits with them are as good."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +16,7 @@ from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.files import read_json
 from mgs.images import exif_exposure, write_png
 from mgs.metrics import colour_corrected
-from mgs.prior.build import build_prior, save_prior
+from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.exposure import DARK, GAIN_STD, RATIO_STD, SATURATED, solve_gains
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate_run
@@ -110,8 +108,8 @@ def rock(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "albedo", albedo)
-        dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(16, 64, 48))
-    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=600)))
+        synthetic.write_dataset(root, synthetic.orbit_cameras(16, 64, 48))
+    save_prior(root / "prior", prior_from_mesh(root / "rock.glb", PriorSettings(gaussians=600)))
     return root
 
 
@@ -136,7 +134,7 @@ def varied(rock: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 Runs = dict[str, tuple[State, Path]]
 
-RUN = {"policy": "uniform", "seeds": 4, "budget": 4}
+RUN = {"policy": "uniform", "seeds": 4, "budget": 3, "train": {"passes": 20}}
 
 
 @pytest.fixture(scope="module")
@@ -146,13 +144,12 @@ def runs(rock: Path, varied: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     made = {}
     kinds = {"constant": (rock, False), "without": (varied, False), "with": (varied, True)}
     for name, (root, exposure) in kinds.items():
-        state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=4, **RUN).state
+        state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=3, **RUN).state
         evaluate_run(folder / name, pictures=False, convergence=True)
         made[name] = state, folder / name
     return made
 
 
-@pytest.mark.slow
 def test_a_run_finds_the_gains_of_its_images(runs, varied):
     state, out = runs["with"]
     dataset = load_dataset(varied)
@@ -168,7 +165,6 @@ def test_a_run_finds_the_gains_of_its_images(runs, varied):
     assert not any("exposure" in line for line in runs["without"][0].steps)
 
 
-@pytest.mark.slow
 def test_a_fit_with_gains_is_nearly_as_good_as_one_of_constant_exposure_and_without_it_is_worse(
     runs,
 ):
@@ -195,11 +191,11 @@ def test_an_interrupted_run_goes_on_bit_for_bit(varied, runs, tmp_path):
         pass
 
     def kill(state: State) -> None:
-        if len(state.steps) == 3:
+        if len(state.steps) == 2:
             raise Killed
 
     with pytest.raises(Killed):
-        run_nbv(varied, tmp_path / "run", exposure=True, evaluate_every=4, on_step=kill, **RUN)
+        run_nbv(varied, tmp_path / "run", exposure=True, evaluate_every=3, on_step=kill, **RUN)
     resume_nbv(tmp_path / "run")
     one, other = read_checkpoint(runs["with"][1]), read_checkpoint(tmp_path / "run")
     assert one is not None

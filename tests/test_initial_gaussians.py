@@ -1,7 +1,5 @@
 """Initial Gaussians on an analytic scene with known colours."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
@@ -17,7 +15,7 @@ from mgs.data.dataset import Dataset
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.images import write_png
-from mgs.prior.build import Prior, build_prior, load_prior, save_prior
+from mgs.prior.build import Prior, build_prior, load_prior, prior_from_mesh, save_prior
 from mgs.prior.initial import (
     GREY,
     IN_PLANE_SCALE,
@@ -166,9 +164,14 @@ def test_colours_are_averaged_and_the_mask_counts(prior, dataset, tmp_path):
     assert np.allclose(gaussians.rgb, GREY, atol=1e-6)
 
 
-def test_behind_the_surface_lies_an_opaque_backing(dataset):
+@pytest.fixture(scope="module")
+def backed(dataset: Dataset) -> Prior:
+    return prior_from_mesh(dataset.root / "rock.glb", PriorSettings(gaussians=1200))
+
+
+def test_behind_the_surface_lies_an_opaque_backing(dataset, backed):
     """A third of the Gaussians, evenly spread, a spacing inside, opaque, coloured as above them."""
-    prior = build_prior(dataset, PriorSettings(gaussians=1200))
+    prior = backed
     gaussians, seen = initial_gaussians(prior, dataset.frames)
     assert (len(gaussians), len(prior.points), len(seen), prior.backed) == (1200, 800, 800, 400)
     surface, backing, over = gaussians[:800], gaussians[800:], slice(0, 400)
@@ -192,11 +195,12 @@ def joined(a: Gaussians, b: Gaussians) -> Gaussians:
     return Gaussians(*(np.concatenate([getattr(a, name), getattr(b, name)]) for name in vars(a)))
 
 
-def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(dataset, tmp_path):
-    prior = build_prior(dataset, PriorSettings(gaussians=300))
-    loaded = load_prior(save_prior(tmp_path / "prior", prior))
-    assert loaded.backed == prior.backed == 100
-    assert len(initial_gaussians(loaded, dataset.frames[:2])[0]) == 300
+def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(
+    dataset, backed, tmp_path
+):
+    loaded = load_prior(save_prior(tmp_path / "prior", backed))
+    assert loaded.backed == backed.backed == 400
+    assert len(initial_gaussians(loaded, dataset.frames[:2])[0]) == 1200
     assert prior_digest(replace(loaded, backed=99)) != prior_digest(loaded)
     numbers = json.loads((tmp_path / "prior/prior.json").read_text())
     (tmp_path / "prior/prior.json").write_text(json.dumps(numbers | {"backed": 1000}))

@@ -1,7 +1,5 @@
 """The loop in a few lines of a user's own program takes the views of `mgs.run_nbv`."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from pathlib import Path
 
@@ -36,8 +34,9 @@ def loop_by_hand(run: mgs.Run) -> mgs.Fitted:
 def rock(tmp_path_factory) -> Path:
     """A dataset of a rock with its prior."""
     root = tmp_path_factory.mktemp("rock")
-    dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(8, 48, 36))
-    mgs.save_prior(root / "prior", mgs.build_prior(dataset, mgs.PriorSettings(gaussians=200)))
+    synthetic.write_dataset(root, synthetic.orbit_cameras(8, 48, 36))
+    prior = mgs.prior_from_mesh(root / "rock.glb", mgs.PriorSettings(gaussians=200))
+    mgs.save_prior(root / "prior", prior)
     return root
 
 

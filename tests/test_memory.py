@@ -1,7 +1,5 @@
 """Memory is bounded without a change of results, and no array is read beyond its end."""
 
-from __future__ import annotations
-
 import gc
 import re
 import subprocess
@@ -25,7 +23,7 @@ from mgs.data.importers import import_source
 from mgs.data.sources import read_source
 from mgs.fit import objective
 from mgs.memory import PADDING, adopted, kept_within, padded
-from mgs.prior.build import build_prior, save_prior
+from mgs.prior.build import build_prior, prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run import operations, problem
 from mgs.run.nbv import run_nbv
@@ -75,7 +73,7 @@ class Live:
 def rock(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     root = tmp_path_factory.mktemp("rock") / "dataset"
     dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(9, 48, 36))
-    save_prior(root / "prior", build_prior(dataset, PriorSettings(gaussians=300)))
+    save_prior(root / "prior", prior_from_mesh(root / "rock.glb", PriorSettings(gaussians=300)))
     return dataset
 
 
@@ -110,6 +108,7 @@ def test_a_run_holds_few_images_at_once_and_finds_the_same(
 TARGET_OF = problem.target_of
 
 
+@pytest.mark.usefixtures("coarse_priors")
 def test_commands_before_a_run_hold_few_images_at_once(
     rock: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

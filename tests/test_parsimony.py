@@ -74,9 +74,8 @@ def write_data(root, size=(48, 36)):
     return synthetic.write_dataset(root, synthetic.orbit_cameras(12, *size))
 
 
-@pytest.mark.parametrize("asked", [[], ["--gaussians", "auto"]], ids=["default", "auto"])
-def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys, asked):
-    command("prior", data.root, "--out", tmp_path / "p", *asked)
+def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys):
+    command("prior", data.root, "--out", tmp_path / "p")
     numbers = json.loads((tmp_path / "p/prior.json").read_text())
     pixel = numbers["resolution"]["pixel"]
     assert numbers["spacing"] == pytest.approx(PIXELS_PER_SAMPLE * pixel, rel=0.01)
@@ -93,6 +92,12 @@ def test_a_given_mesh_takes_its_number_from_the_pixels_too(data, tmp_path, capsy
     assert "resolution" in json.loads((tmp_path / "p/prior.json").read_text())
     with pytest.raises(InputError, match="a density is relative to the voxels of a cloud"):
         prior_from_mesh(tmp_path / "rock.ply", PriorSettings(density=0.5))
+
+
+def test_the_automatic_number_has_a_limit(data, monkeypatch):
+    monkeypatch.setattr("mgs.prior.build.MOST_GAUSSIANS", 100)
+    prior = build_prior(data)
+    assert len(prior.points) + prior.backed == 100
 
 
 def test_views_are_spread_evenly_from_the_first_on():
@@ -130,14 +135,6 @@ def test_the_automatic_choice_is_compared_with_the_smallest_that_is_as_good():
     assert parsimony._holds(auto | found | {"loss": 0.0}) == "yes"
     assert parsimony._holds(auto | found | {"loss": 0.2}) == "no: worse"
     assert parsimony._holds({"loss": 0.0, "over_smallest": 2}) == "no: too many parameters"
-
-
-def test_every_need_of_a_cell_is_a_cell():
-    for size in parsimony.SIZES.values():
-        cells = parsimony.cells_of(size)
-        names = {cell.name for cell in cells}
-        assert all(set(cell.needs) <= names for cell in cells)
-        assert all(json.loads(json.dumps(cell.arguments)) == cell.arguments for cell in cells)
 
 
 @pytest.mark.slow

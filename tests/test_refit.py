@@ -230,11 +230,12 @@ def test_lambda_of_each_kind(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(tmp_path_factory, coarse_priors):
     root = tmp_path_factory.mktemp("refit")
     synthetic.write_dataset(root / "data/test", synthetic.orbit_cameras(3, 48, 36, altitude=2.0))
     data = synthetic.write_dataset(root / "data", synthetic.orbit_cameras(12, 48, 36))
-    run_nbv(data.root, root / "run", gaussians=400, budget=2, policy="uniform")
+    given = {"gaussians": 400, "budget": 2, "policy": "uniform", "train": {"passes": 10}}
+    run_nbv(data.root, root / "run", **given)
     return root / "run"
 
 
@@ -306,7 +307,8 @@ def test_the_images_of_the_last_fit_are_those_of_the_run(run):
 @pytest.mark.parametrize("means", ["normal", "free"])
 def test_a_run_that_learns_means_is_refitted_too(run, tmp_path, means):
     small = {"gaussians": 150, "budget": 1, "policy": "uniform", "exposure": True}
-    run_nbv(run.parent / "data", tmp_path / "run", train={"means": means}, **small)
+    train = {"means": means, "passes": 10}
+    run_nbv(run.parent / "data", tmp_path / "run", train=train, **small)
     found = refit_run(tmp_path / "run", sh="0")
     assert found.before == 150 * {"normal": 12, "free": 14}[means]
     vertices = PlyData.read(str(tmp_path / "run" / REFITTED))["vertex"].data

@@ -1,7 +1,5 @@
 """`mgs suggest`: candidates, ranks, plans; flight plans read by a parser that is not ours."""
 
-from __future__ import annotations
-
 import json
 import math
 from xml.etree import ElementTree
@@ -27,7 +25,7 @@ def run(tmp_path_factory):
     """A run of three seeds on one side of an ellipsoid, of 14 poses on a circle of 2.6 m."""
     folder = tmp_path_factory.mktemp("suggest")
     data = synthetic.write_dataset(folder / "data", synthetic.orbit_cameras(14, 48, 36)[:8])
-    prior = mgs.build_prior(data, mgs.PriorSettings(gaussians=300))
+    prior = mgs.prior_from_mesh(data.root / "rock.glb", mgs.PriorSettings(gaussians=300))
     mgs.save_prior(data.root / "prior", prior)
     mgs.run_nbv(data.root, folder / "run", seeds=8, budget=0)
     return folder / "run"
