@@ -1,7 +1,5 @@
 """A headless Chromium of this machine, driven by playwright."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

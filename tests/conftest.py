@@ -54,6 +54,17 @@ def coarse_arena():
         yield
 
 
+@pytest.fixture(scope="module")
+def coarse_priors():
+    """Surfaces of few cells, which are most of a prior's cost: for tests that do not look at it."""
+    from mgs.prior import hull, surface
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(hull, "COARSE", 14)
+        patched.setattr(surface, "POISSON_DEPTHS", (5, 5))
+        yield
+
+
 @pytest.fixture
 def short_fits(monkeypatch):
     """Fits of runs have at most two passes: for tests that do not look at their quality."""

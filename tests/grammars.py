@@ -1,7 +1,5 @@
 """Strategies of hypothesis: damaged bytes of a file, and the file with other contents."""
 
-from __future__ import annotations
-
 import json
 import re
 import struct

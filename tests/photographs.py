@@ -11,8 +11,6 @@ It also has the true masks (masks), the true rock in the world of these data (tr
 similarity to that world (truth.json). The same seed gives the same files.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Run commands of the program in this process, and read the steps of a run."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

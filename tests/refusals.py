@@ -1,7 +1,5 @@
 """Checks of every refusal, and places that a command must keep out of."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A small RGB-D dataset in closed form: an ellipsoid half buried in a plane."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -29,19 +29,6 @@ def test_importing_loads_nothing_and_leaves_the_variant_alone():
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 
 
-def test_no_module_hides_behind_a_function_of_its_name():
-    """Else `mgs.splat.render` is a function or a module, as it was imported."""
-    for folder in {path.parent for path in (ROOT / "mgs").rglob("*.py")}:
-        package = ".".join(folder.relative_to(ROOT).parts)
-        module = __import__(package, fromlist=["_"])
-        for path in folder.glob("*.py"):
-            if path.stem != "__init__" and path.stem != "__main__":
-                found = getattr(module, path.stem, None)
-                assert found is None or found.__class__.__name__ == "module", (
-                    f"{package}.{path.stem}"
-                )
-
-
 def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
     """Nothing is printed, callbacks are called, and the state is what the folder holds."""
     steps, stages = [], set()

@@ -4,8 +4,6 @@ code 2, nothing left over.
 A rule is tried by one command; that the other commands use the same check is tried once for each.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable
@@ -75,11 +73,6 @@ def no_surface(data: dict) -> None:
         one.pop("mask_path")
 
 
-def a_folder(root: Path) -> None:
-    (root / "transforms.json").unlink()
-    (root / "transforms.json").mkdir()
-
-
 def same_name(root: Path) -> None:
     (root / "images/left").mkdir()
     shutil.copy(root / "images/kf_0000.png", root / "images/left/kf_0000.png")
@@ -88,7 +81,6 @@ def same_name(root: Path) -> None:
 
 DATASETS: dict[str, tuple[Change, str]] = {
     "no transforms.json": (remove("transforms.json"), "transforms.json"),
-    "folder in place of transforms.json": (a_folder, "transforms.json"),
     "transforms.json of another shape": (
         lambda root: (root / "transforms.json").write_text("[1, 2]"),
         "no frames",
@@ -96,7 +88,6 @@ DATASETS: dict[str, tuple[Change, str]] = {
     "no frames": (header(frames=[]), "no frames"),
     "pose of words": (frame(transform_matrix=[["a"] * 4] * 4), "frame 2"),
     "pose of NaN": (frame(transform_matrix=[[float("nan")] * 4] * 4), "not a finite 4x4"),
-    "pose of 2 rows": (frame(transform_matrix=[[1, 0], [0, 1]]), "not a finite 4x4"),
     "singular pose": (frame(transform_matrix=np.diag([1, 1, 0, 1]).tolist()), "singular"),
     "no pose": (edit(lambda data: data["frames"][2].pop("transform_matrix")), "frame 2 lacks"),
     "no intrinsics": (edit(lambda data: data.pop("fl_x")), "intrinsics"),
@@ -112,13 +103,10 @@ DATASETS: dict[str, tuple[Change, str]] = {
     "distortion of one frame": (frame(p2=-1e-3), "mgs import"),
     "distortion that is no number": (header(k4="a"), "mgs import"),
     "fisheye": (header(camera_model="OPENCV_FISHEYE"), "mgs import"),
-    "fisheye in one frame": (frame(camera_model="OPENCV_FISHEYE"), "mgs import"),
     "camera model that is no text": (header(camera_model=[1]), "mgs import"),
     "frame twice": (edit(lambda data: data["frames"].append(data["frames"][0])), "kf_0000"),
     "name twice": (same_name, "kf_0000"),
     "file_path that is a number": (frame(file_path=5), "frame 2"),
-    "file_path null": (frame(file_path=None), "frame 2"),
-    "file_path empty": (frame(file_path=""), "frame 2"),
     "file_path with a null character": (frame(file_path="a\0b"), "frame 2"),
     "mask_path that is a list": (frame(mask_path=["a"]), "mask_path"),
     "timestamp NaN": (frame(timestamp=float("nan")), "timestamp"),

@@ -1,7 +1,5 @@
 """Views chosen together, before their images are read (more in test_nbv.py)."""
 
-from __future__ import annotations
-
 import pytest
 import tiny
 from program import command, steps

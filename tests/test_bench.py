@@ -1,7 +1,5 @@
 """`mgs bench`: what is timed and written."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import tiny

@@ -1,7 +1,5 @@
 """On-demand datasets: a frame is rendered when a run takes it; the run is otherwise the same."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil
@@ -56,7 +54,7 @@ main()
 """
 """The program; it kills itself before it writes the eighth PNG file (mask or image)."""
 
-pytestmark = pytest.mark.usefixtures("coarse_arena")
+pytestmark = pytest.mark.usefixtures("coarse_arena", "coarse_priors")
 
 
 @pytest.fixture(scope="module")

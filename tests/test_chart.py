@@ -76,12 +76,6 @@ def test_commands_of_points_say_what_was_measured(size):
             assert (DEFAULTS[key].default if said[key] is None else said[key]) == value
         settings = NbvSettings(dataset="DATA", prior="PRIOR", **made, train=train)
         assert settings.train_at(1).passes == min(point.warm_passes, point.passes)
-    data = chart.Data(size)
-    cells = [cell for kind in chart.KINDS for cell in data.cells(kind, 3)]
-    by_name = {cell.name: cell for cell in cells}
-    assert all(by_name[cell.name] == cell for cell in cells)
-    assert all(need in by_name for cell in cells for need in cell.needs)
-    assert all(cell.alone for cell in cells if "repeats" in cell.arguments)
 
 
 def test_a_preset_that_is_beaten_by_a_run_of_its_time_fails():
@@ -208,6 +202,7 @@ def test_a_chart_is_measured_once_and_written(small, tmp_path, capsys):
     assert "| **fast**: " in (out / "run.md").read_text()
 
 
+@pytest.mark.usefixtures("coarse_priors")
 def test_photographs_are_charted_beside_another_program(dataset, tmp_path, capsys, monkeypatch):
     tiny.write_dataset(dataset / "test", frames=3)
     monkeypatch.setitem(photographs.PASSES, "quick", (1, 2))

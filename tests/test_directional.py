@@ -1,7 +1,5 @@
 """Directional D- and I-optimality against their definitions, and laws of a gain."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import tiny

@@ -1,7 +1,5 @@
 """The real operations together: dataset, prior, next best views, evaluation, diagnosis, report."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -23,6 +21,8 @@ from mgs.run.operations import psnr_measure
 from mgs.splat import ListCache
 from mgs.splat_ply import read_ply
 from mgs.synth.rendering import write_contact_sheet
+
+pytestmark = pytest.mark.usefixtures("coarse_priors")
 
 VIEWS = ["--seed-views", "3", "--budget", "4", "--passes", "6", "--random-seed", "1"]
 STRUCK = """
@@ -58,7 +58,7 @@ def dataset(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def run(dataset):
+def run(dataset, coarse_priors):
     out = dataset.parent / "run"
     command("nbv", dataset, "--out", out, "--gaussians", 300, *VIEWS, "--evaluate-every", 2)
     return out

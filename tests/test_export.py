@@ -1,7 +1,5 @@
 """Models in the formats of other programs: round trips, colours, and files that are refused."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import struct

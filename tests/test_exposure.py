@@ -1,7 +1,5 @@
 """Exposure that differs between images: gains are found, and fits with them are as good."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files and images: complete or absent, errors in one line, and every kind of PNG."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

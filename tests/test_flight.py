@@ -1,7 +1,5 @@
 """Flights with a limit: tours, the budget of a run, poses that are not allowed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import tiny

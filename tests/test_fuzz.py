@@ -6,8 +6,6 @@ same command continues an interrupted pass; --cache-clear begins a new one. An i
 copied to the folder `corpus`, which the quick suite reads.
 """
 
-from __future__ import annotations
-
 import faulthandler
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """Hostile input: one line, exit code 2, nothing lost, nothing decoded that is too large."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

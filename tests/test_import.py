@@ -1,7 +1,5 @@
 """Imports: cameras to 1e-9, the same pixels, distortion undone, bad input in one line."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """An interrupted import, and the same command again: the same dataset, bit for bit."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Initial Gaussians on an analytic scene with known colours."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A resumed run needs its prior, all poses and the files of frames taken as they were."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

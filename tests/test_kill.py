@@ -5,8 +5,6 @@ uninterrupted run bit for bit. Two processes of every writing command. The memor
 interrupted pass; --cache-clear begins a new one.
 """
 
-from __future__ import annotations
-
 import faulthandler
 import os
 import re

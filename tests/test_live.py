@@ -1,7 +1,5 @@
 """Live capture: poses out, pictures back, by a command, a folder or a function."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import shutil

@@ -1,7 +1,5 @@
 """The loop in a few lines of a user's own program takes the views of `mgs.run_nbv`."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from pathlib import Path
 

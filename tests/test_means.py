@@ -1,7 +1,5 @@
 """Learned means, along the prior's normals or free: steps of a fit, and runs of `mgs nbv`."""
 
-from __future__ import annotations
-
 import json
 from typing import get_args
 

@@ -1,7 +1,5 @@
 """Memory is bounded without a change of results, and no array is read beyond its end."""
 
-from __future__ import annotations
-
 import gc
 import re
 import subprocess
@@ -25,7 +23,6 @@ from mgs.data.importers import import_source
 from mgs.data.sources import read_source
 from mgs.fit import objective
 from mgs.memory import PADDING, adopted, kept_within, padded
-from mgs.prior import hull
 from mgs.prior.build import build_prior, prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run import operations, problem
@@ -111,6 +108,7 @@ def test_a_run_holds_few_images_at_once_and_finds_the_same(
 TARGET_OF = problem.target_of
 
 
+@pytest.mark.usefixtures("coarse_priors")
 def test_commands_before_a_run_hold_few_images_at_once(
     rock: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,7 +116,6 @@ def test_commands_before_a_run_hold_few_images_at_once(
     from mgs.data.masks import make_masks
     from mgs.data.meshes import read_mesh
 
-    monkeypatch.setattr(hull, "COARSE", 16)
     live, read, rgb, mask = Live(), importers.read_rgba, Frame.rgb, Frame.mask
     monkeypatch.setattr(importers, "read_rgba", lambda path: live.watch(np.array(read(path))))
     monkeypatch.setattr(Frame, "rgb", lambda frame: live.watch(rgb(frame).copy()))

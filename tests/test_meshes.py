@@ -1,7 +1,5 @@
 """Given meshes of any kind: the right prior, or one line that says what is wrong."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

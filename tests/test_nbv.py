@@ -1,7 +1,5 @@
 """The loop in a folder with the operations of tests/tiny.py, one view or a batch at a time."""
 
-from __future__ import annotations
-
 import json
 import math
 import signal

@@ -1,7 +1,5 @@
 """`mgs nbv` around the loop: settings of a run, errors, what is printed."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Orbits: where the cameras are, and what they look at."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

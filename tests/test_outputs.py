@@ -1,8 +1,6 @@
 """Outputs that cannot be written and options that are wrong, through the real command line: known
 before any work."""
 
-from __future__ import annotations
-
 import importlib
 import os
 from pathlib import Path
@@ -17,6 +15,8 @@ from refusals import a_file, listing, occupied, refused
 from mgs import __version__
 from mgs.cli.app import COMMANDS, app
 from mgs.splat_ply import write_ply
+
+pytestmark = pytest.mark.usefixtures("coarse_priors")
 
 
 def read_only(tmp_path: Path) -> Path:
@@ -126,33 +126,6 @@ def test_a_file_where_a_run_keeps_its_pictures(capsys, dataset, prior, tmp_path)
         a_file(run / folder)
         line = refused(capsys, [name, run], run)
         assert "cannot be written" in line or "is a file, not a folder" in line
-
-
-def test_a_report_under_a_file(capsys, dataset, prior, tmp_path):
-    run, file = tiny.write_run(tmp_path / "run", dataset, prior), a_file(tmp_path / "file")
-    for out in (file, file / "report"):
-        line = refused(capsys, ["report", run, "--out", out], tmp_path)
-        assert "cannot be written" in line
-
-
-def test_bench_knows_before_it_measures_that_it_cannot_write(capsys, tmp_path):
-    for path, named in (
-        (a_file(tmp_path / "file") / "x", "cannot be written"),
-        (occupied(tmp_path / "folder"), "is a folder"),
-    ):
-        assert named in refused(capsys, ["bench", "--json", path])
-
-
-@pytest.mark.parametrize("existing", [False, True])
-def test_a_prior_that_fails_leaves_all_as_it_was(capsys, dataset, tmp_path, existing):
-    out = tmp_path / "new/deeper/prior"
-    if existing:
-        out.mkdir(parents=True)
-    before, few = listing(tmp_path), ["--gaussians", 1]
-    refused(capsys, ["prior", dataset, "--out", out, *few])
-    refused(capsys, ["prior", dataset, "--out", out, "--mesh", tmp_path / "none.glb"])
-    refused(capsys, ["nbv", dataset, "--out", out, *few, "--budget", 1])
-    assert listing(tmp_path) == before
 
 
 WHOLE = {

@@ -13,7 +13,6 @@ import synthetic
 import mgs
 from mgs.policy import criteria
 from mgs.policy import poses as pose_policies
-from mgs.prior import hull
 from mgs.splat import ESTIMATORS
 from mgs.synth import rendering
 
@@ -31,7 +30,7 @@ def pages():
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
+def data(tmp_path_factory, coarse_priors):
     """Inputs of the how-to pages: demo, photos with depth, a COLMAP model, masks, a mesh."""
     folder = tmp_path_factory.mktemp("readers")
     dataset = synthetic.write_dataset(folder / "demo/dataset", synthetic.orbit_cameras(14, 48, 36))
@@ -45,15 +44,14 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture
-def quick(monkeypatch, coarse_arena, short_fits):
-    """Coarse rocks and hulls, and short fits."""
+def quick(monkeypatch, coarse_arena, coarse_priors, short_fits):
+    """Coarse rocks and priors, and short fits."""
     make_rock = rendering.make_rock
 
     def coarse(rock, rng):
         return make_rock(rock.model_copy(update={"detail": rock.size / 30}), rng)
 
     monkeypatch.setattr(rendering, "make_rock", coarse)
-    monkeypatch.setattr(hull, "COARSE", 14)
 
 
 @pytest.fixture

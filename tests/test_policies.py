@@ -1,7 +1,5 @@
 """Policies: laws of an information gain, and each policy against its formula."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Policies in a user's file."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -19,8 +17,6 @@ from mgs.run.folder import open_run
 from mgs.run.nbv import start_run
 
 FUNCTIONS = """
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

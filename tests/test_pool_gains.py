@@ -1,7 +1,5 @@
 """Updated gains against the reference, `mgs.policy.directional.gains`."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """The prior on an analytic scene: every station against what is known exactly."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The program as a whole: how it starts and ends, and what it repairs."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Command line and versions in results."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Imports of recordings: ROS bags, TUM RGB-D, Open3D, RTAB-Map, Metashape."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import struct
@@ -350,15 +348,3 @@ def test_refusals_are_one_line(dataset, tmp_path, capsys, case):
     make, message = BROKEN[case]
     source = make(tmp_path, dataset)
     assert message in refused(capsys, ["import", source, "--out", tmp_path / "out"], tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["ROS bag 2", "TUM RGB-D"])
-def test_a_recording_becomes_a_model(dataset, tmp_path, kind):
-    """Bag, dataset, masks of the rock's mesh, prior of the depth, run, renders."""
-    source, out = WRITERS[kind](tmp_path, dataset), tmp_path / "out"
-    command("import", source, "--out", out, "--mesh", dataset.root / "rock.glb")
-    options = ["--seed-views", 3, "--budget", 1, "--passes", 2, "--gaussians", 200]
-    command("nbv", out, *options, "--out", tmp_path / "run")
-    command("eval", tmp_path / "run")
-    assert len(list((tmp_path / "run/renders").glob("*.png"))) > 0

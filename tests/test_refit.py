@@ -230,7 +230,7 @@ def test_lambda_of_each_kind(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(tmp_path_factory, coarse_priors):
     root = tmp_path_factory.mktemp("refit")
     synthetic.write_dataset(root / "data/test", synthetic.orbit_cameras(3, 48, 36, altitude=2.0))
     data = synthetic.write_dataset(root / "data", synthetic.orbit_cameras(12, 48, 36))

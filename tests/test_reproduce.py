@@ -455,15 +455,6 @@ def test_a_set_up_changes_the_orbit_of_the_scene():
     assert "gaussians" not in prior.arguments, "their number is automatic"
 
 
-def test_every_run_of_every_result_has_its_own_cell():
-    for size in reproduce.SIZES.values():
-        for name, result in reproduce.RESULTS.items():
-            cells: dict = {}
-            for cell in result.cells(size, result.count(size)):
-                assert cells.setdefault(cell.name, cell) == cell, name
-            assert all(need in cells for cell in cells.values() for need in cell.needs)
-
-
 def test_a_folder_of_another_preset_or_of_something_else_is_refused(capsys, tmp_path):
     occupied(tmp_path / "full")
     assert "is there already" in refused(capsys, ["reproduce", tmp_path / "full"], tmp_path)

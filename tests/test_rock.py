@@ -1,7 +1,5 @@
 """Rocks: procedural and given."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

@@ -1,7 +1,5 @@
 """Mitsuba sees what `Camera` says: the same pixels, in colour and in depth."""
 
-from __future__ import annotations
-
 import mitsuba as mi
 import numpy as np
 import pytest

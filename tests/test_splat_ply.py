@@ -1,7 +1,5 @@
 """Compressed PLY files of SuperSplat and PlayCanvas, and comments in any script."""
 
-from __future__ import annotations
-
 import base64
 import math
 import struct

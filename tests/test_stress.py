@@ -53,23 +53,12 @@ def test_detectors_are_judged_by_false_and_missed_alarms():
     assert faults.false_alarms(noisy + noisy) == [1.0], "a clean run of two experiments counts once"
 
 
-def test_claims_and_cells_of_all_experiments_are_complete():
-    from importlib import import_module
-
+def test_claims_of_all_experiments_are_complete():
     for name, experiment in run.EXPERIMENTS.items():
         assert experiment.panels, name
         for one in experiment.claims:
             assert one.hypothesis.endswith(".")
             assert judged(one, [])["verdict"] == "depends"
-    for size in SIZES.values():
-        cells = [cell for one in run.EXPERIMENTS.values() for cell in one.cells(size)]
-        by_name = {cell.name: cell for cell in cells}
-        for cell in cells:
-            module, _, function = cell.task.partition(":")
-            assert callable(getattr(import_module(module), function))
-            assert by_name[cell.name] == cell
-            assert set(cell.needs) <= set(by_name)
-            assert json.loads(json.dumps(cell.arguments)) == cell.arguments
     *_, cell = rock_cell("n", "m:f", SIZES["quick"], ("boulder", 0), x=1)
     assert cell.arguments["scene"] == "boulder-0"
     assert cell.arguments["x"] == 1

@@ -4,8 +4,6 @@ A room is a module or sub-package directly in mgs/. Imports inside functions and
 count, too.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from graphlib import CycleError, TopologicalSorter

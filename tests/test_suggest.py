@@ -1,7 +1,5 @@
 """`mgs suggest`: candidates, ranks, plans; flight plans read by a parser that is not ours."""
 
-from __future__ import annotations
-
 import json
 import math
 from xml.etree import ElementTree

@@ -1,7 +1,5 @@
 """The survey: sensor, odometry, registration, loop closure and pose graph, against the truth."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

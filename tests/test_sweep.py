@@ -1,11 +1,13 @@
 """A sweep of cells: each is done once, in the order of needs, and what was interrupted goes on."""
 
+import json
 import logging
 import os
 import signal
 import subprocess
 import sys
 import time
+from importlib import import_module
 
 import dask
 import numpy as np
@@ -51,6 +53,35 @@ def test_cells_come_after_those_they_need_and_are_done_once(tmp_path):
     assert again == {"a/1": {"sum": 1}, "b": {"sum": 3}}
     assert CALLS == ["1", "b"]
     assert told == []
+
+
+def studies():
+    """Cells of each study by its name, of every size."""
+    from mgs.study import chart, parsimony, reproduce
+    from mgs.study.stress import lab, run
+
+    for size in chart.SIZES.values():
+        data = chart.Data(size)
+        yield "chart", [cell for kind in chart.KINDS for cell in data.cells(kind, 3)]
+    for size in parsimony.SIZES.values():
+        yield "parsimony", parsimony.cells_of(size)
+    for size in lab.SIZES.values():
+        yield "stress", [cell for one in run.EXPERIMENTS.values() for cell in one.cells(size)]
+    for size in reproduce.SIZES.values():
+        for name, result in reproduce.RESULTS.items():
+            yield name, list(result.cells(size, result.count(size)))
+
+
+def test_cells_of_a_study_have_one_name_each_and_all_they_need():
+    for study, cells in studies():
+        by_name = {one.name: one for one in cells}
+        for one in cells:
+            module, _, function = one.task.partition(":")
+            assert callable(getattr(import_module(module), function)), study
+            assert by_name[one.name] == one, study
+            assert set(one.needs) <= set(by_name), study
+            assert json.loads(json.dumps(one.arguments)) == one.arguments, study
+            assert one.alone or study != "chart" or "repeats" not in one.arguments
 
 
 def test_names_come_in_the_order_of_those_known():

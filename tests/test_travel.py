@@ -1,7 +1,5 @@
 """Moves from view to view: scores over travel costs, path lengths, nearest poses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import tiny

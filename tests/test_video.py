@@ -1,7 +1,5 @@
 """Films of a run: paths of cameras, the story of its views, and the files."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The viewer towards strangers: other websites, other machines, hostile names and messages."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

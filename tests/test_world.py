@@ -1,8 +1,6 @@
 """Reports of a world whose up axis is not +Z and whose unit is unknown: figures, page, maps,
 viewer."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

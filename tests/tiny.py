@@ -4,8 +4,6 @@
 MOMENT (`dying_operations`).
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

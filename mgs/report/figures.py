@@ -301,9 +301,9 @@ def comparison_figure(
         save_figure(figure, path)
 
 
-def _in_lines(text: str, width: int = 34) -> str:
-    """Wrap text to lines of at most `width` characters, which fit above one column."""
-    return "\n".join(textwrap.wrap(literal(text), width))
+def _in_lines(text: str) -> str:
+    """Wrap text to lines that fit above one column."""
+    return "\n".join(textwrap.wrap(literal(text), 34))
 
 
 def uncertainty_figure(

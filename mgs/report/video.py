@@ -102,12 +102,12 @@ def _picture(maps: dict[str, np.ndarray]) -> np.ndarray:
     return srgb_from_linear(np.stack([maps[channel] for channel in "RGB"], -1))
 
 
-def _unknown(maps: dict[str, np.ndarray], behind: float = 0.0) -> np.ndarray:
-    """Map of the variance that is left, sRGB in [0,1] [H,W,3]. behind: grey around the model."""
+def _unknown(maps: dict[str, np.ndarray]) -> np.ndarray:
+    """Map of the variance that is left, sRGB in [0,1] [H,W,3]."""
     import matplotlib
 
     colours = matplotlib.colormaps[UNKNOWN](np.clip(maps["uncertainty"], 0, 1))[..., :3]
-    return np.where(maps["A"][..., None] >= VISIBLE, colours, behind).astype(np.float32)
+    return np.where(maps["A"][..., None] >= VISIBLE, colours, 0).astype(np.float32)
 
 
 def _resized(image: np.ndarray, camera: Camera) -> np.ndarray:

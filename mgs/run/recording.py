@@ -19,7 +19,7 @@ from mgs.run import inputs
 from mgs.run.checks import Checks
 from mgs.run.ending import FitDivergedError, diverged, run_end
 from mgs.run.folder import check_settings, read_checkpoint, write_checkpoint, write_steps
-from mgs.run.loop import Chooser, select_views, uncertainty
+from mgs.run.loop import select_views, uncertainty
 from mgs.run.problem import Operations, Problem, Progress
 from mgs.run.settings import NbvSettings
 from mgs.run.state import Choice, Learned, State
@@ -43,14 +43,13 @@ def run(
     operations: Operations,
     progress: Progress,
     on_step: Callable[[State], None] = lambda state: None,
-    chooser: Chooser | None = None,
     policy: Policy | None = None,
 ) -> State:
     """Run or resume the loop in `out`, which has its config.json, to its end; give the last state.
 
-    on_step(state): called after every step, or batch of steps, that is on disk. chooser: as
-    `select_views`. policy: in place of that of the settings. Killed at any moment and called again,
-    it takes the same views as an uninterrupted run.
+    on_step(state): called after every step, or batch of steps, that is on disk. policy: in
+    place of that of the settings. Killed at any moment and called again, it takes the same views as
+    an uninterrupted run.
 
     Raises InputError as `check_settings`; where another process works on the folder; where the
     prior, a pose or a file of a frame taken has changed; where a frame it takes cannot be read or
@@ -72,7 +71,7 @@ def run(
                 write_checkpoint(out, state)
             on_step(state)
         if state is None or "ended" not in state.steps[-1]:
-            state = _go_on(out, problem, recorder, state, on_step, chooser)
+            state = _go_on(out, problem, recorder, state, on_step)
         write_steps(out, state)
         write_ply(out / "gaussians.ply", state.gaussians)
         return state
@@ -84,11 +83,10 @@ def _go_on(
     recorder: Recorder,
     state: State | None,
     on_step: Callable[[State], None],
-    chooser: Chooser | None,
 ) -> State:
     """Run the loop from a state to its end, and commit every step."""
     try:
-        for learned in select_views(problem, state, chooser):
+        for learned in select_views(problem, state):
             if isinstance(learned, Choice):
                 assert state is not None
                 state = mark_end(problem, state, learned)
@@ -97,6 +95,8 @@ def _go_on(
                 state = recorder.recorded(learned, state)
                 write_checkpoint(out, state)
                 on_step(state)
+                if "ended" in state.steps[-1]:
+                    break
     except FitDivergedError as error:
         kept = len(state.steps) if state else 0
         raise InputError(diverged(out, error.step, kept, error.losses)) from None
@@ -136,7 +136,9 @@ def mark_end(problem: Problem, state: State, refused: Choice | None = None) -> S
     views = len(state.taken) - problem.settings.seeds
     stuck = not problem.reachable(state.taken)
     metres = problem.flight.metres(state.taken) if stuck else None
-    ended = run_end(problem.settings, views, uncertainty(problem, state), next_view, metres)
+    predicted = last.get("prediction", {}).get("psnr")
+    left = uncertainty(problem, state)
+    ended = run_end(problem.settings, views, left, next_view, metres, predicted)
     return replace(state, steps=[*state.steps[:-1], last | ({"ended": ended} if ended else {})])
 
 
@@ -205,9 +207,7 @@ class Recorder:
             line["exposure"] = dict(zip(names, learned.gains.tolist(), strict=True))
         if self.checks:
             self.stopwatch("checking", 0, 1)
-            if learned.before is not None:
-                line |= self.checks.residual(learned, learned.before, new)
-            line |= self.checks.indicators(learned, [*known, *lines])
+            line |= self.checks.entries(learned, new, [*known, *lines])
         every, first, step = settings.evaluate_every, len(known), line["step"]
         if every and any(k % every == 0 for k in range(first, step + 1)):
             self.stopwatch("evaluating", 0, 1)

@@ -84,10 +84,10 @@ def effect(record: Row) -> str:
     return f"{record['effect']:.3g}{between} {record['unit']}"
 
 
-def verdict_table(records: Sequence[Row], heading: str = "hypothesis") -> str:
+def verdict_table(records: Sequence[Row]) -> str:
     """Judged claims as a Markdown table."""
     return markdown(
-        (heading, "verdict", "mean effect (95 % interval)", "runs"),
+        ("hypothesis", "verdict", "mean effect (95 % interval)", "runs"),
         [
             (
                 one["hypothesis"],

@@ -1,7 +1,5 @@
 """Random scenes for the splat tests, and comparisons."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
