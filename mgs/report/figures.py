@@ -37,10 +37,10 @@ POLICY_STYLE: dict[str, tuple[str, str | tuple[int, int, int]]] = {
     "directional-i": ("#5500bb", "<"),
     "directional-d": ("#770000", ">"),
     "paper": ("#335533", "h"),
-    "i-optimal": ("#7755dd", "d"),
+    "i-optimal": ("#7755dd", "8"),
     "block-d": ("#bbbb77", (4, 1, 0)),
     "angle": ("#553355", (6, 1, 0)),
-    "cover": ("#000066", "8"),
+    "cover": ("#000066", "d"),
     "completeness": ("#8888ee", "H"),
 }
 """Colour and marker of each policy, the same in every figure. The first seven colours are those of
