@@ -12,10 +12,12 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from mgs.cli.nbv import resume_and_print
+from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset, target_of, write_transforms
 from mgs.images import write_png
 from mgs.prior.build import load_prior, prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
+from mgs.report.evaluation import evaluate_model
 from mgs.report.page_facts import measured, read_shown
 from mgs.report.runs import read_run
 from mgs.run import folder as run_folder
@@ -27,12 +29,13 @@ from mgs.run.detectors import (
     before_fit,
     means_drift,
     outline_margin,
-    residual,
     step_indicators,
     view_indicators,
 )
+from mgs.run.ending import why_ended
 from mgs.run.nbv import run_nbv, start_run
-from mgs.splat import render
+from mgs.run.prediction import predicted_psnr
+from mgs.splat import as_drjit, render
 
 FITS = Before(outline=0.001, offset=0.01)
 GOOD = ViewIndicators(FITS, unexplained=0.05, error=0.02, ratios=(-0.08, 0.0, 0.08))
@@ -148,6 +151,8 @@ def test_a_perfect_render_explains_all_and_a_single_colour_nothing():
     flat = view_indicators(target, mask, np.broadcast_to(truth.mean((0, 1)), truth.shape), FITS)
     assert flat.unexplained == pytest.approx(1, abs=1e-6)
     assert flat.error == pytest.approx(truth.std(axis=(0, 1)).mean(), rel=0.05)
+    unlike = srgb_from_linear(truth) - srgb_from_linear(truth.mean((0, 1)))
+    assert flat.srgb_error == pytest.approx(np.mean(unlike**2), rel=1e-5)
     assert view_indicators(target, mask, truth, FITS) == ViewIndicators(FITS, 0.0, 0.0)
     assert view_indicators(target, ~mask, truth, FITS) == ViewIndicators(FITS, 0.0, 0.0)
 
@@ -156,13 +161,6 @@ def test_drift_is_in_standard_deviations_of_the_prior():
     start = np.zeros((5, 3))
     assert means_drift(start, start, 0.1) == 0
     assert means_drift(start + np.array([0.2, 0, 0]), start, 0.1) == pytest.approx(2)
-
-
-def test_an_image_without_known_colours_has_no_residual():
-    target, mask = np.full((2, 3, 4), 0.5), np.ones((2, 3), bool)
-    assert residual([(np.zeros((2, 3, 3)), target, mask)]) == 0.5
-    target[..., 3] = 0
-    assert residual([(np.zeros((2, 3, 3)), target, mask)]) is None
 
 
 @pytest.fixture(scope="module")
@@ -193,6 +191,40 @@ def test_a_good_run_has_no_warning_and_the_residual_of_new_images(rock, tmp_path
     wrong = np.asarray(render(before.gaussians, frame.camera).rgb) - target[..., :3]
     expected = np.sqrt(np.mean(wrong[known] ** 2))
     assert after.steps[-1]["residual"] == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_run_predicts_the_quality_of_views_not_taken_and_stops_by_it(rock, tmp_path):
+    given = {"seeds": 2, "budget": 5}
+    whole = run_nbv(rock, tmp_path / "whole", **given).state
+    told = [line["prediction"].get("psnr") for line in whole.steps]
+    assert told[0] is None
+    frames = load_dataset(rock).frames
+    left = [frame for k, frame in enumerate(frames) if k not in whole.taken]
+    found = evaluate_model(as_drjit(whole.gaussians), left, ())["all"]["psnr_mask"]
+    assert told[-1] == pytest.approx(found, abs=2)
+    limit = sorted(told[1:])[2]
+    views = next(k for k in range(1, 6) if told[k] >= limit)
+    early = run_nbv(rock, tmp_path / "early", **given, stop_psnr=limit).state
+    assert early.taken == whole.taken[: 2 + views]
+    ended = {"reason": "psnr", "views": views, "psnr": told[views], "limit": limit}
+    assert early.steps[-1]["ended"] == ended
+    words = f"predicted to be {told[views]:.1f} dB after {views} chosen view"
+    assert words in why_ended(ended)
+
+
+def test_the_excess_of_the_last_views_is_scaled_by_the_gains():
+    first = {"fitted": 0.9, "left": 9.0}
+    entry = {"new": 1.9, "gain": 5.0, "fitted": 0.9, "left": 3.0}
+    errors = [0.9 + 1.0 / 5.0 * left for left in (3.0, 2.0)]
+    assert predicted_psnr([first]) is None
+    assert predicted_psnr([first, entry]) == pytest.approx(-10 * np.log10(errors[0]))
+    last = entry | {"left": 2.0}
+    # Only the last three views count, and no excess is negative.
+    assert predicted_psnr([first, entry | {"new": 99}, entry, entry, last]) == pytest.approx(
+        -10 * np.log10(errors[1])
+    )
+    assert predicted_psnr([first, entry | {"new": 0.1}]) == pytest.approx(-10 * np.log10(0.9))
+    assert predicted_psnr([first, {"new": 1.9, "gain": 5.0, "fitted": 0.9}]) is None
 
 
 def test_a_side_that_no_seed_saw_is_no_drift_of_the_exposure(rock, tmp_path):

@@ -94,6 +94,12 @@ def test_a_given_mesh_takes_its_number_from_the_pixels_too(data, tmp_path, capsy
         prior_from_mesh(tmp_path / "rock.ply", PriorSettings(density=0.5))
 
 
+def test_the_automatic_number_has_a_limit(data, monkeypatch):
+    monkeypatch.setattr("mgs.prior.build.MOST_GAUSSIANS", 100)
+    prior = build_prior(data)
+    assert len(prior.points) + prior.backed == 100
+
+
 def test_views_are_spread_evenly_from_the_first_on():
     angles = 2 * np.pi * np.arange(24) / 24
     positions = np.stack([np.cos(angles), np.sin(angles), np.ones(24)], 1)

@@ -17,6 +17,7 @@ from PIL import Image
 from program import command, exit_code, said
 from refusals import refused
 from scipy.ndimage import binary_dilation
+from scipy.spatial import cKDTree
 
 from mgs.camera import Camera, look_at
 from mgs.data.check import check_dataset
@@ -496,6 +497,29 @@ def test_poses_alone_are_fitted_from_random_points(data, tmp_path, capsys):
     start, seen = initial_gaussians(load_prior(tmp_path / "d/prior"), frames)
     assert seen.mean() > 0.9
     assert np.allclose(start.opacities, 0.1)
+
+
+def test_photographs_without_masks_are_fitted_whole_from_their_points(data, tmp_path, capsys):
+    """Not from the surface of the object, which cannot explain what is around it."""
+    command("import", data("nerfstudio"), "--out", tmp_path / "d")
+    command("prior", tmp_path / "d", "--gaussians", "300")
+    capsys.readouterr()
+    fitted = ["fit", tmp_path / "d", "--passes", "2", "--exposure", "--gaussians", "400"]
+    command(*fitted, "--out", tmp_path / "whole")
+    assert "start: 400 points of the cameras and 0 random ones" in capsys.readouterr().out
+    prior, cloud = load_prior(tmp_path / "whole/prior"), read_cloud(tmp_path / "d/sparse.ply")
+    assert cKDTree(cloud.points).query(prior.points)[0].max() < 1e-5
+    given = ["--prior", tmp_path / "d/prior", "--out", tmp_path / "object"]
+    command("fit", tmp_path / "d", "--passes", "2", *given)
+    sh = [
+        read_json(tmp_path / name / "config.json")["settings"]["sh"] for name in ("whole", "object")
+    ]
+    assert sh == [0, 1]
+    bare(tmp_path / "bare", data)
+    fitted[1] = tmp_path / "bare"
+    assert "has no surface on which to compare" in refused(
+        capsys, [*fitted, "--out", tmp_path / "run"], tmp_path / "run"
+    )
 
 
 def test_a_fit_with_adaptive_density_is_a_run_as_3dgs(data, tmp_path, capsys, monkeypatch):

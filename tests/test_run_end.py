@@ -35,23 +35,26 @@ NUMBERS = st.floats(1e-3, 1 - 1e-3)
     views=st.integers(0, 5),
     uncertainty=NUMBERS,
     gain=NUMBERS,
-    limits=st.tuples(st.none() | NUMBERS, st.none() | NUMBERS),
+    limits=st.tuples(*[st.none() | NUMBERS] * 3),
+    predicted=st.none() | NUMBERS,
 )
-def test_the_first_rule_that_holds_is_the_reason(views, uncertainty, gain, limits):
-    stop_uncertainty, stop_gain = limits
-    limit = {"stop_uncertainty": stop_uncertainty, "stop_gain": stop_gain}
+def test_the_first_rule_that_holds_is_the_reason(views, uncertainty, gain, limits, predicted):
+    stop_uncertainty, stop_gain, stop_psnr = limits
+    limit = {"stop_uncertainty": stop_uncertainty, "stop_gain": stop_gain, "stop_psnr": stop_psnr}
     settings = NbvSettings(dataset=".", prior=".", budget=3, **limit)
-    found = run_end(settings, views, uncertainty, {"name": "kf_0001", "information_gain": gain})
+    refused = {"name": "kf_0001", "information_gain": gain}
+    found = run_end(settings, views, uncertainty, refused, None, predicted)
     holds = {
         "budget": views >= 3,
         "uncertainty": stop_uncertainty is not None and uncertainty <= stop_uncertainty,
+        "psnr": None not in (stop_psnr, predicted) and predicted >= stop_psnr,
         "gain": stop_gain is not None and gain < stop_gain,
     }
     reason = next((reason for reason, held in holds.items() if held), None)
     assert (found and found["reason"]) == reason
     # What was recorded is enough to find the same again.
-    assert run_end(settings, views, uncertainty, found) == found
-    unknown = run_end(settings, views, uncertainty, None)
+    assert run_end(settings, views, uncertainty, found, None, predicted) == found
+    unknown = run_end(settings, views, uncertainty, None, None, predicted)
     assert unknown == (None if reason == "gain" else found)
 
 

@@ -51,8 +51,9 @@ def fit(
 
     By default means are free if the prior comes from photographs (points, masks or random), and
     colours have SH degree 1 if it comes from points or masks. Otherwise means are frozen and
-    colours have degree 0. Test views are never fitted. The output is a run folder like that of
-    `mgs nbv`, so all commands for runs accept it.
+    colours have degree 0. Photographs without masks are fitted whole, unless --prior is given. Test
+    views are never fitted. The output is a run folder like that of `mgs nbv`, so all commands for
+    runs accept it.
     """
     from rich.console import Console
 
@@ -62,6 +63,13 @@ def fit(
     given = {name: options[name] for name in options if options[name] not in (None, [])}
     asked = {"prior": prior, "gaussians": parse_gaussians(gaussians), "force": force}
     run = start_and_print(dataset, out, console, start_fit, **asked, **settings_of(given))
+    numbers = run.prior.numbers
+    if numbers["from"] == "random" and prior is None:
+        console.print(
+            f"start: {numbers['triangulated']:,} points of the cameras and "
+            f"{numbers['n'] - numbers['triangulated']:,} random ones",
+            soft_wrap=True,
+        )
     resume_and_print(run, console, run.settings.policy)
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 PANELS = {
     "Main options": ("policy", "budget", "seeds"),
-    "Choosing": ("batch", "nearest", "travel", "stop_gain", "stop_uncertainty"),
+    "Choosing": ("batch", "nearest", "travel", "stop_gain", "stop_uncertainty", "stop_psnr"),
     "Flight": ("flight_length", "flight_time", "speed", "hover", "no_fly", "clearance"),
     "Fitting": (
         *("passes", "warm_passes", "means", "sh", "exposure", "alpha_weight", "optimiser", "rates"),
@@ -45,6 +45,7 @@ METAVARS = {
     "clearance": "METRES",
     "stop_gain": "GAIN",
     "stop_uncertainty": "SHARE",
+    "stop_psnr": "DB",
     "alpha_weight": "WEIGHT",
     "rates": "KIND=NUMBER",
     "prior_std": "KIND=NUMBER",

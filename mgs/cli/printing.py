@@ -157,7 +157,10 @@ def step_line(line: Mapping[str, Any]) -> str:
     parts.append(f"coverage {100 * line['coverage']:.2f} %")
     if "loss" in line:
         parts.append(f"{passes(line)} passes")
-    for key in _measured([line]):
+    measured = _measured([line])
+    if not measured and (psnr := line.get("prediction", {}).get("psnr")):
+        parts.append(f"masked PSNR of views not taken about {psnr:.1f} dB")
+    for key in measured:
         parts.append(f"{' '.join(MEASURED[key].split())} views {line[key]:.2f} dB")
     return ", ".join([*parts, f"{sum(line['seconds'].values()):.1f} s"])
 

@@ -175,7 +175,12 @@ def _built(
 def _random(numbers: dict[str, Any]) -> str:
     """Line about a random start."""
     unit = "m" if numbers["unit"] == "m" else "units"
-    return f"{numbers['n']:,} random points in a ball of radius {numbers['radius']:.3g} {unit}"
+    given = numbers["triangulated"]
+    return (
+        (f"{given:,} points that came with the cameras, and " if given else "")
+        + f"{numbers['n'] - given:,} random points in and around a ball of radius "
+        f"{numbers['radius']:.3g} {unit}"
+    )
 
 
 def _table(numbers: dict[str, Any]) -> Table:
@@ -222,10 +227,15 @@ def _table(numbers: dict[str, Any]) -> Table:
 
 def _reason(numbers: dict[str, Any]) -> str:
     """Reason for the number of Gaussians, if the cameras decided it."""
-    from mgs.prior.resolution import PIXELS_PER_SAMPLE
+    from mgs.prior.resolution import MOST_GAUSSIANS, PIXELS_PER_SAMPLE
 
     pixel, count = numbers["resolution"]["pixel"], numbers["n"] + numbers["backed"]
     size = f"{1e3 * pixel:.2f} mm" if numbers["unit"] == "m" else f"{pixel:.4g} unit"
+    if count == MOST_GAUSSIANS:
+        return (
+            f"{count:,} Gaussians, the most without --gaussians; the closest pixel covers {size} "
+            "of the surface, and would allow more"
+        )
     return (
         f"{count:,} Gaussians, since the closest pixel covers {size} of the surface, and samples "
         f"nearer than {PIXELS_PER_SAMPLE:g} pixels gain too little"

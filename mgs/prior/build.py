@@ -34,7 +34,7 @@ from mgs.prior.photographs import (
     source_of,
     surface_of,
 )
-from mgs.prior.resolution import resolution
+from mgs.prior.resolution import MOST_GAUSSIANS, resolution
 from mgs.prior.scattered import scattered
 from mgs.prior.segmentation import SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
@@ -209,6 +209,8 @@ def _samples(
     resolved = resolution(mesh, cameras) if settings.resolved_by_cameras else None
     asked, share = settings.gaussians, settings.backing
     total = asked if isinstance(asked, int) else None
+    if resolved and resolved.samples * (1 + share) > MOST_GAUSSIANS:
+        total = MOST_GAUSSIANS
     count = None if total is None else total - round(total * share / (1 + share))
     if resolved:
         spacing = resolved.spacing

@@ -21,6 +21,10 @@ PIXELS_PER_SAMPLE = 1.15
 finer ones are worse: more parameters than pixel values. Judged by `mgs parsimony`
 (docs/parsimony.md)."""
 
+MOST_GAUSSIANS = 200_000
+"""Most Gaussians that cameras decide: close-ups and high resolution ask for millions, which take
+hours to fit. A chosen constant."""
+
 
 @dataclass(frozen=True)
 class Resolution:

@@ -1,4 +1,7 @@
-"""Random start: a prior for photographs whose object has no known surface."""
+"""Random start: a prior for photographs whose object has no known surface.
+
+Points that came with the cameras, if there are any, take the place of as many random ones.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +11,23 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from mgs.data.clouds import read_cloud, views_of
 from mgs.data.dataset import Dataset
 from mgs.data.meshes import Mesh
 from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError
-from mgs.prior.points import MASK_SHARE
+from mgs.prior.photographs import CLOUD
+from mgs.prior.points import MASK_SHARE, reliable
+from mgs.prior.resolution import MOST_GAUSSIANS
 from mgs.prior.settings import PriorSettings
 from mgs.seeds import generator
 from mgs.survey.fusion import focus
 
 GAUSSIANS = 10_000
-"""Number of Gaussians where none is given."""
+"""Fewest Gaussians where no number is given."""
+
+PIXELS = 100
+"""Pixels of all images, in the masks, per Gaussian where no number is given. A chosen constant."""
 
 FAR = 10.0
 """Radius of the random background, over that of the ball that the cameras look at."""
@@ -34,13 +43,17 @@ def scattered(
 
     Points fill the ball that all cameras see, about the point they look at, inside the masks if all
     frames have them. Otherwise half of them lie outside, evenly in the logarithm of their distance,
-    as background. The mesh is the ball; normals point outwards. Raises InputError if the settings
-    shape a surface, or the masks share no point of the ball.
+    as background. Well triangulated points of the dataset's cloud, in the masks, come first. The
+    mesh is the ball; normals point outwards, those of the cloud to its cameras. Raises InputError
+    if the settings shape a surface, or the masks share no point of the ball.
     """
     import trimesh  # here, because it takes 0.2 s and no other prior needs it
 
     settings.refuse_shaping("a random start has no surface")
-    count = settings.gaussians if isinstance(settings.gaussians, int) else GAUSSIANS
+    count = settings.gaussians
+    if not isinstance(count, int):
+        pixels = sum(int(frame.mask().sum()) for frame in dataset.frames)
+        count = min(max(pixels // PIXELS, GAUSSIANS), MOST_GAUSSIANS)
     middle, rng = focus(dataset.frames).point, generator(settings.seed, "prior/random")
     reach = [
         np.linalg.norm(frame.camera.position - middle)
@@ -48,7 +61,8 @@ def scattered(
         for frame in dataset.frames
     ]
     radius, masked = float(np.median(reach)), has_masks(dataset.frames)
-    kept, drawn = [np.zeros((0, 3))], 0
+    given, views_of_given = _triangulated(dataset, count, rng)
+    kept, drawn = [given], 0
     while sum(map(len, kept)) < count and drawn < DRAWS * count:
         directions = rng.normal(size=(count, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -67,8 +81,30 @@ def scattered(
         )
     outwards = points - middle
     normals = outwards / np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-9)
+    normals[: len(given)] = views_of_given
     spacing = float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
     ball = trimesh.creation.icosphere(3, radius)
     mesh = Mesh(ball.vertices + middle, ball.faces, np.ones(len(ball.faces), bool))
-    numbers = {"n": count, "spacing": spacing, "radius": radius, "depth_tolerance": 2 * radius}
-    return mesh, points, normals, spacing, numbers | {"backed": 0, "settings": asdict(settings)}
+    numbers: dict[str, Any] = {"n": count, "triangulated": len(given), "spacing": spacing}
+    numbers |= {
+        "radius": radius,
+        "depth_tolerance": 2 * radius,
+        "backed": 0,
+        "settings": asdict(settings),
+    }
+    return mesh, points, normals, spacing, numbers
+
+
+def _triangulated(
+    dataset: Dataset, most: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Reliable points [N,3] of the dataset's cloud that lie in some image and in all masks, at most
+    `most`, and unit directions to their cameras [N,3]; none where it has no cloud."""
+    if not (dataset.root / CLOUD).is_file():
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    cloud = read_cloud(dataset.root / CLOUD)
+    share, count = mask_share(cloud.points, dataset.frames)
+    kept = np.flatnonzero(reliable(cloud) & (count > 0) & (share >= MASK_SHARE))
+    kept = np.sort(rng.permutation(kept)[:most])
+    views = views_of(cloud, [frame.camera for frame in dataset.frames])
+    return cloud.points[kept], views[kept]

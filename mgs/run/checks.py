@@ -1,8 +1,9 @@
-"""Entries of steps.jsonl that show whether a run goes wrong: residual, indicators, warnings."""
+"""Entries of steps.jsonl that compare renders with images: residual, indicators, warnings, and the
+prediction for the views not taken."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
@@ -11,7 +12,9 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.gaussians import Gaussians
 from mgs.policy.poses import POSE_POLICIES
+from mgs.policy.registry import DIRECTIONAL_D, PLANNED
 from mgs.run import detectors
+from mgs.run.prediction import predicted_psnr
 from mgs.run.problem import Problem
 from mgs.run.state import Learned
 
@@ -30,34 +33,71 @@ class Checks:
         self.problem, self.render = problem, render
         self.before_fit = cache(self._before_fit)
 
-    def residual(self, learned: Learned, before: Gaussians, new: list[int]) -> dict[str, float]:
-        """`residual` of a step: rms difference of new images to the model before, linear RGB.
+    def entries(
+        self, learned: Learned, new: list[int], known: Sequence[dict[str, Any]]
+    ) -> dict[str, Any]:
+        """Entries of the last line in `known`, the lines of all steps: `residual`, `indicators`,
+        `warnings` and `prediction`. new: views that the model before was not fitted to."""
+        new_views: list[detectors.ViewIndicators] = []
+        entries: dict[str, Any] = {}
+        if learned.before is not None:
+            new_views = self.views(learned.before, learned, new)
+            entries["residual"] = float(np.sqrt(np.mean([view.error**2 for view in new_views])))
+        views = self.views(learned.fit.gaussians, learned, learned.taken)
+        entries |= self.indicators(learned, views, known)
+        settings = self.problem.settings
+        if settings.stop_psnr is not None or settings.policy in PLANNED:
+            past = [step["prediction"] for step in known if "prediction" in step]
+            entry = self.prediction(learned.taken, new, views, new_views)
+            if (psnr := predicted_psnr([*past, entry])) is not None:
+                entry["psnr"] = psnr
+            entries["prediction"] = entry
+        return entries
 
-        Inside the mask; to be compared with the setting `pixel_noise`. Empty where no pixel counts.
-        """
-        problem = self.problem
-        shown = problem.targets(learned.taken, learned.gains)[-len(new) :]
-        found = detectors.residual(
-            (
-                self.render(before, problem.cameras[i])[0],
-                target,
-                problem.frames[i].mask(),
-            )
-            for i, target in zip(new, shown, strict=True)
-        )
-        return {} if found is None else {"residual": found}
-
-    def indicators(self, learned: Learned, steps: list[dict[str, Any]]) -> dict[str, Any]:
-        """`indicators` of the last step, and `warnings` where one now exceeds its limit."""
-        problem, gains, fit = self.problem, learned.gains, learned.fit
-        views = []
-        shown = problem.targets(learned.taken, gains)
-        for i, target in zip(learned.taken, shown, strict=True):
+    def views(
+        self, model: Gaussians, learned: Learned, some: list[int]
+    ) -> list[detectors.ViewIndicators]:
+        """Compare the images of the last views taken, `some`, with a model."""
+        problem, views = self.problem, []
+        shown = problem.targets(learned.taken, learned.gains)[-len(some) :]
+        for i, target in zip(some, shown, strict=True):
             packed, before = self.before_fit(i)
             size = target.shape[0] * target.shape[1]
             mask = np.unpackbits(packed, count=size).astype(bool).reshape(target.shape[:2])
-            rendered = self.render(fit.gaussians, problem.cameras[i])[0]
+            rendered = self.render(model, problem.cameras[i])[0]
             views.append(detectors.view_indicators(target, mask, rendered, before))
+        return views
+
+    def prediction(
+        self,
+        taken: list[int],
+        new: list[int],
+        views: list[detectors.ViewIndicators],
+        new_views: list[detectors.ViewIndicators],
+    ) -> dict[str, float]:
+        """An entry of `mgs.run.prediction.predicted_psnr`. views, new_views: of all views taken
+        under the model, and of new ones under the model before."""
+
+        def mean_gain(before: list[int], poses: list[int]) -> float:
+            gains = self.problem.visibility.gains(before, poses, *DIRECTIONAL_D, False)
+            return float(gains.mean())
+
+        entry = {"fitted": float(np.mean([view.srgb_error for view in views]))}
+        if new_views:
+            entry["new"] = float(np.mean([view.srgb_error for view in new_views]))
+            entry["gain"] = mean_gain(taken[: -len(new)], new)
+        if left := [i for i in range(len(self.problem.frames)) if i not in taken]:
+            entry["left"] = mean_gain(taken, left)
+        return entry
+
+    def indicators(
+        self,
+        learned: Learned,
+        views: list[detectors.ViewIndicators],
+        steps: Sequence[dict[str, Any]],
+    ) -> dict[str, Any]:
+        """`indicators` of the last step, and `warnings` where one now exceeds its limit."""
+        problem, fit = self.problem, learned.fit
         known = [] if problem.settings.policy in GEOMETRIC else steps
         scores = [s["information_gain"] for s in known if s["information_gain"] is not None]
         start, coverage = problem.start, steps[-1]["coverage"]

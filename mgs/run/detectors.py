@@ -8,15 +8,15 @@ otherwise. A fit that diverges ends the run (`mgs.fit.stopping`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from mgs.camera import Camera
+from mgs.colour import srgb_from_linear
 from mgs.gaussians import Gaussians
-from mgs.metrics import masked_squares
 
 DARK = 1e-3
 """Linear RGB, added to brightnesses before their ratio is taken."""
@@ -50,13 +50,15 @@ class ViewIndicators:
     """A captured image compared with the Gaussians before training, and with the fitted model.
 
     unexplained: mean squared error in the mask over the variance of the image there: 0 is a perfect
-    fit, 1 a single colour. error: root of that mean squared error, linear RGB. ratios: quantiles
-    (RATIO_QUANTILES) of the log ratio of the image's brightness to the render's, over the mask.
+    fit, 1 a single colour. error: root of that mean squared error, linear RGB. srgb_error: mean
+    squared error of sRGB values in the mask. ratios: quantiles (RATIO_QUANTILES) of the log ratio
+    of the image's brightness to the render's, over the mask.
     """
 
     before: Before
     unexplained: float
     error: float
+    srgb_error: float = 0.0
     ratios: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
@@ -110,7 +112,8 @@ def view_indicators(
     squared, variance = float(np.mean((truth - drawn) ** 2)), float(truth.var(axis=0).mean())
     brightness = np.log(truth.mean(axis=1) + DARK) - np.log(drawn.mean(axis=1) + DARK)
     ratios = tuple(np.quantile(brightness, RATIO_QUANTILES).tolist())
-    return ViewIndicators(before, squared / max(variance, 1e-12), squared**0.5, ratios)
+    srgb = float(np.mean(np.square(srgb_from_linear(truth) - srgb_from_linear(drawn))))
+    return ViewIndicators(before, squared / max(variance, 1e-12), squared**0.5, srgb, ratios)
 
 
 def _exposure(ratios: np.ndarray) -> float:
@@ -122,15 +125,6 @@ def _exposure(ratios: np.ndarray) -> float:
     shifts = ratios - np.median(ratios, axis=0)
     common = np.where(np.abs(np.sign(shifts).sum(axis=1)) == 3, np.abs(shifts).min(axis=1), 0.0)
     return float((common / (ratios[:, 2] - ratios[:, 0] + LEAST_SPREAD)).max())
-
-
-def residual(views: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> float | None:
-    """Root mean square difference inside the masks, linear RGB; None where no pixel counts.
-
-    views: (render [H,W,3], target [H,W,4 or more] with weights, mask [H,W]) of each.
-    """
-    squares = np.concatenate([masked_squares(*view) for view in views])
-    return float(np.sqrt(squares.mean())) if len(squares) else None
 
 
 def step_indicators(

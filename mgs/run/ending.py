@@ -50,6 +50,7 @@ class RunEnd(StrEnum):
 
     BUDGET = "budget"
     UNCERTAINTY = "uncertainty"
+    PSNR = "psnr"
     GAIN = "gain"
     FLIGHT = "flight"
 
@@ -60,18 +61,22 @@ def run_end(
     uncertainty: float,
     refused: Mapping[str, Any] | None,
     metres: float | None = None,
+    predicted: float | None = None,
 ) -> dict[str, Any] | None:
     """`ended` of steps.jsonl where the run ends here: the `reason` and its numbers; else None.
 
     views: chosen so far. uncertainty: mean variance that is left, over that of the prior.
     refused: `name` and `information_gain` of the next view, where it is known. metres: length of
-    the flight, where no pose is left in its reach.
+    the flight, where no pose is left in its reach. predicted: `mgs.run.prediction`, dB.
     """
     if views >= settings.budget:
         return {"reason": str(RunEnd.BUDGET), "views": views}
     if settings.stop_uncertainty is not None and uncertainty <= settings.stop_uncertainty:
         numbers = {"uncertainty": uncertainty, "limit": settings.stop_uncertainty}
         return {"reason": str(RunEnd.UNCERTAINTY), "views": views, **numbers}
+    limit = settings.stop_psnr
+    if limit is not None and predicted is not None and predicted >= limit:
+        return {"reason": str(RunEnd.PSNR), "views": views, "psnr": predicted, "limit": limit}
     if metres is not None:
         return {"reason": str(RunEnd.FLIGHT), "views": views, "metres": metres}
     gain = refused.get("information_gain", math.inf) if refused else math.inf
@@ -89,6 +94,11 @@ def why_ended(ended: Mapping[str, Any]) -> str:
     if ended["reason"] == RunEnd.UNCERTAINTY:
         limit = f"no more than --stop-uncertainty {ended['limit']:g}"
         return f"{ended['uncertainty']:.4g} of the prior's variance is left after {views}, {limit}"
+    if ended["reason"] == RunEnd.PSNR:
+        return (
+            f"the masked PSNR of the views not taken is predicted to be {ended['psnr']:.1f} dB "
+            f"after {views}, no less than --stop-psnr {ended['limit']:g}"
+        )
     if ended["reason"] == RunEnd.FLIGHT:
         return (
             f"no pose is left that the flight's limits allow, {views}; "

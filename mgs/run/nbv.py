@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from mgs import runtime
 from mgs.camera import extent_of
 from mgs.data.dataset import Dataset, load_dataset
+from mgs.data.visibility import has_masks
 from mgs.errors import InputError, row_named
 from mgs.files import THERE, Ours, atomic_folder, reading
 from mgs.fit.settings import as_3dgs
@@ -86,6 +87,7 @@ def start_run(
     live: Live | Transport | None = None,
     prior: str | Path | Prior | None = None,
     gaussians: int | Literal["auto"] | None = None,
+    source: str | None = None,
     preset: str | None = None,
     loose: float = 1.0,
     force: bool = False,
@@ -100,6 +102,7 @@ def start_run(
       file) (docs/howto/on-site.md). They are kept in OUT/dataset.
     - prior: a folder, or a Prior, which is copied into the run. Default: DATASET/prior if it
       exists, else a prior of `gaussians` built in the run (default: as many as cameras resolve).
+    - source: of a prior built in the run (`mgs.prior.photographs.source_of`).
     - preset: a row of `PRESETS`, whose values are defaults. loose: as `NbvSettings.with_spacing`.
     - force: replace an existing run.
     - settings: fields of `NbvSettings`. `policy` may also be a function (docs/howto/policy.md),
@@ -119,7 +122,7 @@ def start_run(
     root = given.root if given else out / DATASET if dataset is None else Path(str(dataset))
     if prior is not None and gaussians is not None:
         raise InputError("nbv: --gaussians builds a prior; leave it out, or leave out --prior")
-    if prior is None and gaussians is None and (root / "prior/prior.json").is_file():
+    if (prior, gaussians, source) == (None,) * 3 and (root / "prior/prior.json").is_file():
         prior = root / "prior"
     row = None if preset is None else row_named(PRESETS, preset, "--preset")
     loaded = given
@@ -143,13 +146,18 @@ def start_run(
     read = [path for path in (root if capture is None else None, prior) if isinstance(path, Path)]
     with atomic_folder(out, Ours(FILES, read) if holds_run(out) else None) as unfinished:
         frames = loaded or _poses(unfinished / DATASET, str(capture), complete.seed, progress)
-        built = found or _built_prior(frames, gaussians, row, complete.seed, progress)
+        built = found or _built_prior(frames, gaussians, source, row, complete.seed, progress)
         if not isinstance(prior, str | Path):
             save_prior(unfinished / "prior", built)
         _check_near(built, frames, where)
         if built.numbers.get("from") == "random" and complete.train.means != "free":
             free = "pass --means free, or give depth, points or masks"
             raise InputError(f"{where}: starts at random points, not on a surface; {free}")
+        if complete.exposure and built.numbers.get("triangulated") == 0:
+            raise InputError(
+                f"--exposure: {where} has no surface on which to compare photographs; leave it "
+                "out, or give points or masks"
+            )
         complete = complete.with_spacing(built.spacing, loose)
         if complete.flies or complete.no_fly or complete.clearance is not None:
             Problem(
@@ -176,13 +184,18 @@ def start_fit(
 
     By default means are free where the prior comes from photographs (`LOOSE`), with FREE_TRAIN,
     colours of degree FREE_SH and a looser prior, else frozen. With adaptive density, settings and
-    degree are by default those of 3DGS (`as_3dgs`). Arguments and errors as `start_run`.
+    degree are by default those of 3DGS (`as_3dgs`). Photographs without masks are fitted whole,
+    from the points that came with the cameras and random ones, unless a prior is given: a surface
+    of the object cannot explain what is around it. Arguments and errors as `start_run`.
     """
     root = Path(dataset)
     loaded, train = load_dataset(root), dict(settings.pop("train", {}))
     found = Path(prior) if prior is not None else root / "prior"
     known = gaussians is None and (prior is not None or (found / "prior.json").is_file())
     source = load_prior(found).numbers.get("from") if known else source_of_prior(loaded.survey())
+    bare = prior is None and source == "points" and not has_masks(loaded.frames)
+    whole = "random" if bare and train.get("means", "free") == "free" else None
+    source = whole or source
     if train.get("density") == "adaptive":
         recipe = as_3dgs(extent_of([frame.camera for frame in loaded.frames]))
         rates = recipe["rates"] | train.get("rates", {})
@@ -195,9 +208,8 @@ def start_fit(
         train = FREE_TRAIN | train
         settings.setdefault("sh", FREE_SH[source])
     every = {"seeds": len(loaded), "budget": 0, "train": train, "loose": loose}
-    return start_run(
-        root, out, prior=prior, gaussians=gaussians, progress=progress, **settings | every
-    )
+    built: dict[str, Any] = {"prior": prior, "gaussians": gaussians, "source": whole}
+    return start_run(root, out, progress=progress, **built, **settings | every)
 
 
 def _with_defaults(settings: dict[str, Any], row: Any, loaded: Dataset | None) -> dict[str, Any]:
@@ -216,11 +228,16 @@ def _resolved(given: NbvSettings, count: int, budget_given: bool) -> NbvSettings
     return given.model_copy(update=resolved)
 
 
-def _built_prior(frames: Dataset, gaussians: Any, row: Any, seed: int, progress: Progress) -> Prior:
+def _built_prior(
+    frames: Dataset, gaussians: Any, source: str | None, row: Any, seed: int, progress: Progress
+) -> Prior:
     """Build a prior of a dataset, or of its survey."""
     asked = PriorSettings(gaussians=gaussians, seed=seed, density=row.density if row else None)
     return build_prior(
-        frames.survey(), asked, on_stage=lambda stage: progress(f"prior: {stage}", 0, 1)
+        frames.survey(),
+        asked,
+        source=source,
+        on_stage=lambda stage: progress(f"prior: {stage}", 0, 1),
     )
 
 

@@ -95,6 +95,8 @@ def _go_on(
                 state = recorder.recorded(learned, state)
                 write_checkpoint(out, state)
                 on_step(state)
+                if "ended" in state.steps[-1]:
+                    break
     except FitDivergedError as error:
         kept = len(state.steps) if state else 0
         raise InputError(diverged(out, error.step, kept, error.losses)) from None
@@ -134,7 +136,9 @@ def mark_end(problem: Problem, state: State, refused: Choice | None = None) -> S
     views = len(state.taken) - problem.settings.seeds
     stuck = not problem.reachable(state.taken)
     metres = problem.flight.metres(state.taken) if stuck else None
-    ended = run_end(problem.settings, views, uncertainty(problem, state), next_view, metres)
+    predicted = last.get("prediction", {}).get("psnr")
+    left = uncertainty(problem, state)
+    ended = run_end(problem.settings, views, left, next_view, metres, predicted)
     return replace(state, steps=[*state.steps[:-1], last | ({"ended": ended} if ended else {})])
 
 
@@ -203,9 +207,7 @@ class Recorder:
             line["exposure"] = dict(zip(names, learned.gains.tolist(), strict=True))
         if self.checks:
             self.stopwatch("checking", 0, 1)
-            if learned.before is not None:
-                line |= self.checks.residual(learned, learned.before, new)
-            line |= self.checks.indicators(learned, [*known, *lines])
+            line |= self.checks.entries(learned, new, [*known, *lines])
         every, first, step = settings.evaluate_every, len(known), line["step"]
         if every and any(k % every == 0 for k in range(first, step + 1)):
             self.stopwatch("evaluating", 0, 1)

@@ -88,6 +88,8 @@ class NbvSettings(BaseModel):
     """End the run if the chosen view's information gain (Eq. 7, ½ nat per parameter) is lower."""
     stop_uncertainty: Annotated[float, Field(gt=0, lt=1)] | None = None
     """End the run when at most this share (0 to 1) of the prior's variance is left."""
+    stop_psnr: Annotated[float, Field(gt=0, le=80, allow_inf_nan=False)] | None = None
+    """End the run when the masked PSNR of the views not taken is predicted to be this high, dB."""
     seeds: Annotated[int, Field(ge=1)] = 4
     """Number of seed views for the first fit, spread evenly over the directions of the poses."""
     seed: Annotated[int, Field(ge=0)] = 0

@@ -155,7 +155,7 @@ def taken_in_order(run: Run) -> list[Frame]:
 def _settings(run: Run, taken: int, views: int, given: dict[str, Any]) -> NbvSettings:
     """Settings of the run for a batch of `views` after all views taken."""
     fixed = {"seeds": taken, "budget": views, "batch": max(views, 2)}
-    free = {"travel": None, "nearest": None, "stop_gain": None, "stop_uncertainty": None}
+    free = dict.fromkeys(["travel", "nearest", "stop_gain", "stop_uncertainty", "stop_psnr"])
     settings = validated(NbvSettings, run.settings.model_dump() | free | given | fixed)
     check_settings(settings, taken + views)
     return settings
