@@ -28,8 +28,8 @@ from mgs.synth.scene_file import Arena, Rock, SceneFile
 from mgs.view.subject import read_subject
 
 TINY = RenderPreset(width=64, height=48, frames=8, spp=2)
-SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=4))
-TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 4\n"
+SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=0))
+TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 0\n"
 RUN = ["--seed-views", "3", "--budget", "3", "--passes", "3", "--evaluate-every", "1"]
 RUN += ["--random-seed", "1"]
 KILLED = """

@@ -15,7 +15,6 @@ from mgs.images import read_exr
 from mgs.policy import criteria
 from mgs.report import diagnostics
 from mgs.run import folder as run_folder
-from mgs.run import recording
 from mgs.run.folder import Run
 from mgs.run.settings import NbvSettings
 from mgs.run.state import State
@@ -99,9 +98,7 @@ def test_maps_of_an_empty_view_are_zero():
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     root = tmp_path_factory.mktemp("diagnostics")
-    dataset = load_dataset(tiny.write_dataset(root / "data"))
-    settings = tiny.start(root / "run", dataset)
-    recording.run(root / "run", settings, dataset, tiny.operations(), tiny.silent)
+    tiny.run(root / "run", load_dataset(tiny.write_dataset(root / "data")))
     return root / "run"
 
 

@@ -194,12 +194,12 @@ def test_a_front_seen_from_one_side_is_closed_behind_and_is_no_ground(tmp_path):
     frames = [Frame(f"{k}", camera, k, tmp_path) for k, camera in enumerate(cameras)]
     write_cloud(tmp_path / "sparse.ply", SparseCloud(wall + rng.normal(0, 0.005, wall.shape)))
     dataset = Dataset(tmp_path, tuple(frames))
-    settings = PriorSettings(gaussians=1000, backing=0, poisson_depth=7)
+    settings = PriorSettings(gaussians=1000, backing=0, poisson_depth=6)
     prior = build_prior(dataset, settings, source="points")
     assert trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces).is_watertight
     assert "plane_normal" not in prior.numbers
     away = np.minimum(np.abs(prior.points[:, 1]), np.abs(prior.points[:, 1] + 0.3))
-    assert np.quantile(away, 0.9) < 0.1
+    assert np.quantile(away, 0.9) < 0.2
     assert prior.numbers["sampled_area"] > 12
 
 

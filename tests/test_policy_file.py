@@ -17,6 +17,8 @@ from mgs.run.folder import open_run
 from mgs.run.nbv import start_run
 
 FUNCTIONS = """
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -25,12 +25,9 @@ from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.policy.registry import policy_names
 from mgs.report import figures, tables, writing
-from mgs.report.evaluation import evaluate_model
 from mgs.report.figures import POLICY_STYLE
 from mgs.report.page_plots import SYMBOLS
 from mgs.report.runs import compare_runs, read_run
-from mgs.run import recording
-from mgs.run.folder import open_run
 
 FIGURES = ("orbit", "gain", "coverage", "comparison", "psnr")
 
@@ -51,34 +48,19 @@ def tested(tmp_path_factory):
 
 def write_runs(root):
     dataset = load_dataset(tiny.write_dataset(root / "data"))
-    tests = dataset.test_views()
     names = [f"{views}psnr{mask}" for views in ("", "test_") for mask in ("", "_mask")]
-    names = names if tests else names[:2]
+    names = names if dataset.test_views() else names[:2]
 
     def measure(gaussians, taken):
         return {name: float(len(taken) * (1 + len(name))) for name in names}
 
-    for policy, grey in (("d-optimal", 0.3), ("random", 0.2)):
-        settings = tiny.start(root / policy, dataset, policy=policy, evaluate_every=1)
-        parts = tiny.operations(measure=measure)
-        recording.run(root / policy, settings, dataset, parts, tiny.silent)
-        made = open_run(root / policy)
-        gaussians, trained = made.state.gaussians, [frame.name for frame in made.taken]
-
-        def wall(_, camera, grey=grey):
-            one = np.ones((camera.height, camera.width))
-            return np.full((*one.shape, 3), grey, np.float32), one, one
-
-        metrics = evaluate_model(
-            gaussians,
-            dataset.frames,
-            trained,
-            test_frames=tests.frames if tests else (),
-            renderer=wall,
-            pictures=root / policy / "renders",
+    return [
+        tiny.write_measured_run(
+            root / policy, dataset, grey, tiny.operations(measure=measure),
+            policy=policy, evaluate_every=1,
         )
-        write_json(root / policy / "metrics.json", {"policy": policy} | metrics)
-    return [root / "d-optimal", root / "random"]
+        for policy, grey in (("d-optimal", 0.3), ("random", 0.2))
+    ]  # fmt: skip
 
 
 def changed(run, out, metrics=None, steps=None, config=None):

@@ -319,7 +319,7 @@ def test_the_viewer_in_a_browser(browser, run):
     ):
         tab.get_by_text(subject.title).wait_for()
         tab.get_by_label("Cameras", exact=True).first.uncheck(force=True)
-        for layer in ("alpha", "uncertainty", "colour"):
+        for layer in ("uncertainty", "colour"):
             choose(tab, "Layer", layer)
             expected = layers.kernel_image(subject, camera, layer)[0].astype(int)
             assert expected[inside].std() > 2

@@ -11,17 +11,14 @@ import tiny
 from matplotlib.figure import Figure
 
 from mgs import plotting
-from mgs.camera import Camera
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.up import PLUS_Z, unit_up, upright
 from mgs.files import write_json
 from mgs.gaussians import Gaussians
 from mgs.report import diagnostics, figures
-from mgs.report.evaluation import evaluate_model
 from mgs.report.page import write_page
 from mgs.report.runs import up_of
 from mgs.report.writing import write_report
-from mgs.run import recording
 from mgs.run.folder import open_run
 from mgs.view import layers
 from mgs.view.subject import read_subject
@@ -44,21 +41,8 @@ def make_run(root: Path, tilted: bool) -> Path:
     def turned(g: Gaussians) -> Gaussians:
         return replace(g, means=(g.means @ turn.T).astype(np.float32))
 
-    operations = tiny.operations(initial=lambda frames: turned(tiny.initial(frames)), up=dataset.up)
-    settings = tiny.start(root / "run", dataset, policy="uniform")
-    recording.run(root / "run", settings, dataset, operations, tiny.silent)
-    made = open_run(root / "run")
-    gaussians, trained = made.state.gaussians, [frame.name for frame in made.taken]
-
-    def black(g: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        shape = camera.height, camera.width
-        return np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape)
-
-    metrics = evaluate_model(
-        gaussians, dataset.frames, trained, renderer=black, pictures=root / "run/renders"
-    )
-    write_json(root / "run/metrics.json", {"policy": "uniform"} | metrics)
-    return root / "run"
+    parts = tiny.operations(initial=lambda frames: turned(tiny.initial(frames)), up=dataset.up)
+    return tiny.write_measured_run(root / "run", dataset, 0.0, parts, policy="uniform")
 
 
 @pytest.fixture(scope="module")

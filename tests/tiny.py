@@ -15,6 +15,7 @@ import numpy as np
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.data.frames import Frame
+from mgs.files import write_json
 from mgs.fit.settings import TrainSettings
 from mgs.fit.stopping import StopReason
 from mgs.gaussians import Gaussians, sh_from_rgb
@@ -187,6 +188,29 @@ def write_run(out: Path, root: Path, prior: Path) -> Path:
         prior=prior_digest(known), initial=lambda frames: initial_gaussians(known, frames)[0]
     )
     recording.run(out, settings.model_copy(update={"budget": 0}), dataset, parts, silent)
+    return out
+
+
+def write_measured_run(out: Path, dataset: Dataset, grey: float, parts, **values) -> Path:
+    """A finished run with pictures and metrics.json, as if every render were of one grey."""
+    from mgs.report.evaluation import evaluate_model
+
+    run(out, dataset, parts, **values)
+    made, tests = run_folder.open_run(out), dataset.test_views()
+
+    def wall(_, camera):
+        one = np.ones((camera.height, camera.width))
+        return np.full((*one.shape, 3), grey, np.float32), one, one
+
+    metrics = evaluate_model(
+        made.state.gaussians,
+        dataset.frames,
+        [frame.name for frame in made.taken],
+        test_frames=tests.frames if tests else (),
+        renderer=wall,
+        pictures=out / "renders",
+    )
+    write_json(out / "metrics.json", {"policy": values["policy"]} | metrics)
     return out
 
 
