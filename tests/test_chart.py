@@ -133,7 +133,7 @@ def test_a_run_with_a_preset_writes_what_it_came_to(dataset, prior, tmp_path, mo
         start_run(dataset, tmp_path / "other", prior=prior, preset="best")
     asked = []
 
-    def build(frames, given, on_stage):
+    def build(frames, given, source, on_stage):
         asked.append(given)
         raise InputError("enough")
 
