@@ -39,6 +39,7 @@ from mgs.prior.build import build_prior, load_prior, prior_and_cloud
 from mgs.prior.hull import visual_hull
 from mgs.prior.initial import initial_gaussians
 from mgs.prior.points import _grown, main_cluster, on_surface, reliable
+from mgs.prior.scattered import scattered
 from mgs.prior.settings import PriorSettings
 from mgs.splat_files import load_gaussians
 
@@ -497,6 +498,21 @@ def test_poses_alone_are_fitted_from_random_points(data, tmp_path, capsys):
     start, seen = initial_gaussians(load_prior(tmp_path / "d/prior"), frames)
     assert seen.mean() > 0.9
     assert np.allclose(start.opacities, 0.1)
+
+
+def test_random_points_are_fewer_than_those_of_the_cameras(data, tmp_path, monkeypatch):
+    """Unless these are few. Too many hide the scene."""
+    command("import", data("nerfstudio"), "--out", tmp_path / "d")
+    dataset = load_dataset(tmp_path / "d")
+    few = scattered(dataset, PriorSettings())[4]
+    for constant, value in (("GAUSSIANS", 100), ("PIXELS", 1)):
+        monkeypatch.setattr(f"mgs.prior.scattered.{constant}", value)
+    many = scattered(dataset, PriorSettings())[4]
+    assert few["n"] == 10_000
+    assert few["triangulated"] == many["triangulated"]
+    assert many["n"] == round(1.5 * many["triangulated"])
+    asked = scattered(dataset, PriorSettings(gaussians=5000))[4]
+    assert (asked["n"], asked["triangulated"]) == (5000, few["triangulated"])
 
 
 def test_photographs_without_masks_are_fitted_whole_from_their_points(data, tmp_path, capsys):

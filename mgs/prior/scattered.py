@@ -29,6 +29,10 @@ GAUSSIANS = 10_000
 PIXELS = 100
 """Pixels of all images, in the masks, per Gaussian where no number is given. A chosen constant."""
 
+MOST_RANDOM = 0.5
+"""Most random points per point that came with the cameras where no number is given and these are
+many. With two per point, a plush toy in a room was drawn 5.7 dB worse: they hide it."""
+
 FAR = 10.0
 """Radius of the random background, over that of the ball that the cameras look at."""
 
@@ -50,18 +54,20 @@ def scattered(
     import trimesh  # here, because it takes 0.2 s and no other prior needs it
 
     settings.refuse_shaping("a random start has no surface")
-    count = settings.gaussians
-    if not isinstance(count, int):
-        pixels = sum(int(frame.mask().sum()) for frame in dataset.frames)
-        count = min(max(pixels // PIXELS, GAUSSIANS), MOST_GAUSSIANS)
-    middle, rng = focus(dataset.frames).point, generator(settings.seed, "prior/random")
+    asked, rng = settings.gaussians, generator(settings.seed, "prior/random")
+    pixels = sum(int(frame.mask().sum()) for frame in dataset.frames)
+    count = min(max(pixels // PIXELS, GAUSSIANS), MOST_GAUSSIANS)
+    count = asked if isinstance(asked, int) else count
+    given, views_of_given = _triangulated(dataset, count, rng)
+    if len(given) and not isinstance(asked, int):
+        count = min(count, max(round((1 + MOST_RANDOM) * len(given)), GAUSSIANS))
+    middle = focus(dataset.frames).point
     reach = [
         np.linalg.norm(frame.camera.position - middle)
         * np.sin(np.arctan(min(frame.camera.width, frame.camera.height) / 2 / frame.camera.K[0, 0]))
         for frame in dataset.frames
     ]
     radius, masked = float(np.median(reach)), has_masks(dataset.frames)
-    given, views_of_given = _triangulated(dataset, count, rng)
     kept, drawn = [given], 0
     while sum(map(len, kept)) < count and drawn < DRAWS * count:
         directions = rng.normal(size=(count, 3))
