@@ -38,12 +38,15 @@ from mgs.run.prediction import predicted_psnr
 from mgs.splat import as_drjit, render
 
 FITS = Before(outline=0.001, offset=0.01)
-GOOD = ViewIndicators(FITS, unexplained=0.05, error=0.02, ratios=(-0.08, 0.0, 0.08))
+GOOD = ViewIndicators(FITS, 0.05, 0.02, srgb_error=1e-3, ratios=(-0.08, 0.0, 0.08))
+NOWHERE = np.zeros((0, 3))
 FALLING = (1.0, 0.5, 0.3, 0.25, 0.249, 0.248)
 
 
 def indicators(views=(GOOD,) * 4, losses=FALLING, coverage=0.95, gains=(0.5, 0.4), drift=0.0):
-    return step_indicators(list(views), list(losses), coverage, list(gains), drift)
+    angles = 2 * np.pi * np.arange(len(views)) / len(views)
+    ring = np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
+    return step_indicators(list(views), ring, list(losses), coverage, list(gains), drift)
 
 
 def one_bad(**changes) -> tuple[ViewIndicators, ...]:
@@ -61,7 +64,7 @@ BAD = {
         "by 50 % of",
     ),
     "pose": ({"views": one_bad(offset=0.2)}, "20.0 % of the rock's size"),
-    "outlier": ({"views": (GOOD, GOOD, GOOD, replace(GOOD, error=0.2))}, "10.0 times"),
+    "outlier": ({"views": (GOOD, GOOD, GOOD, replace(GOOD, srgb_error=0.1))}, "10.0 times"),
     "means": ({"drift": 5.0}, "5.0 standard deviations"),
     "coverage": ({"coverage": 0.2}, "only 20 %"),
     "saturated": ({"gains": (0.5, 0.3, 0.01)}, "gained 2 %"),
@@ -88,10 +91,10 @@ def test_a_warning_comes_once_and_again_after_it_was_over():
 
 
 def test_signs_that_a_step_cannot_have_are_left_out():
-    assert set(step_indicators([], [1.0], 1.0, [], 0.0)) == {"means"}
+    assert set(step_indicators([], NOWHERE, [1.0], 1.0, [], 0.0)) == {"means"}
     # A warm fit may end lower than it was in between, and not lower than at its start.
-    assert step_indicators([], [1.0, 1.2, 1.1, 1.0], 1.0, [], 0.0)["unconverged"] == 0
-    unknown = step_indicators([], [1.0, float("nan"), 1.0, 1.0], 1.0, [], 0.0)
+    assert step_indicators([], NOWHERE, [1.0, 1.2, 1.1, 1.0], 1.0, [], 0.0)["unconverged"] == 0
+    unknown = step_indicators([], NOWHERE, [1.0, float("nan"), 1.0, 1.0], 1.0, [], 0.0)
     assert {"unconverged", "worse"}.isdisjoint(unknown)
 
 
@@ -109,6 +112,15 @@ def test_the_outline_is_the_share_of_pixels_that_disagree_by_more_than_the_margi
         assert before_fit(mask, alpha, margin).outline == pytest.approx(share)
     assert before_fit(mask, alpha, 1).offset == pytest.approx(3 / np.sqrt(80))
     assert before_fit(mask, 0 * alpha, 1).offset == 1
+
+
+def test_views_that_are_hard_to_fit_are_no_outliers_beside_others_of_their_side():
+    """A highlight seen by four of twelve views on a ring, and one wrong image among the others."""
+    errors = np.array([9.0] * 4 + [1.0] * 8)
+    views = [replace(GOOD, srgb_error=1e-4 * error) for error in errors**2]
+    assert indicators(views)["outlier"] == 1
+    views[8] = replace(GOOD, srgb_error=1e-4 * 4.0**2)
+    assert indicators(views)["outlier"] == pytest.approx(4)
 
 
 def test_an_exposure_shifts_all_pixels_and_a_highlight_some():

@@ -105,7 +105,10 @@ class Checks:
         std = problem.settings.prior_std.get("mean")
         if std and problem.settings.train.density == "fixed":
             drift = detectors.means_drift(fit.gaussians.means, start.means, std)
-        indicators = detectors.step_indicators(views, fit.losses, coverage, scores, drift)
+        positions = problem.positions[learned.taken]
+        indicators = detectors.step_indicators(
+            views, positions, fit.losses, coverage, scores, drift
+        )
         if start.opacities.max() < 0.5:  # random points: no surface to compare with
             for name in ("prior", "pose", "coverage"):
                 indicators.pop(name, None)

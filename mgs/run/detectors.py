@@ -28,6 +28,9 @@ LEAST_SPREAD = 0.1
 """Added to the range of these quantiles before a shift is divided by it, so that a fit without any
 residual has no exposure to report."""
 
+NEIGHBOURS = 3
+"""Number of nearest views with which a view's error is compared."""
+
 COVERING_VIEWS = 4
 """Fewest views of which a good coverage can be expected."""
 
@@ -127,8 +130,21 @@ def _exposure(ratios: np.ndarray) -> float:
     return float((common / (ratios[:, 2] - ratios[:, 0] + LEAST_SPREAD)).max())
 
 
+def _outlier(errors: np.ndarray, positions: np.ndarray) -> float:
+    """Largest error of a view over the largest of its neighbours', or over the median if larger.
+
+    Views from near poses are alike, so highlights and shadows that are hard to fit are no outliers.
+    errors: [V]. positions: of the cameras [V,3].
+    """
+    away = np.linalg.norm(positions[:, None] - positions, axis=2)
+    np.fill_diagonal(away, np.inf)
+    near = errors[np.argsort(away, axis=1)[:, :NEIGHBOURS]].max(axis=1)
+    return float((errors / np.maximum(np.maximum(near, np.median(errors)), 1e-12)).max())
+
+
 def step_indicators(
     views: Sequence[ViewIndicators],
+    positions: np.ndarray,
     losses: Sequence[float],
     coverage: float,
     gains: Sequence[float],
@@ -136,8 +152,9 @@ def step_indicators(
 ) -> dict[str, float]:
     """Numbers of a step by the names in DETECTORS, without those that it cannot tell.
 
-    views: all taken. losses: of the start of the fit, then of each pass. coverage: Eq. 9, 0 to 1.
-    gains: information gain of every view chosen so far, in order. drift: of `means_drift`.
+    views: all taken. positions: of their cameras [V,3]. losses: of the start of the fit, then of
+    each pass. coverage: Eq. 9, 0 to 1. gains: information gain of every view chosen so far, in
+    order. drift: of `means_drift`.
     """
     indicators = {"means": drift}
     if len(losses) >= 2 and min(losses) > 0 and np.isfinite(losses).all():
@@ -146,15 +163,15 @@ def step_indicators(
         indicators["unconverged"] = float(1 - (lowest[-1] / lowest[-1 - window]) ** (1 / window))
         indicators["worse"] = min(losses[1:]) / losses[0] - 1
     if views:
-        errors = np.array([view.error for view in views])
         indicators["residual"] = float(np.median([view.unexplained for view in views]))
         indicators["prior"] = float(np.median([view.before.outline for view in views]))
         indicators["exposure"] = _exposure(np.array([view.ratios for view in views]))
         indicators["pose"] = max(view.before.offset for view in views)
         if len(views) >= COVERING_VIEWS:
             indicators["coverage"] = 1 - coverage
-        if len(views) >= 3:
-            indicators["outlier"] = float(errors.max() / max(np.median(errors), 1e-12))
+        if len(views) > NEIGHBOURS:
+            errors = np.sqrt([view.srgb_error for view in views])
+            indicators["outlier"] = _outlier(errors, positions)
     if len(gains) >= 2 and max(gains) > 0:
         indicators["saturated"] = 1 - gains[-1] / max(gains)
     return indicators
@@ -225,10 +242,10 @@ DETECTORS: dict[str, Detector] = {
         ),
     ),
     "outlier": Detector(
-        2.5,
+        2.25,
         lambda v, limit: (
-            f"one view fits badly: its error after the fit is {v:.1f} times the median view's "
-            f"(limit {limit:.1f}); check its pose, mask and image"
+            f"one view fits badly: its error after the fit is {v:.1f} times that of the views "
+            f"around it (limit {limit:.2f}); check its pose, mask and image"
         ),
     ),
     "means": Detector(

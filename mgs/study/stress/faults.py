@@ -262,7 +262,8 @@ def indicators_of(
     std = MEAN_STD * lab.prior.spacing
     drift = detectors.means_drift(fit.gaussians.means, start.means, std)
     seen = coverage(surface, lab.lam())
-    return fit.gaussians, detectors.step_indicators(views, fit.losses, seen, [], drift)
+    positions = np.array([lab.frames[i].camera.position for i in taken])
+    return fit.gaussians, detectors.step_indicators(views, positions, fit.losses, seen, [], drift)
 
 
 SIZES_IN_WORDS = {
