@@ -56,18 +56,6 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     return PSNR_LIMIT if error <= 10 ** (-PSNR_LIMIT / 10) else -10 * math.log10(error)
 
 
-def masked_squares(
-    rendered: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None
-) -> np.ndarray:
-    """Squared differences [K,3], (linear RGB)^2, of the pixels of known colour in a mask [H,W].
-
-    rendered: [H,W,3]. target: [H,W,4] or more, colour and weight (`mgs.data.dataset.target_of`); a
-    weight of 0 means unknown. mask: None: all pixels.
-    """
-    known = target[..., 3] > 0
-    return np.square(rendered - target[..., :3])[known if mask is None else mask & known]
-
-
 def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Mean structural similarity of two images (Wang et al. 2004, by scikit-image).
 

@@ -141,7 +141,7 @@ def test_masks_that_do_not_fit_are_one_line_that_names_a_frame(tmp_path):
         wrong = np.zeros((72, 96), bool)
         wrong[where, where] = True
         write_png(dataset.frames[7].mask_path, wrong)
-        with pytest.raises(InputError, match=rf"{words}.*; kf_0007 carves (9\d|100)% of what few"):
+        with pytest.raises(InputError, match=rf"{words}.*; frame kf_0007 cuts away (9\d|100)% of"):
             visual_hull(dataset.frames)
     # With scattered pixels the grid reaches beyond all images, where no mask is against a point.
     for k, frame in enumerate(dataset.frames):

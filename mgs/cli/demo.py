@@ -107,13 +107,11 @@ def completed(runs: list[Run], console: Console) -> Iterator[Run]:
     cores = len(os.sched_getaffinity(0))
     count = max(1, min(len(left), cores))
     last = len(left) % count or count
+    working = {}
     with runtime.processes(count) as pool:
-        working = {
-            folder: pool.submit(
-                complete, folder, left[count:], cores // (count if k < len(left) - last else last)
-            )
-            for k, folder in enumerate(left)
-        }
+        for k, folder in enumerate(left):
+            together = count if k < len(left) - last else last
+            working[folder] = pool.submit(complete, folder, left[count:], cores // together)
         try:
             for run in runs:
                 with progress_bar("steps", console) as progress:

@@ -43,7 +43,7 @@ AGREEMENT = 0.8
 """Least median share of a mask that the hull must fill; above 0.95 where masks and poses fit."""
 
 FEW = 0.1
-"""Share of the frames with a point in their image that may carve it by mistake."""
+"""Share of the frames that see a point of the object and may carve it by mistake."""
 
 
 @dataclass(frozen=True)
@@ -178,15 +178,18 @@ def _inside(views: Sequence[_View], points: np.ndarray, reach: float) -> np.ndar
 
 
 def _odd_one(frames: Sequence[Frame], views: Sequence[_View], points: np.ndarray) -> str:
-    """Words for the frame that carves most of the points [N,3] that no other, or FEW, carve."""
+    """Part of a message: the frame that carves most of the points that few others carve (FEW).
+
+    points: [N,3], of the coarse grid.
+    """
     values = np.stack([view(points) for view in views])
     carved, seen = values <= 0, np.isfinite(values).sum(axis=0)
     above = carved.sum(axis=0) - np.maximum(FEW * seen, 1)
     above[seen < min(LEAST_VIEWS, len(views))] = len(views)
     share = carved[:, above <= max(above.min(), 0)].mean(axis=1)
     return (
-        f"{frames[int(share.argmax())].name} carves {share.max():.0%} of what few others carve "
-        f"(the median frame {np.median(share):.0%})"
+        f"frame {frames[int(share.argmax())].name} cuts away {share.max():.0%} of the space that "
+        f"few other frames cut away (the median frame {np.median(share):.0%})"
     )
 
 
@@ -212,8 +215,10 @@ def _largest(field: np.ndarray) -> np.ndarray:
 def _checked_agreement(
     frames: Sequence[Frame], views: Sequence[_View], mesh: Mesh, points: np.ndarray
 ) -> np.ndarray:
-    """Share of each mask that the mesh fills. Raises InputError if too small; points [N,3] of the
-    coarse grid tell which frame is wrong."""
+    """Share of each mask that the mesh fills. Raises InputError if too small.
+
+    points: [N,3], of the coarse grid; they tell which frame is wrong.
+    """
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     depth = mesh_depth(mesh)

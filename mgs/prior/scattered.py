@@ -31,7 +31,7 @@ PIXELS = 100
 
 MOST_RANDOM = 0.5
 """Most random points per point that came with the cameras where no number is given and these are
-many. With two per point, a plush toy in a room was drawn 5.7 dB worse: they hide it."""
+many: they hide what is behind them. A chosen constant."""
 
 FAR = 10.0
 """Radius of the random background, over that of the ball that the cameras look at."""

@@ -33,7 +33,6 @@ from mgs.fit.objective import Vector, objective
 from mgs.fit.stopping import StopReason
 from mgs.gaussians import Gaussians
 from mgs.memory import Deferred
-from mgs.metrics import masked_squares
 from mgs.policy.criteria import LEARN_LOSS, lam_by_kind
 from mgs.policy.poses import azimuths
 from mgs.prior.build import Prior
@@ -260,7 +259,7 @@ def directional_gain(
 def _squared_error(model: Gaussians, camera: Camera, target: np.ndarray, cache: ListCache) -> float:
     """Mean squared error of the pixels whose colour is known, (linear RGB)^2."""
     rgb = np.asarray(render(model, camera, cache=cache).rgb, np.float64)
-    return float(masked_squares(rgb, target).mean())
+    return float(np.square(rgb - target[..., :3])[target[..., 3] > 0].mean())
 
 
 def _worth(model: Gaussians, images: Images, settings: NbvSettings, cache: ListCache) -> Worth:

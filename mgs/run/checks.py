@@ -75,8 +75,10 @@ class Checks:
         views: list[detectors.ViewIndicators],
         new_views: list[detectors.ViewIndicators],
     ) -> dict[str, float]:
-        """An entry of `mgs.run.prediction.predicted_psnr`. views, new_views: of all views taken
-        under the model, and of new ones under the model before."""
+        """Entry of the last fit for `mgs.run.prediction.predicted_psnr`.
+
+        views: all views taken, under the model. new_views: the new ones, under the model before.
+        """
 
         def mean_gain(before: list[int], poses: list[int]) -> float:
             gains = self.problem.visibility.gains(before, poses, *DIRECTIONAL_D, False)

@@ -242,7 +242,7 @@ DETECTORS: dict[str, Detector] = {
         ),
     ),
     "outlier": Detector(
-        2.25,
+        2.25,  # 13 clean fits of rocks and photographs: up to 2.22
         lambda v, limit: (
             f"one view fits badly: its error after the fit is {v:.1f} times that of the views "
             f"around it (limit {limit:.2f}); check its pose, mask and image"

@@ -15,8 +15,8 @@ A step is one chosen view; of a batch only the last step has a fit. A line of `s
 - `iterations`, `loss`, `stop_reason`: of the fit.
 - `residual`: rms difference of the new images to the model before, linear RGB.
 - `exposure`: gains (red, green, blue) by frame name, with the setting `exposure`.
-- `prediction`: of the PSNR of the views not taken (`mgs.run.prediction`), where the policy is
-  `directional-d` or `stop_psnr` is set.
+- `prediction`: predicted masked PSNR of the views not taken, dB, and what it is computed from
+  (`mgs.run.prediction`); if the policy is `directional-d` or `stop_psnr` is set.
 - `indicators`, `warnings`: of `mgs.run.detectors`. `seconds`: by stage.
 - `test_psnr`, `test_psnr_mask`, dB, where it was evaluated; without test views `psnr`, `psnr_mask`
   over all views, and `held_out_...`.

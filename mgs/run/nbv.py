@@ -102,7 +102,7 @@ def start_run(
       file) (docs/howto/on-site.md). They are kept in OUT/dataset.
     - prior: a folder, or a Prior, which is copied into the run. Default: DATASET/prior if it
       exists, else a prior of `gaussians` built in the run (default: as many as cameras resolve).
-    - source: of a prior built in the run (`mgs.prior.photographs.source_of`).
+    - source: what a prior built in the run is made from (`mgs.prior.photographs.source_of`).
     - preset: a row of `PRESETS`, whose values are defaults. loose: as `NbvSettings.with_spacing`.
     - force: replace an existing run.
     - settings: fields of `NbvSettings`. `policy` may also be a function (docs/howto/policy.md),

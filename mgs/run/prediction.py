@@ -1,4 +1,4 @@
-"""Predicted PSNR of the views not taken, from those taken: what `--stop-psnr` goes by.
+"""Predicted PSNR of the views not taken, for `--stop-psnr`.
 
 The image of a new view is a test of the model before it. Its error is above the mean error of the
 images which that model was fitted to. This excess is about proportional to the view's directional
@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 
 WINDOW = 3
-"""Number of fits over whose new views the excess is averaged. Chosen on two rocks that judge
-nothing, of 2 to 8."""
+"""Number of last fits whose new views give the mean excess. Chosen among 2 to 8 on two rocks that
+judge nothing."""
 
 LEAST_ERROR = 1e-8
 """Least mean squared error that is predicted, 80 dB."""
