@@ -1,8 +1,8 @@
 """Start of Dr.Jit and Mitsuba: find a usable libLLVM, then set Mitsuba's variant unless one is set.
 
-Everything in mgs that computes with Dr.Jit calls `start` first. Dr.Jit compiles kernels with the
-system's libLLVM. A version older than 19 aborts the process inside a kernel ("Cannot select:
-fminimum") without an exception, so the version is checked before any kernel runs.
+Everything in mgs that computes with Dr.Jit calls `start` first. On a processor Dr.Jit compiles
+kernels with the system's libLLVM. A version older than 19 aborts the process inside a kernel
+("Cannot select: fminimum") without an exception, so it is checked before any kernel runs.
 
 Up to `start` this module needs only Python's standard library: tools/setup.sh uses it before
 anything is installed.
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 VARIANT = "llvm_ad_rgb"
 """Default variant: compiled by LLVM, differentiable, RGB, single precision."""
+
+VARIANT_VARIABLE = "MGS_VARIANT"
+"""Environment variable that names another variant, such as cuda_ad_rgb for an NVIDIA GPU."""
 
 MIN_LLVM = 19
 """Least major version of libLLVM. 14 and 15 cannot compile the minimum and maximum of floats; 19
@@ -133,12 +136,14 @@ def _installed(folders: tuple[str, ...], pattern: str) -> list[str]:
 
 
 def start() -> None:
-    """Set Mitsuba's variant to VARIANT, or check the one that is set. Further calls cost nothing.
+    """Set Mitsuba's variant, or check the one that is set. Further calls cost nothing.
 
-    Raises InputError if the variant is not differentiable RGB in single precision, if no libLLVM of
-    version 19 or newer is found, or if Dr.Jit cannot use this processor with it.
+    Set is the one that MGS_VARIANT names, else VARIANT. Raises InputError if the variant is not
+    differentiable RGB in single precision; for one of LLVM if no libLLVM of version 19 or newer is
+    found, or if Dr.Jit cannot use this processor with it; for one of CUDA if Dr.Jit finds no GPU.
     """
-    if "mitsuba" not in sys.modules:
+    wanted = os.environ.get(VARIANT_VARIABLE) or VARIANT
+    if "mitsuba" not in sys.modules and wanted.startswith("llvm"):
         _choose_libllvm()
     if "HOME" not in os.environ:  # Dr.Jit would print a line and compile every kernel anew
         os.environ.setdefault("DRJIT_CACHE_DIR", os.path.expanduser("~/.drjit"))
@@ -147,17 +152,35 @@ def start() -> None:
     if mi.variant() in _checked:
         return
     if mi.variant() is None:
-        _choose_libllvm()
-        _check_libllvm()
-        mi.set_variant(VARIANT)
-    else:
-        _check_variant()
+        _set_variant(wanted)
+    _check_variant()
     _keep_order()
     _checked.add(mi.variant())
 
 
 _checked: set[str] = set()
 """Variants that `start` has accepted in this process."""
+
+
+def _set_variant(name: str) -> None:
+    """Set Mitsuba's variant. Raises InputError as `start`."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if name not in mi.variants():
+        raise InputError(
+            f"{VARIANT_VARIABLE}={name}: Mitsuba has no such variant; "
+            f"choose {VARIANT} or cuda_ad_rgb"
+        )
+    if name.startswith("llvm"):
+        _choose_libllvm()
+        _check_libllvm()
+    elif name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        raise InputError(
+            f"{VARIANT_VARIABLE}={name}: Dr.Jit finds no NVIDIA GPU and driver; "
+            f"unset {VARIANT_VARIABLE} to compute on the processor"
+        )
+    mi.set_variant(name)
 
 
 def _choose_libllvm() -> None:
@@ -210,7 +233,7 @@ def _check_variant() -> None:
     if not (differentiable and mi.is_rgb and dr.type_v(mi.Float) == dr.VarType.Float32):
         raise InputError(
             f"Mitsuba's variant {mi.variant()} is set, and mgs needs differentiable RGB in single "
-            f"precision; call mitsuba.set_variant('{VARIANT}') before mgs, or set none"
+            f"precision; take {VARIANT} (the default) or cuda_ad_rgb"
         )
     if dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
         _check_libllvm()
@@ -242,15 +265,16 @@ def _begin_process() -> None:
 
 
 def processor() -> dict[str, str | int]:
-    """Processor as Dr.Jit sees it, after `start`: "cpu" (LLVM's name), "simd_width" (float32 lanes)
-    and "threads".
+    """Processor as Dr.Jit sees it, after `start`: "variant", "cpu" (LLVM's name), "simd_width"
+    (float32 lanes) and "threads".
 
-    The first two are "unknown" if Dr.Jit does not tell.
+    "cpu" and "simd_width" are "unknown" if Dr.Jit does not tell.
     """
     import drjit as dr
+    import mitsuba as mi
 
     core = ctypes.CDLL(str(Path(str(dr.__file__)).with_name("libdrjit-core.so")))
-    facts: dict[str, str | int] = {"threads": dr.thread_count()}
+    facts: dict[str, str | int] = {"variant": mi.variant(), "threads": dr.thread_count()}
     facts |= {"cpu": "unknown", "simd_width": "unknown"}
     # C++ names of jit_llvm_target_cpu() and jit_llvm_vector_width().
     with contextlib.suppress(AttributeError):

@@ -1,5 +1,6 @@
 """Choice of libLLVM and variant, and one line for those that do not work."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -144,6 +145,20 @@ def said(call):
 def test_without_a_variant_a_call_sets_ours():
     done = python(f"{PREPARE}said(lambda: render(one, camera))")
     assert done.stdout == "llvm_ad_rgb\n", done.stderr
+
+
+@pytest.mark.parametrize(
+    ("variant", "message"),
+    [
+        ("nonsense", "MGS_VARIANT=nonsense: Mitsuba has no such variant; choose llvm_ad_rgb"),
+        ("scalar_rgb", SCALAR),
+        ("cuda_ad_rgb", "MGS_VARIANT=cuda_ad_rgb: Dr.Jit finds no NVIDIA GPU"),
+    ],
+)
+def test_a_variant_that_cannot_run_is_one_line(variant, message):
+    environment = os.environ | {"MGS_VARIANT": variant, "CUDA_VISIBLE_DEVICES": ""}
+    done = python(f"{PREPARE}said(lambda: render(one, camera))", **environment)
+    assert message in done.stdout, done.stderr
 
 
 def test_the_users_variant_stays_and_an_unusable_one_is_refused_by_every_call():

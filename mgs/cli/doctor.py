@@ -68,23 +68,23 @@ def _software() -> list[Row]:
 
 
 def _machine() -> list[Row]:
-    """Processor, memory and libLLVM."""
+    """Processor, memory, variant and, for one of LLVM, libLLVM."""
     gib = 1024**3 / os.sysconf("SC_PAGE_SIZE")
     total, free = os.sysconf("SC_PHYS_PAGES") / gib, os.sysconf("SC_AVPHYS_PAGES") / gib
     memory = f"{total:.1f} GiB, {free:.1f} GiB free"
     rows = [("cores", str(os.cpu_count()), ""), ("memory", memory, "")]
     try:
-        library = str(runtime.find_libllvm())
-    except InputError as error:
-        return [*rows, ("libLLVM", "not usable", str(error))]
-    try:
         runtime.start()
         runtime.check_kernel()
     except (InputError, ImportError) as error:
-        return [*rows, ("libLLVM", library, str(error))]
+        return [*rows, ("variant", "not usable", str(error))]
     facts = runtime.processor()
+    rows.append(("variant", str(facts["variant"]), ""))
+    if facts["simd_width"] == "unknown":
+        return rows
     lanes = f"{facts['simd_width']} float32 lanes ({facts['cpu']})"
     threads = f"{facts['threads']} (Dr.Jit)"
+    library = str(runtime.find_libllvm())
     return [*rows, ("libLLVM", library, ""), ("SIMD", lanes, ""), ("threads", threads, "")]
 
 

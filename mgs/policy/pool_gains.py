@@ -218,7 +218,7 @@ class PoolGains:
     def _harmonics(self, of: Any, by: Any) -> list[Any]:
         """K spherical harmonics of the directions from poses to Gaussians, given their indices."""
         offset = dr.gather(mi.Point3d, self.points, of) - dr.gather(mi.Point3d, self.positions, by)
-        return list(dr.sh_eval(mi.Vector3d(offset * dr.rcp(dr.norm(offset))), self.degree))
+        return list(dr.sh_eval(mi.Vector3d(offset * (1 / dr.norm(offset))), self.degree))
 
     def _row(self, vectors: Any) -> list[Any]:
         """The K entries for each pair's Gaussian of vectors [N*K]; four at once if K allows it."""

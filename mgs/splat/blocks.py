@@ -25,11 +25,17 @@ from mgs.splat.projection import Splats
 
 BLOCK_X, BLOCK_Y = 8, 4
 """Width and height of a block, pixels. With AVX-512, 8x2 and 4x4 drew no faster, and gradients
-took longer because there are more pairs."""
+took longer because there are more pairs. Its 32 pixels are a warp of a GPU."""
 
 TILE = 16
 """Width and height of a tile, blocks. Lanes work tile by tile, so that its splats (64 bytes
 each) and their sums stay in a core's cache. The fastest size measured."""
+
+
+def on_cpu() -> bool:
+    """Whether the variant computes on the processor; else on a GPU."""
+    return bool(dr.backend_v(mi.Float) == dr.JitBackend.LLVM)
+
 
 LOG2_INV_ALPHA_MIN = 7.994353436858858
 """log2(255) = -log2(ALPHA_MIN): a footprint ends where xi^2 + eta^2 = log2_opacity + log2(255)."""
@@ -132,12 +138,10 @@ def changes(built: Footprints, splats: Splats) -> Any:
 def depth_order(depth: Any) -> Any:
     """Indices of splats front to back, equal depths by index, UInt32 [N].
 
-    A stable radix sort of the bits, which for positive floats have the order of the values. depth:
-    Float [N], positive.
+    The bits of positive floats have the order of the values. depth: Float [N], positive.
     """
-    bits = dr.reinterpret_array(mi.UInt32, depth)
-    order = dr.detail.block_mkperm(bits & 0xFFFF, len(depth), 1 << 16)
-    return _sorted(order, dr.gather(mi.UInt32, bits, order) >> 16, 1 << 16)
+    index = dr.arange(mi.UInt32, len(depth))
+    return _sorted(index, dr.reinterpret_array(mi.UInt32, depth), 1 << 32)
 
 
 def build(splats: Splats, width: int, height: int, older: BlockLists | None = None) -> BlockLists:
@@ -198,9 +202,27 @@ def _sorted(values: Any, keys: Any, count: int) -> Any:
     Evaluated, because the values serve as addresses next: two kernels are faster than one in which
     a random read waits for another.
     """
-    values = dr.gather(mi.UInt32, values, dr.detail.block_mkperm(keys, len(values), count))
+    values = dr.gather(mi.UInt32, values, _permutation(keys, count))
     dr.eval(values)
     return values
+
+
+DIGIT_BITS = {"cpu": 20, "gpu": 8}
+"""Most bits of a key by which `_permutation` sorts at once. On a GPU Dr.Jit's permutations are
+stable for up to 512 values (with 64 KB of shared memory), and not above."""
+
+
+def _permutation(keys: Any, count: int) -> Any:
+    """Indices that sort UInt32 keys below `count` stably, by a radix sort of even digits."""
+    bits, most = max(count - 1, 1).bit_length(), DIGIT_BITS["cpu" if on_cpu() else "gpu"]
+    digit = -(-bits // -(-bits // most))
+    if digit == bits:
+        return dr.detail.block_mkperm(keys, len(keys), count)
+    order = dr.detail.block_mkperm(keys & ((1 << digit) - 1), len(keys), 1 << digit)
+    for shift in range(digit, bits, digit):
+        rest = (dr.gather(mi.UInt32, keys, order) >> shift) & ((1 << digit) - 1)
+        order = dr.gather(mi.UInt32, order, dr.detail.block_mkperm(rest, len(keys), 1 << digit))
+    return order
 
 
 def _orders(splats: Splats, blocks_x: int, blocks_y: int) -> tuple[Any, Any]:
@@ -357,7 +379,7 @@ def _by_block(owner: Any, number: Any, numbers: int) -> tuple[Any, Any, Any, Any
     start, end = dr.zeros(mi.UInt32, numbers), dr.zeros(mi.UInt32, numbers)
     if count == 0:  # Dr.Jit has no operations on arrays of length 0
         return dr.zeros(mi.UInt32, _room(count)), pair, start, end
-    slot, at = dr.detail.block_mkperm(number, count, numbers), dr.arange(mi.UInt32, _room(count))
+    slot, at = _permutation(number, numbers), dr.arange(mi.UInt32, _room(count))
     used, last = at < dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, count - 1)
     slot = dr.gather(mi.UInt32, slot, at, used)
     dr.scatter(pair, at, slot, used, mode=dr.ReduceMode.NoConflicts)

@@ -116,7 +116,7 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
         z * X + w * Y - x * Z,
         -y * X + x * Y + w * Z,
     ]
-    transparency = dr.rcp(1 + dr.exp(mi.Float64(gaussians.logit_opacities.array)))
+    transparency = 1 / (1 + dr.exp(mi.Float64(gaussians.logit_opacities.array)))
     basis = sh_basis(mean, camera, gaussians.sh.shape[1])
     positive = [dr.select(c > 0, mi.Float(1), 0) for c in (splats.red, splats.green, splats.blue)]
     shape = [dict(zip(POWERS[3:], m, strict=True)) for m in (*by_scale, *by_quat)]

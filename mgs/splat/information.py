@@ -359,7 +359,7 @@ def _interleaved(columns: dict[int, Any], size: int, n: int) -> np.ndarray:
         dr.scatter(flat, normal, row + packet, mode=dr.ReduceMode.NoConflicts)
         if packet % PACKETS == PACKETS - 1:
             dr.eval(flat)
-    return np.array(flat, copy=False).reshape(n, -1)[:, :size]
+    return flat.numpy().reshape(n, -1)[:, :size]
 
 
 ESTIMATORS: dict[str, Callable[..., np.ndarray]] = {

@@ -7,8 +7,8 @@ far), with C the finished pixel. The same instructions then make the same decisi
 finished pixels) as the forward kernel, and none need be stored.
 
 These three store sums for each (splat, block) pair, and a second kernel adds those of each splat.
-There are no atomic additions, so reruns are bitwise equal with any number of threads. Symbols:
-docs/notation.md.
+The order of all additions is fixed, so reruns are bitwise equal with any number of threads.
+Symbols: docs/notation.md.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mgs.splat.blocks import BLOCK_X, BlockLists
+from mgs.splat.blocks import BlockLists
 from mgs.splat.constants import ALPHA_MAX
 from mgs.splat.projection import Splats
 from mgs.splat.recording import frozen
@@ -48,7 +48,7 @@ def _pixel_sums(
     """[T, sum w n, ...] of each pixel of a lane, with a sum for each of a splat's numbers n. T: as
     in `blend`."""
     count = len(numbers(unpack(packed, mi.UInt32(0))))
-    pixels = [[t, *(dr.zeros(type(packed), len(lists.block)) for _ in range(count))] for t in T]
+    pixels = [[t, *(dr.zeros(type(packed), len(lane.first)) for _ in range(count))] for t in T]
 
     def draw(of_splat: list[Any], raw: Any, _xi: Any, _eta: Any, pixel: list[Any]) -> list[Any]:
         T, *sums = pixel
@@ -72,19 +72,19 @@ def forward(lists: BlockLists, packed: Any, whole: bool) -> tuple[Any, ...]:
     if whole:
         numbers = lambda splat: [*splat.colour, mi.Float(1), splat.depth]  # noqa: E731
         pixels = _pixel_sums(lists, packed, lane, T, numbers)
-        return _store_pixels(lists, [sums for _, *sums in pixels])
+        return _store_pixels(lists, lane, [sums for _, *sums in pixels])
     pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
-    return _store_pixels(lists, [[*rgb, 1 - dr.abs(t)] for t, *rgb in pixels])
+    return _store_pixels(lists, lane, [[*rgb, 1 - dr.abs(t)] for t, *rgb in pixels])
 
 
-def _store_pixels(lists: BlockLists, pixels: list[list[Any]]) -> tuple[Any, ...]:
+def _store_pixels(lists: BlockLists, lane: Lane, pixels: list[list[Any]]) -> tuple[Any, ...]:
     """Write red, green, blue, alpha and, if given, depth of each pixel in the layout of
     `forward`."""
     sizes = (4, 1) if len(pixels[0]) == 5 else (4,)
     out = tuple(dr.empty(mi.Float, len(lists.block) * PIXELS * size) for size in sizes)
     for pixel, (r, g, b, a, *depth) in enumerate(pixels):
         for array, value in zip(out, (mi.Vector4f(r, g, b, a), *depth), strict=True):
-            dr.scatter(array, value, lists.block * PIXELS + pixel, mode=dr.ReduceMode.NoConflicts)
+            dr.scatter(array, value, lane.first + pixel, mode=dr.ReduceMode.NoConflicts)
     return out
 
 
@@ -134,7 +134,7 @@ def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, ...]
     so it is not stored. Where alpha is clamped at ALPHA_MAX or the splat is not drawn, alpha' is 0.
     """
     lane, T = lanes(lists)
-    pixels = [[t, *(dr.zeros(mi.Float, len(lists.block)) for _ in range(5))] for t in T]
+    pixels = [[t, *(dr.zeros(mi.Float, len(lane.first)) for _ in range(5))] for t in T]
 
     def start(pair: Any, splat: Splats) -> tuple[list[Any], list[Any], list[Any]]:
         place = dr.gather(mi.UInt32, lists.splat, pair)
@@ -161,7 +161,9 @@ def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, ...]
 
     pixels = walk(lists, packed, lane, pixels, draw, start)
     ordered = ([*rgb, alpha, z] for _, alpha, *rgb, z in pixels)
-    return _store_pixels(lists, [[without_denormals(x) for x in values] for values in ordered])
+    return _store_pixels(
+        lists, lane, [[without_denormals(x) for x in values] for values in ordered]
+    )
 
 
 def _finished(pixels: Any, background: Any, real: Any) -> Any:
@@ -229,8 +231,8 @@ def adjoint(
     """
     lane, T = lanes(lists)
     dL, pixels = [], []
-    for pixel in range(PIXELS):
-        places = lists.block * PIXELS + pixel
+    for pixel in range(len(T)):
+        places = lane.first + pixel
         rgba, d_rgba = (list(dr.gather(mi.Vector4f, a[0], places)) for a in (out, d_out))
         values, slopes = rgba[:channels], d_rgba[:channels]
         if channels == 5:
@@ -247,8 +249,8 @@ def adjoint(
             m0, m1, m2 = mi.Float(0), mi.Float(0), mi.Float(0)
             for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
                 raw = computed_after(raw, [*sums[:4], m0, m1, m2] if x else sums if j else [])
-                transmittance, behind = pixels[j * BLOCK_X + x]
-                dr_, dg, db, *others = dL[j * BLOCK_X + x]
+                transmittance, behind = pixels[j * lane.columns + x]
+                dr_, dg, db, *others = dL[j * lane.columns + x]
                 alpha, w, after, room = blend(raw, transmittance)
                 c = dr.fma(b, db, others[0]) if others else b * db  # others: alpha, depth
                 if len(others) == 2:
@@ -358,7 +360,7 @@ def fisher(
     lane, T = lanes(lists)
     T = [real(t) for t in T]
     pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
-    behind, last = _finished(pixels, background, real), [None] * PIXELS
+    behind, last = _finished(pixels, background, real), [None] * len(T)
     if alpha_weight is not None:
         last = [mi.Float(dr.abs(t)) * dr.sqrt(alpha_weight) for t, *_ in pixels]
     dr.eval(behind, last)
@@ -372,7 +374,7 @@ def fisher(
             m = [mi.Float(0)] * 5
             cross_m = [[mi.Float(0)] * 3 for _ in range(3)]
             for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
-                pixel = j * BLOCK_X + x
+                pixel = j * lane.columns + x
                 in_row = [sums[0], *m, *(c for a in cross_m for c in a)]
                 raw = computed_after(raw, in_row if x else sums if j else [])
                 transmittance, *behind = pixels[pixel]
@@ -423,7 +425,7 @@ def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
     def visit(splat: Splats, rows: list[Row], pixels: Any) -> Any:
         new, alive, total = [], mi.Bool(False), mi.Float(0)
         for pixel, (transmittance, *behind) in enumerate(pixels):
-            raw = rows[pixel // BLOCK_X].raw_alpha[pixel % BLOCK_X]
+            raw = rows[pixel // lane.columns].raw_alpha[pixel % lane.columns]
             alpha, w, after, room = blend(raw, transmittance)
             behind = [dr.fma(-c, w, s) for c, s in zip(splat.colour, behind, strict=True)]
             new.append([after, *behind])

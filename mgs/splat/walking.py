@@ -1,10 +1,11 @@
-"""Shared parts of the kernels: how one SIMD lane draws the splats of its block, and how sums reach
-the splats.
+"""Shared parts of the kernels: how a lane draws the splats of its block, and how sums reach the
+splats.
 
 The image is cut into blocks of BLOCK_X x BLOCK_Y pixels, one per SIMD lane. A lane reads its
 block's list of splats front to back and draws each on all pixels of the block. So a splat is read
 once for 32 pixels, whose contributions to it are added before they are stored: on a CPU, splatting
-is limited by reads and writes at scattered addresses, not by arithmetic.
+is limited by reads and writes at scattered addresses, not by arithmetic. On a GPU a lane draws one
+pixel (`lane_size`), and the 32 lanes of a warp share a block's list and add up their contributions.
 
 Python loops over a block's pixels are unrolled while Dr.Jit traces a kernel. No Python loop runs
 over Gaussians or the image. Symbols: docs/notation.md.
@@ -19,7 +20,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists, on_cpu
 from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from mgs.splat.projection import Splats
 
@@ -37,9 +38,10 @@ def without_denormals(x: Any) -> Any:
 
 
 def recorded_sizes(lists: BlockLists, *others: Any) -> tuple[int, ...]:
-    """Constants of a recorded kernel (`frozen`): lengths of its lists, flags and plain numbers."""
+    """Constants of a recorded kernel (`frozen`): lengths of its lists, flags and plain numbers, and
+    its `lane_size`."""
     numbers = (x for x in others if isinstance(x, int))
-    return len(lists.splat), len(lists.slot_start), len(lists.block), *numbers
+    return len(lists.splat), len(lists.slot_start), len(lists.block), *lane_size(), *numbers
 
 
 def pack(s: Splats, place: Any) -> Any:
@@ -93,32 +95,54 @@ def unpack(packed: Any, place: Any) -> Splats:
     return Splats(mean_x, mean_y, shear, white_x, white_y, log2_opacity, depth, *colour)
 
 
+def lane_size() -> tuple[int, int]:
+    """Width and height of a lane's part of its block, pixels: the whole block on a CPU, one pixel
+    on a GPU, where a block is a warp of 32 lanes."""
+    return (BLOCK_X, BLOCK_Y) if on_cpu() else (1, 1)
+
+
 @dataclass
 class Lane:
-    """Work of each lane. left, top: centre of its block's first pixel, px, Float [L]. start, end:
-    range of its pairs in `BlockLists.splat`, UInt32 [L]."""
+    """Work of each lane. columns, rows: `lane_size`. left, top: centre of its first pixel, px,
+    Float [L]. start, end: range of its pairs in `BlockLists.splat`, UInt32 [L]. first: place of its
+    first pixel in the output of kernels, UInt32 [L]."""
 
+    columns: int
+    rows: int
     left: Any
     top: Any
     start: Any
     end: Any
+    first: Any
 
 
 def lanes(lists: BlockLists) -> tuple[Lane, list[Any]]:
-    """The lanes, and the initial transmittance of each of their 32 pixels: 1, or 0 (finished)
-    outside the image."""
-    x, y = (lists.block % lists.blocks_x) * BLOCK_X, (lists.block // lists.blocks_x) * BLOCK_Y
+    """The lanes, and the initial transmittance of each of their pixels: 1, or 0 (finished) outside
+    the image."""
+    columns, rows = lane_size()
+    block, start, end, first = lists.block, lists.start, lists.end, lists.block * PIXELS
+    across, down = mi.UInt32(0), mi.UInt32(0)  # from the block's first pixel to the lane's
+    if (per_block := PIXELS // (columns * rows)) > 1:
+        lane = dr.arange(mi.UInt32, len(lists.block) * per_block)
+        block, start, end = (
+            dr.gather(mi.UInt32, x, lane // per_block) for x in (block, start, end)
+        )
+        across = lane % per_block % BLOCK_X
+        down = lane % per_block // BLOCK_X
+        first = block * PIXELS + lane % per_block
+    x, y = (block % lists.blocks_x) * BLOCK_X, (block // lists.blocks_x) * BLOCK_Y
+    x, y = x + across, y + down
     T = [
         dr.select((x + i < lists.width) & (y + j < lists.height), mi.Float(1), mi.Float(0))
-        for j in range(BLOCK_Y)
-        for i in range(BLOCK_X)
+        for j in range(rows)
+        for i in range(columns)
     ]
-    return Lane(mi.Float(x) + 0.5, mi.Float(y) + 0.5, lists.start, lists.end), T
+    return Lane(columns, rows, mi.Float(x) + 0.5, mi.Float(y) + 0.5, start, end, first), T
 
 
 @dataclass
 class Row:
-    """One row of a block's pixels under one splat: eta of the row; xi and raw alpha, before
+    """One row of a lane's pixels under one splat: eta of the row; xi and raw alpha, before
     thresholds, of each pixel."""
 
     eta: Any
@@ -151,16 +175,13 @@ def exp2(x: Any) -> Any:
     return dr.reinterpret_array(type(x), dr.reinterpret_array(integer, value) + exponent)
 
 
-CENTRE, MIDDLE = BLOCK_X // 2, BLOCK_Y // 2
-"""Column and row of a block at which `block_rows` starts."""
-
-
 def block_rows(lane: Lane, s: Splats) -> list[Row]:
-    """xi, eta and alpha = 2^(log2_opacity - xi^2 - eta^2) of one splat on all pixels of a block.
+    """xi, eta and alpha = 2^(log2_opacity - xi^2 - eta^2) of one splat on all pixels of a lane.
 
     The exponent is quadratic in x and y. So along a row the ratio of neighbouring alphas changes by
     a constant factor, and from row to row these ratios do, too. Alphas follow from one another by
-    multiplication: nine exp2 for 32 pixels, with rounding errors up to ten times as large.
+    multiplication, from the central row and column on: nine exp2 for 32 pixels, with rounding
+    errors up to ten times as large.
 
     Nothing that is drawn underflows. A splat in a block's list reaches the rectangle of the block's
     pixel centres, where its exponent is somewhere at least -log2(255) (`Footprints`). From a pixel
@@ -171,34 +192,39 @@ def block_rows(lane: Lane, s: Splats) -> list[Row]:
     both. Lists are made in single precision: a splat with its centre millions of pixels away may
     miss the block; then nothing of it is drawn in rows whose exponent is too small.
 
-    The offset of the block's first pixel from the splat is computed in double: far along a slanted
+    The offset of the lane's first pixel from the splat is computed in double: far along a slanted
     needle, xi is a small difference of large numbers.
     """
-    real = type(s.white_x)
+    real, centre_column, centre_row = type(s.white_x), lane.columns // 2, lane.rows // 2
     dx, dy = mi.Float64(lane.left) - s.mean_x, mi.Float64(lane.top) - s.mean_y
     corner, down = real(mi.Float64(s.white_x) * (dx - s.shear * dy)), real(dy)
     slant = s.white_x * real(s.shear)
     bend = exp2(-2 * s.white_x * s.white_x)  # factor of the ratios from pixel to pixel
     middle = [
-        dr.fma(s.white_x, real(CENTRE), dr.fma(-slant, real(j), corner)) for j in range(BLOCK_Y)
+        dr.fma(s.white_x, real(centre_column), dr.fma(-slant, real(j), corner))
+        for j in range(lane.rows)
     ]
     ratios = {}  # of the alpha beside the centre of each row to that at the centre
     for side in (-1, 1):
         # side: -1 to the right, 1 to the left.
-        ratio = [exp2(s.white_x * dr.fma(real(2 * side), middle[MIDDLE], -s.white_x))] * BLOCK_Y
-        for way, rows in ((-1, range(MIDDLE + 1, BLOCK_Y)), (1, range(MIDDLE - 1, -1, -1))):
+        beside = exp2(s.white_x * dr.fma(real(2 * side), middle[centre_row], -s.white_x))
+        ratio = [beside] * lane.rows
+        above, below = range(centre_row - 1, -1, -1), range(centre_row + 1, lane.rows)
+        for way, rows in ((-1, below), (1, above)):
             turn = exp2(2 * side * way * s.white_x * slant)  # factor from row to row
             for j in rows:
                 ratio[j] = ratio[j + way] * turn
         ratios[side] = ratio
     made = []
-    for j in range(BLOCK_Y):
+    left, right = range(centre_column - 1, -1, -1), range(centre_column + 1, lane.columns)
+    for j in range(lane.rows):
         eta = s.white_y * (down + j)
         first = dr.fma(-slant, real(j), corner)
-        xi = [dr.fma(s.white_x, real(i), first) for i in range(BLOCK_X)]
-        power = dr.fma(-xi[CENTRE], xi[CENTRE], dr.fma(-eta, eta, s.log2_opacity))
-        raw = [dr.select(power > -120, exp2(power), 0)] * BLOCK_X
-        for side, columns in ((-1, range(CENTRE + 1, BLOCK_X)), (1, range(CENTRE - 1, -1, -1))):
+        xi = [dr.fma(s.white_x, real(i), first) for i in range(lane.columns)]
+        centre = xi[centre_column]
+        power = dr.fma(-centre, centre, dr.fma(-eta, eta, s.log2_opacity))
+        raw = [dr.select(power > -120, exp2(power), 0)] * lane.columns
+        for side, columns in ((-1, right), (1, left)):
             ratio = ratios[side][j]
             for i in columns:
                 raw[i] = raw[i + side] * ratio
@@ -258,7 +284,7 @@ def walk(
 ) -> Any:
     """Draw each lane's list front to back, until it ends or all pixels of the block are finished.
 
-    pixels: state of each of the 32 pixels, lists with T of `blend` first.
+    pixels: state of each of a lane's pixels, lists with T of `blend` first.
     start(pair, splat): called once per pair (UInt32, index in the lists).
     draw(started, raw, xi, eta, pixel) -> pixel: draws the splat on one pixel, given the result of
         `start`.
@@ -273,7 +299,7 @@ def walk(
         most: Any = None  # largest transmittance so far; that of a finished pixel is negative
         for number, pixel in enumerate(pixels):
             for of_splat, rows in started:
-                row, x = rows[number // BLOCK_X], number % BLOCK_X
+                row, x = rows[number // lane.columns], number % lane.columns
                 raw = computed_after(row.raw_alpha[x], [] if most is None else [mi.Float(most)])
                 pixel = draw(of_splat, raw, row.xi[x], row.eta, pixel)
             new.append(pixel)
@@ -297,17 +323,22 @@ def walk_and_store(
         an unfinished pixel. sums: `count` Floats.
 
     Returns the sums of all pairs in the order of the lists, padded to packets of four; 0 for pairs
-    that were not visited because all pixels of their block were finished. A lane writes to its own
-    list's pairs in order, so no atomic operations are needed, and cache lines are filled at once.
+    that were not visited because all pixels of their block were finished. A lane that draws a whole
+    block writes to its own list's pairs in order, so no atomic operations are needed, and cache
+    lines are filled at once. Lanes that share a block are a warp: it adds up their sums in a fixed
+    order and makes one addition to zeros.
     """
-    packets = packet_count(count)
-    stored = dr.empty(mi.Float, len(lists.splat) * 4 * packets)
+    packets, whole = packet_count(count), lane.columns * lane.rows == PIXELS
+    stored = (dr.empty if whole else dr.zeros)(mi.Float, len(lists.splat) * 4 * packets)
 
     def store(pair: Any, sums: list[Any]) -> None:
         padded = sums + [mi.Float(0)] * (-len(sums) % 4)
         for i in range(packets):
-            packet = mi.Vector4f(*padded[4 * i : 4 * i + 4])
-            dr.scatter(stored, packet, pair * packets + i, mode=dr.ReduceMode.NoConflicts)
+            packet, at = mi.Vector4f(*padded[4 * i : 4 * i + 4]), pair * packets + i
+            if whole:
+                dr.scatter(stored, packet, at, mode=dr.ReduceMode.NoConflicts)
+            else:
+                dr.scatter_reduce(dr.ReduceOp.Add, stored, packet, at, mode=dr.ReduceMode.Local)
 
     def visit_and_store(
         pair: Any, drawn: list[tuple[Any, Splats, list[Row]]], pixels: Any
@@ -322,14 +353,15 @@ def walk_and_store(
         return (pair + 1,)
 
     left, _ = _walk_until_done(lists, packed, lane, pixels, visit_and_store, 1)
-    dr.while_loop((left,), lambda pair: pair < lane.end, store_zeros)
+    if whole:
+        dr.while_loop((left,), lambda pair: pair < lane.end, store_zeros)
     return stored
 
 
 def pair_at(
     lists: BlockLists, packed: Any, lane: Lane, first: Any, k: int
 ) -> tuple[Any, Splats, list[Row]]:
-    """The k-th pair after the first, its splat, and the block's rows under it. After a lane's last
+    """The k-th pair after the first, its splat, and the lane's rows under it. After a lane's last
     pair, the first one again as a splat that draws nothing."""
     if k == 0:
         pair, splat = first, unpack(packed, dr.gather(mi.UInt32, lists.splat, first))

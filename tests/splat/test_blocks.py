@@ -158,7 +158,10 @@ def test_kernels_are_recorded_once_whether_lists_are_new_kept_or_rebuilt(monkeyp
     assert len(recorded) == 4, "forward, adjoint, and the two walks of Fisher"
 
 
-def test_depth_order_is_a_stable_sort():
+@pytest.mark.parametrize("kind", ["cpu", "gpu"])
+def test_depth_order_is_a_stable_sort(monkeypatch, kind):
+    """In two passes of 16 bits on the processor, and four of 8 on a GPU."""
+    monkeypatch.setitem(blocks.DIGIT_BITS, "cpu", blocks.DIGIT_BITS[kind])
     rng = np.random.default_rng(0)
     depth = rng.choice(rng.uniform(0.01, 50, 300), 1000).astype(np.float32)
     found = np.asarray(depth_order(mi.Float(depth)))

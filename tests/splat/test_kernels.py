@@ -5,10 +5,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mgs.splat import ListCache, as_drjit, kernels, reference, render, walking
-from mgs.splat.blocks import BLOCK_X, BLOCK_Y
+from mgs.splat import ListCache, as_drjit, fisher, kernels, reference, render, walking
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y, on_cpu
 from mgs.splat.projection import camera_array, project
-from mgs.splat.walking import CENTRE, computed_after, exp2
+from mgs.splat.walking import computed_after, exp2
 
 from .scenes import in_own_process, make_camera, make_gaussians, place
 
@@ -57,7 +57,7 @@ def test_no_alpha_underflows_on_the_way_through_a_block(log_scales):
         for name in ("mean_x", "mean_y", "shear", "white_x", "white_y", "log2_opacity")
     )
     rows = np.arange(BLOCK_Y)[:, None]
-    dx = block % across * BLOCK_X + CENTRE + 0.5 - u
+    dx = block % across * BLOCK_X + BLOCK_X // 2 + 0.5 - u
     dy = block // across * BLOCK_Y + rows + 0.5 - v
     exponent = opacity - (p * (dx - k * dy)) ** 2 - (e * dy) ** 2
     assert len(pair) > 400
@@ -79,8 +79,33 @@ def test_splats_are_drawn_alike_one_or_several_at_a_time(monkeypatch):
     assert found[0] == found[1] == found[2]
 
 
+def test_lanes_of_one_pixel_draw_the_same(monkeypatch):
+    """The lanes of a GPU, here on the processor: each of a block's 32 lanes draws one pixel."""
+    gaussians, camera = make_gaussians(60, 3), make_camera()
+    splats, lists, packed = built(gaussians, camera)
+    tangents = kernels.pack_tangents(splats, splats, lists.place)
+
+    def everything():
+        image = kernels.forward(lists, packed, True)
+        found = [*image, *kernels.jvp(lists, packed, tangents)]
+        found.append(kernels.adjoint(lists, packed, image, image, True, 5))
+        found.append(kernels.removal(lists, packed, mi.Color3f(0.3)))
+        found = [np.asarray(array, np.float64) for array in found]
+        options = {"means": "free", "alpha_weight": 0.5}
+        return found + [fisher(gaussians, camera, name, **options) for name in ("exact", "block")]
+
+    whole = everything()
+    monkeypatch.setattr(walking, "lane_size", lambda: (1, 1))
+    single = everything()
+    for one, other in zip(single, whole, strict=True):
+        assert np.abs(one - other).max() < 3e-6 * np.abs(other).max()
+        assert (one != other).any(), "no recording of the other lanes was replayed"
+
+
 def test_the_order_of_instructions_changes_no_bit(tmp_path):
     """With and without LLVM's machine scheduler, each with an empty cache of kernels."""
+    if not on_cpu():
+        pytest.skip("the option is LLVM's")
     code = """
 import hashlib, sys
 import numpy as np
@@ -121,7 +146,7 @@ def test_alphas_of_a_block_follow_from_one_another(log_scales):
     _, lists, packed = built(g, make_camera((80, 60), 80))
     lane, _ = walking.lanes(lists)
     _, splat, rows = walking.pair_at(lists, packed, lane, mi.UInt32(lane.start), 0)
-    there = np.asarray(lists.end) > np.asarray(lists.start)
+    there = np.asarray(lane.end) > np.asarray(lane.start)
     u, v, k, p, e, opacity = (
         np.asarray(getattr(splat, name), np.float64)[there]
         for name in ("mean_x", "mean_y", "shear", "white_x", "white_y", "log2_opacity")
