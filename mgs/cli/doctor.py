@@ -80,7 +80,7 @@ def _machine() -> list[Row]:
         return [*rows, ("variant", "not usable", str(error))]
     facts = runtime.processor()
     rows.append(("variant", str(facts["variant"]), ""))
-    if facts["simd_width"] == "unknown":
+    if not str(facts["variant"]).startswith("llvm"):
         return rows
     lanes = f"{facts['simd_width']} float32 lanes ({facts['cpu']})"
     threads = f"{facts['threads']} (Dr.Jit)"
