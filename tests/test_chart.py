@@ -3,7 +3,9 @@
 import csv
 import json
 import shlex
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -210,28 +212,35 @@ def test_photographs_are_charted_beside_another_program(dataset, tmp_path, capsy
     charted = ["chart", out, "--only", "photographs", "--dataset", dataset, "--gaussians", "60"]
     for text in (
         "",
-        "seconds,psnr\n",
-        "seconds,psnr\n1,x\n",
-        "seconds\n1\n",
-        "seconds,psnr\n0,9\n",
-        "seconds,psnr\n1,inf\n",
+        "cpu_seconds,psnr\n",
+        "cpu_seconds,psnr\n1,x\n",
+        "cpu_seconds\n1\n",
+        "cpu_seconds,psnr\n0,9\n",
+        "cpu_seconds,psnr\n1,inf\n",
     ):
         peer.write_text(text)
         assert "one row or more; correct it" in refused(capsys, [*charted, "--peer", peer], out)
     assert "give --dataset" in refused(capsys, charted[:4], out)
     for option in (["--peer", peer], ["--gaussians", 60]):
-        peer.write_text("seconds,psnr\n1,20\n")
+        peer.write_text("cpu_seconds,psnr\n1,20\n")
         said = refused(capsys, ["chart", out, "--dataset", dataset, *option], out)
         assert f"{option[0]}: is of photographs alone" in said
-    peer.write_text("seconds,step,psnr\n0.5,9,20\n2,50,21.5\n")
+    peer.write_text("cpu_seconds,step,psnr\n0.5,9,20\n2,50,21.5\n")
+    second = Path(shutil.copytree(dataset, tmp_path / "second"))
+    charted += ["--dataset", second]
+    namesake = shutil.copytree(dataset, tmp_path / "other" / "second")
+    assert "have one name" in refused(capsys, [*charted, "--dataset", namesake], out)
+    several = ["--dataset", dataset, "--dataset", second]
+    assert "takes more than one" in refused(capsys, ["chart", out, *several], out)
     command(*charted, "--peer", peer)
     record = json.loads((out / "photographs.json").read_text())
-    ours, others = record["rows"][:2], record["rows"][2:]
-    assert [row["passes"] for row in ours] == [1, 2]
-    assert all(row["seconds"] > 0 and row["psnr"] > 5 for row in ours)
+    ours, others = record["rows"][:4], record["rows"][4:]
+    assert [row["dataset"] for row in ours] == [dataset.name] * 2 + ["second"] * 2
+    assert [row["passes"] for row in ours] == [1, 2, 1, 2]
+    assert all(row["cpu_seconds"] > 0 and row["psnr"] > 5 for row in ours)
     assert others == [
-        {"program": "other", "seconds": 0.5, "psnr": 20},
-        {"program": "other", "seconds": 2, "psnr": 21.5},
+        {"dataset": dataset.name, "program": "other", "cpu_seconds": 0.5, "psnr": 20},
+        {"dataset": dataset.name, "program": "other", "cpu_seconds": 2, "psnr": 21.5},
     ]
     assert parsed(record["command"])["peer"] == [peer]
     assert all(parsed(row["command"])["passes"] == row["passes"] for row in ours)

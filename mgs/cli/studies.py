@@ -183,7 +183,11 @@ def parsimony(
 def chart(
     out: Out = Path("chart"),
     dataset: Annotated[
-        Path | None, option("A dataset with test views, in place of the one that is rendered.")
+        list[Path] | None,
+        option(
+            "A dataset with test views, in place of the one that is rendered. Photographs: "
+            "repeat for more."
+        ),
     ] = None,
     preset: Annotated[
         str, option("quick: about ten minutes on two quiet cores. full: hours.", "--scale")
@@ -199,7 +203,10 @@ def chart(
     ] = None,
     peer: Annotated[
         list[Path] | None,
-        option("CSV of another program on photographs: `seconds`, `psnr`; repeat for more."),
+        option(
+            "CSV of another program on the first dataset of photographs: `cpu_seconds`, `psnr`; "
+            "repeat for more."
+        ),
     ] = None,
 ) -> None:
     """Chart speed against accuracy of single fits and of whole runs.
@@ -216,18 +223,25 @@ def chart(
     counts = [parse_gaussians(count) or "auto" for count in gaussians or ["auto"]]
     for file in peer or []:
         read_peer(file)
-    check_dataset(dataset)
+    datasets = dataset or []
+    for folder in datasets:
+        check_dataset(folder)
+    if len({folder.absolute().name for folder in datasets}) < len(datasets):
+        raise InputError("--dataset: two folders have one name; rename one")
     if NAME not in kinds and (gaussians or peer):
         option_given = "--gaussians" if gaussians else "--peer"
         raise InputError(f"{option_given}: is of photographs alone; give --only {NAME}, too")
-    if NAME in kinds and dataset is None:
+    if NAME in kinds and not datasets:
         raise InputError(f"--only {NAME}: needs photographs; give --dataset DATASET")
+    if kinds != [NAME] and len(datasets) > 1:
+        raise InputError(f"--dataset: only --only {NAME} takes more than one")
     with _study(out, SIZES, preset) as (_, console, report):
-        if NAME in kinds and dataset is not None:
+        if NAME in kinds:
             kinds.remove(NAME)
-            rows = chart_photographs(out, preset, dataset, counts, peer or [], report)
+            rows = chart_photographs(out, preset, datasets, counts, peer or [], report)
             console.print(f"{NAME}: {len(rows)} rows in {out / f'{NAME}.csv'}", soft_wrap=True)
-        found = run_chart(out, preset, kinds, repeats, dataset, report) if kinds else {}
+        given = datasets[0] if datasets else None
+        found = run_chart(out, preset, kinds, repeats, given, report) if kinds else {}
     for kind, (rows, claims) in found.items():
         console.print(f"{kind}: {len(rows)} rows in {out / f'{kind}.csv'}", soft_wrap=True)
         _print_claims(console, claims)

@@ -277,10 +277,9 @@ COLUMNS: dict[str, Content] = {
 }
 
 
-def check_dataset(dataset: Path | None) -> None:
+def check_dataset(dataset: Path) -> None:
     """Raises InputError for a dataset that cannot be read or has no test views."""
-    if dataset is not None:
-        test_views_of(load_dataset(dataset))
+    test_views_of(load_dataset(dataset))
 
 
 def run_chart(

@@ -91,7 +91,10 @@ COLUMNS = 3
 
 
 def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row], title: str = "") -> None:
-    """Draw the panels that have rows; panels with the same groups share a legend. title: of all."""
+    """Draw the panels that have rows. title: of all.
+
+    Panels with the same groups share a legend, also where some have only the first of them.
+    """
     import matplotlib
 
     drawn = [(panel, chosen) for panel in panels if (chosen := _rows_of(panel, rows))]
@@ -101,7 +104,9 @@ def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row], title:
     widths = [max(_size(*plot)[0] for plot in drawn[k::columns]) for k in range(columns)]
     ratios = {"width_ratios": widths, "height_ratios": heights}
     groups = [_groups(*plot) for plot in drawn]
-    shared = len(drawn) > 1 and all(one == groups[0] != [None] for one in groups)
+    most = max(range(len(groups)), key=lambda k: len(groups[k]))
+    alike = all(one == groups[most][: len(one)] != [None] for one in groups)
+    shared = len(drawn) > 1 and alike
     with matplotlib.rc_context(STYLE | {"legend.fontsize": 8}):
         figure = new_figure(sum(widths), sum(heights))
         axes = figure.subplots(len(lines), columns, squeeze=False, gridspec_kw=ratios).ravel()
@@ -117,7 +122,7 @@ def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row], title:
         if title:
             figure.suptitle(title)
         if shared:
-            handles, labels = axes[0].get_legend_handles_labels()
+            handles, labels = axes[most].get_legend_handles_labels()
             side = "lower" if title else "upper"
             figure.legend(handles, labels, loc=f"outside {side} center", ncols=2 * columns)
         save_figure(figure, path)

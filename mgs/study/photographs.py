@@ -1,4 +1,4 @@
-"""PSNR against seconds of `mgs fit` on a dataset of photographs, beside other programs."""
+"""PSNR against CPU seconds of `mgs fit` on datasets of photographs, beside other programs."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ import math
 import shlex
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import reading
-from mgs.plotting import STYLE, new_figure, save_figure
 from mgs.run.nbv import resume_nbv, start_fit
 from mgs.study.case import judge
-from mgs.study.output import Content, group_styles, logarithmic, table, write_table
+from mgs.study.output import Content, Panel, draw_panels, table, write_table
 from mgs.study.sweep import Cell, Report, run_cells
 from mgs.study.verdict import Row
 
@@ -26,10 +25,11 @@ NAME = "photographs"
 PASSES = {"quick": (5, 15, 30), "full": (5, 15, 30, 60)}
 """Passes of the fits, by scale."""
 
-NUMBERS = ("seconds", "cpu_seconds", "psnr", "ssim")
+NUMBERS = ("cpu_seconds", "psnr", "seconds", "ssim")
 """Columns that are read from the CSV of another program."""
 
 COLUMNS: dict[str, Content] = {
+    "dataset": "dataset",
     "program": "program",
     "passes": "passes",
     "seconds": "seconds:.0f",
@@ -55,7 +55,7 @@ def measure(root: Path, out: Path, dataset: str, gaussians: Any, passes: int) ->
 def read_peer(file: Path) -> list[Row]:
     """Read the rows of another program, which is named as its file.
 
-    The file is a CSV with the columns `seconds` and `psnr`, dB on the test views. The others of
+    The file is a CSV with the columns `cpu_seconds` and `psnr`, dB on the test views. The others of
     NUMBERS are optional. Raises InputError for other contents.
     """
     with reading(file):
@@ -64,11 +64,11 @@ def read_peer(file: Path) -> list[Row]:
         )
     try:
         numbers = [{k: float(v) for k, v in line.items() if k in NUMBERS} for line in lines]
-        found = [row[key] for row in numbers for key in ("seconds", "psnr")]
+        found = [row[key] for row in numbers for key in NUMBERS[:2]]
         if not found or not all(0 < number < math.inf for number in found):
             raise ValueError
     except (KeyError, TypeError, ValueError):
-        columns = "a column `seconds` and one `psnr`, positive numbers"
+        columns = "a column `cpu_seconds` and one `psnr`, positive numbers"
         raise InputError(f"{file}: needs {columns}, one row or more; correct it") from None
     return [{"program": file.stem} | row for row in numbers]
 
@@ -76,56 +76,58 @@ def read_peer(file: Path) -> list[Row]:
 def chart_photographs(
     out: Path,
     preset: str,
-    dataset: Path,
+    datasets: Sequence[Path],
     gaussians: Sequence[int | str],
     peers: Sequence[Path],
     report: Report,
 ) -> list[Row]:
-    """Time fits of PASSES with each number of Gaussians, and write photographs.csv, .json, .md and
-    .png, with the rows of other programs (`read_peer`). Returns the rows."""
-    given, others = str(dataset.resolve()), [row for file in peers for row in read_peer(file)]
-    asked = [(count, passes) for count in gaussians for passes in PASSES[preset]]
+    """Time fits of PASSES of each dataset with each number of Gaussians, and write photographs.csv,
+    .json, .md and .png. Returns the rows.
+
+    datasets: of different names. peers: files of other programs on the first one (`read_peer`).
+    """
+    names = [dataset.absolute().name for dataset in datasets]
+    asked = [
+        (dataset, count, passes)
+        for dataset in datasets
+        for count in gaussians
+        for passes in PASSES[preset]
+    ]
     cells = [
         Cell(
-            f"{NAME}/{count}-{passes}",
+            f"{NAME}/{dataset.absolute().name}/{count}-{passes}",
             f"{__name__}:measure",
-            {"dataset": given, "gaussians": count, "passes": passes},
+            {"dataset": str(dataset.resolve()), "gaussians": count, "passes": passes},
             alone=True,
         )
-        for count, passes in asked
+        for dataset, count, passes in asked
     ]
     found = run_cells(out, cells, report)
     rows: list[Row] = []
-    for (count, passes), cell in zip(asked, cells, strict=True):
+    for (dataset, count, passes), cell in zip(asked, cells, strict=True):
         result = found[cell.name]
         words = ["mgs", "fit", str(dataset), "--gaussians", str(count), "--passes", str(passes)]
-        about = {"program": f"mgs, {result['gaussians']:,} Gaussians", "passes": passes}
+        program = f"mgs, {result['gaussians']:,} Gaussians"
+        about = {"dataset": dataset.absolute().name, "program": program, "passes": passes}
         rows.append(about | result | {"command": shlex.join([*words, "--out", "RUN"])})
-    words = ["mgs", "chart", str(out), "--only", NAME, "--scale", preset, "--dataset", str(dataset)]
+    rows += [{"dataset": names[0]} | row for file in peers for row in read_peer(file)]
+    words = ["mgs", "chart", str(out), "--only", NAME, "--scale", preset]
+    words += [word for dataset in datasets for word in ("--dataset", str(dataset))]
     words += [word for count in gaussians for word in ("--gaussians", str(count))]
     words += [word for file in peers for word in ("--peer", str(file))]
-    text = table(COLUMNS, rows + others)
-    write_table(out, NAME, rows + others, text, shlex.join(words), preset=preset)
-    draw(out / f"{NAME}.png", rows + others, dataset.absolute().name)
+    write_table(out, NAME, rows, table(COLUMNS, rows), shlex.join(words), preset=preset)
+    panels = [
+        Panel(
+            "cpu_seconds",
+            "psnr",
+            "CPU seconds",
+            "PSNR on the test views (dB)",
+            by="program",
+            log=True,
+            only=(("dataset", name),),
+            title=name,
+        )
+        for name in names
+    ]
+    draw_panels(out / f"{NAME}.png", panels, rows)
     return rows
-
-
-def draw(path: Path, rows: Sequence[Mapping[str, Any]], dataset: str) -> None:
-    """Draw seconds against PSNR, a line for each program. dataset: its name, for the title.
-
-    Raises InputError as `save_figure`.
-    """
-    import matplotlib
-
-    names = list(dict.fromkeys(row["program"] for row in rows))
-    with matplotlib.rc_context(STYLE):
-        figure = new_figure(5.4, 4.0)
-        axes = figure.subplots()
-        for name, look in zip(names, group_styles(names), strict=True):
-            of = sorted((row["seconds"], row["psnr"]) for row in rows if row["program"] == name)
-            axes.plot(*zip(*of, strict=True), markersize=5, **look)
-        logarithmic(axes)
-        axes.set(xlabel="seconds", ylabel="PSNR on the test views (dB)")
-        axes.set_title(f"What a second buys: fits of {dataset}")
-        axes.legend(loc="lower right", fontsize=9)
-        save_figure(figure, path)
