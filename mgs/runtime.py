@@ -153,8 +153,7 @@ def start() -> None:
         return
     if mi.variant() is None:
         _set_variant(wanted)
-    _check_variant()
-    _keep_order()
+    _prepare_variant()
     _checked.add(mi.variant())
 
 
@@ -224,8 +223,8 @@ def _check_libllvm() -> None:
         )
 
 
-def _check_variant() -> None:
-    """Raise InputError if the variant that is set cannot run the kernels of mgs."""
+def _prepare_variant() -> None:
+    """Prepare the variant that is set. Raises InputError if it cannot run the kernels of mgs."""
     import drjit as dr
     import mitsuba as mi
 
@@ -237,6 +236,7 @@ def _check_variant() -> None:
         )
     if dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
         _check_libllvm()
+        _keep_order()
 
 
 def processes(count: int) -> ProcessPoolExecutor:
