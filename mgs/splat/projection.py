@@ -27,6 +27,7 @@ from mgs.camera import Camera
 from mgs.gaussians import SH_MAX, Gaussians
 from mgs.rotation import QUAT_MIN
 from mgs.splat.constants import EPS2D, FRUSTUM_MARGIN, LOG_SCALE_RANGE, NEAR
+from mgs.splat.recording import frozen
 
 LOG2E = 1.4426950408889634
 
@@ -230,3 +231,9 @@ def project(gaussians: Gaussians, camera: Any) -> Splats:
         shear_rest=shear_rest,
         **{name: mi.Float(getattr(exact, name)) for name in names},
     )
+
+
+@frozen(lambda gaussians, camera: gaussians.sh.shape)
+def projected(gaussians: Gaussians, camera: Any) -> Splats:
+    """`project`, recorded. Not differentiable."""
+    return project(gaussians, camera)
