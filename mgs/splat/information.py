@@ -25,7 +25,6 @@ from mgs.seeds import derive_seed
 from mgs.splat import kernels
 from mgs.splat.derivatives import (
     ByMean,
-    Geometry,
     Moments,
     along_normals,
     by_means,
@@ -36,7 +35,7 @@ from mgs.splat.derivatives import (
     weighted_sum,
 )
 from mgs.splat.projection import camera_array, project64
-from mgs.splat.recording import one_at_a_time
+from mgs.splat.recording import frozen, one_at_a_time
 from mgs.splat.rendering import ListCache, as_colour, as_drjit, render, splats_and_lists
 from mgs.splat.walking import pack, packet_count, sums_by_splat
 
@@ -166,9 +165,9 @@ def _sums(
     means: str,
     normals: np.ndarray | None,
     alpha_weight: float,
-) -> tuple[Moments, Geometry, list[ByMean]]:
-    """Sums of `kernels.fisher`, and the derivatives that turn them into entries of the information.
-    means, normals, alpha_weight: as in `exact`."""
+) -> tuple[Moments, Any, Any, list[ByMean]]:
+    """Sums of `kernels.fisher`, camera and splats of which `geometry` is made, and derivatives by
+    the means. means, normals, alpha_weight: as in `exact`."""
     device = camera_array(camera)
     splats, lists, packed = splats_and_lists(gaussians, camera, cache)
     moving = means != "frozen"
@@ -198,7 +197,7 @@ def _sums(
     by_mean = by_means(gaussians, device) if moving else []
     if normals is not None:
         by_mean = [along_normals(by_mean, normals)]
-    return moments, geometry(gaussians, device, splats), by_mean
+    return moments, device, splats, by_mean
 
 
 def exact(
@@ -216,7 +215,18 @@ def exact(
     normals: float64 [N,3] of length 1 for means="normal", else None.
     """
     how = means, normals, alpha_weight
-    sums, g, by_mean = _sums(gaussians, camera, background, cache, False, *how)
+    sums, device, splats, by_mean = _sums(gaussians, camera, background, cache, False, *how)
+    parts = dr.detach((gaussians, device, splats))
+    size = 3 * gaussians.sh.shape[1] + 8 + len(by_mean)
+    return np.asarray(_diagonal(*parts, sums, by_mean))[:, :size]
+
+
+@frozen(lambda gaussians, camera, splats, sums, by_mean: (*gaussians.sh.shape, len(by_mean)))
+def _diagonal(
+    gaussians: Gaussians, camera: Any, splats: Any, sums: Moments, by_mean: list[ByMean]
+) -> Any:
+    """Columns of `exact` (`_interleaved`)."""
+    g = geometry(gaussians, camera, splats)
     columns = [sums.w2 * basis * basis * positive for basis in g.basis for positive in g.positive]
     columns += [dr.maximum(product_sum(m, m, sums.squared), 0) for m in g.shape]
     columns.append(g.logit * g.logit * sums.squared[0, 0])
@@ -236,7 +246,8 @@ def block(
     """Exact diagonal blocks of J^T J [N,P,P], in one pass over the image: 22 sums per splat, with
     means 34. means, normals, alpha_weight: as in `exact`."""
     how = means, normals, alpha_weight
-    sums, g, by_mean = _sums(gaussians, camera, background, cache, True, *how)
+    sums, device, splats, by_mean = _sums(gaussians, camera, background, cache, True, *how)
+    g = geometry(gaussians, device, splats)
     dr.eval(g, by_mean)  # several kernels may write the blocks
     colour = [(basis, c) for basis in g.basis for c in range(3)]
     k = len(colour)
@@ -268,8 +279,8 @@ def block(
     size = k + 8 + len(by_mean)
     both = {i * size + j: value for (i, j), value in upper.items()}
     both |= {j * size + i: value for (i, j), value in upper.items()}
-    flat = _interleaved(both, size * size, len(gaussians))
-    return flat.reshape(-1, size, size)
+    rows = np.asarray(_interleaved(both, size * size, len(gaussians)))
+    return rows[:, : size * size].reshape(-1, size, size)
 
 
 def _gradient(
@@ -345,12 +356,9 @@ PACKETS = 32
 writes all 56 x 56 columns of SH degree 3."""
 
 
-def _interleaved(columns: dict[int, Any], size: int, n: int) -> np.ndarray:
-    """NumPy float32 [N, size] from Dr.Jit columns [N] by index; columns not given are 0.
-
-    Rows are padded to a multiple of four, which a kernel writes at a time. The result is a view
-    without the padding.
-    """
+def _interleaved(columns: dict[int, Any], size: int, n: int) -> Any:
+    """TensorXf [N, size] from columns [N] by index; columns not given are 0. Rows are padded to a
+    multiple of four, which a kernel writes at a time."""
     packets = -(-size // 4)
     flat, row = dr.empty(mi.Float, n * packets * 4), dr.arange(mi.UInt32, n) * packets
     for packet in range(packets):
@@ -359,7 +367,7 @@ def _interleaved(columns: dict[int, Any], size: int, n: int) -> np.ndarray:
         dr.scatter(flat, normal, row + packet, mode=dr.ReduceMode.NoConflicts)
         if packet % PACKETS == PACKETS - 1:
             dr.eval(flat)
-    return flat.numpy().reshape(n, -1)[:, :size]
+    return mi.TensorXf(flat, (n, 4 * packets))
 
 
 ESTIMATORS: dict[str, Callable[..., np.ndarray]] = {
