@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 
@@ -11,6 +12,7 @@ def main() -> None:
     only."""
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for products of 3x3, threads only wait
     try:
         from mgs.cli.app import main as run
 

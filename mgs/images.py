@@ -39,6 +39,11 @@ PNG_LEVEL = 1
 written in 62 instead of 236 ms; a smooth photo of 3 Mpixel is 7 % larger."""
 
 
+def around(mask: np.ndarray, margin: int) -> tuple[slice, ...]:
+    """Slices of the bounding box of a mask [H,W] with a true pixel, widened by pixels."""
+    return tuple(slice(max(i.min() - margin, 0), i.max() + 1 + margin) for i in np.nonzero(mask))
+
+
 def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> None:
     """Write an 8-bit PNG; the file appears complete. The type of `image` decides:
 

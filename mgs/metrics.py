@@ -9,6 +9,7 @@ import numpy as np
 
 from mgs.colour import srgb_from_linear
 from mgs.errors import InputError
+from mgs.images import around
 
 PSNR_LIMIT = 100.0
 """Largest PSNR reported, dB, also for equal images. Rounding to 8 bits is an error of 59 dB."""
@@ -80,9 +81,12 @@ def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
     if min(a.shape[:2]) < SSIM_WINDOW:
         size, least = f"{a.shape[1]}x{a.shape[0]}", f"{SSIM_WINDOW}x{SSIM_WINDOW}"
         raise InputError(f"SSIM needs images of at least {least} pixels, not {size}")
-    mean, similarity = structural_similarity(
-        np.asarray(a, np.float64),
-        np.asarray(b, np.float64),
+    drawn = ((a != 0) | (b != 0)).any(axis=2)
+    drawn[a.shape[0] // 2, a.shape[1] // 2] = True  # both images may be black
+    box, similarity = around(drawn, SSIM_WINDOW), np.ones(a.shape)  # 1 where all around is black
+    _, similarity[box] = structural_similarity(
+        np.asarray(a[box], np.float64),
+        np.asarray(b[box], np.float64),
         channel_axis=-1,
         data_range=1.0,
         gaussian_weights=True,
@@ -90,7 +94,9 @@ def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
         use_sample_covariance=False,
         full=True,
     )
-    return float(mean), similarity
+    inner = slice(SSIM_WINDOW // 2, -(SSIM_WINDOW // 2))
+    channels = map(np.ascontiguousarray, np.moveaxis(similarity, 2, 0))
+    return float(np.mean([one[inner, inner].mean() for one in channels])), similarity
 
 
 def colour_corrected(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -66,6 +66,17 @@ def test_psnr_inside_a_mask(images):
     assert math.isnan(ssim(a, b, nothing))
 
 
+def test_ssim_around_black_is_that_of_the_whole_image():
+    from skimage.metrics import structural_similarity
+
+    options = {"channel_axis": -1, "data_range": 1.0, "gaussian_weights": True, "sigma": 1.5}
+    rng, black = np.random.default_rng(2), np.zeros((30, 40, 3))
+    for box in (np.s_[:0], np.s_[3:9, 20:33], np.s_[:1, :1], np.s_[25:, 12:]):
+        a, b = black.copy(), black.copy()
+        a[box], b[box] = rng.random(black[box].shape), rng.random(black[box].shape)
+        assert ssim(a, b) == structural_similarity(a, b, use_sample_covariance=False, **options)
+
+
 def test_ssim_follows_its_definition(images):
     """Wang et al. 2004 at one pixel: an 11 x 11 Gaussian window with sigma 1.5, K1 = 0.01, K2 =
     0.03."""

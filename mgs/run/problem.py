@@ -130,7 +130,7 @@ class Problem:
         self.image = kept_within(
             IMAGE_BYTES, lambda i: target_of(self.frames[i], with_alpha), lambda image: image.nbytes
         )
-        self._start_of = lru_cache(maxsize=2)(self.coloured)
+        self._start_of = lru_cache(maxsize=3)(self.coloured)
 
     def with_settings(self, **changes: Any) -> Problem:
         """The same problem with other settings that neither change `lam` nor the seeds, such as

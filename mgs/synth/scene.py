@@ -16,6 +16,7 @@ import trimesh
 from mgs.camera import Camera
 from mgs.colour import linear_from_srgb
 from mgs.data.rock_image import boundary
+from mgs.images import around
 from mgs.memory import padded
 from mgs.seeds import generator
 from mgs.synth.arena import make_ground, make_stones, regolith
@@ -87,7 +88,7 @@ class Traced:
             guides, rock_guides, share = self.guides
             rgb = _denoise(rgb, guides)
             if alpha.any():
-                box = _around(alpha > 0)  # black pixels would cost the denoiser as much as others
+                box = around(alpha > 0, MARGIN)  # black pixels would cost as much as others
                 noisy = continued(rock[box], alpha[box])
                 rock_guides = with_coverage(rock_guides, share, alpha)
                 clean = _denoise(noisy, continued(rock_guides[box], alpha[box]))
@@ -197,11 +198,6 @@ class MitsubaScene:
         dr.eval(hit)  # otherwise each array read below would trace the rays again
         z = np.where(hit.is_valid().numpy(), hit.t.numpy() / length, 0)
         return z.astype(np.float32), (hit.shape == mi.ShapePtr(self.rock)).numpy()
-
-
-def _around(mask: np.ndarray) -> tuple[slice, ...]:
-    """Slices of the bounding box of a mask [H,W] with a true pixel, widened by MARGIN."""
-    return tuple(slice(max(i.min() - MARGIN, 0), i.max() + 1 + MARGIN) for i in np.nonzero(mask))
 
 
 def _denoise(rgb: np.ndarray, guides: np.ndarray) -> np.ndarray:
