@@ -44,7 +44,7 @@ from mgs.memory import IMAGE_BYTES, Deferred, adopted, kept_within, padded
 from mgs.splat import ListCache, as_drjit, fisher, groups
 from mgs.splat.blocks import BlockLists
 from mgs.splat.information import unit_normals
-from mgs.splat.projection import camera_array, project, rows_as_vectors
+from mgs.splat.projection import camera_array, project, projected, rows_as_vectors
 from mgs.splat.recording import frozen, one_at_a_time
 from mgs.splat.rendering import composite_channels, splats_and_lists
 
@@ -292,7 +292,7 @@ class Objective:
 
     def view(self, model: Gaussians, photo: Photo) -> View:
         """A photo with the block lists of a model. Raises InputError as `ListCache.get`."""
-        lists, packed = self.cache.get(photo.camera, _project(model, photo.array))
+        lists, packed = self.cache.get(photo.camera, projected(model, photo.array))
         return View(photo.array, photo.target, photo.size, lists, packed)
 
     def offsets(self, model: Gaussians) -> list[tuple[Any, Any]]:
@@ -449,11 +449,6 @@ def with_gradients(model: Gaussians, prior: ParameterPrior) -> Gaussians:
 
 def _sizes(model: Gaussians, prior: ParameterPrior, view: View, *others: Any) -> tuple[Any, ...]:
     return prior.means, *model.sh.shape, *view.recorded_sizes
-
-
-@frozen(lambda model, camera: model.sh.shape)
-def _project(model: Gaussians, camera: Any) -> Any:
-    return project(model, camera)
 
 
 @frozen(_sizes)

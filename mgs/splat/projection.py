@@ -22,13 +22,12 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from mgs.camera import Camera
 from mgs.gaussians import SH_MAX, Gaussians
-from mgs.memory import padded
 from mgs.rotation import QUAT_MIN
 from mgs.splat.constants import EPS2D, FRUSTUM_MARGIN, LOG_SCALE_RANGE, NEAR
+from mgs.splat.recording import frozen
 
 LOG2E = 1.4426950408889634
 
@@ -89,7 +88,8 @@ def camera_array(camera: Camera) -> Any:
     ]
     pose = camera.world_to_camera
     numbers = [*pose[:3, :3].ravel(), *pose[:3, 3], fx, fy, cx, cy, *clamp, *camera.position]
-    return mi.Float64(padded(numbers, np.float64))
+    # Not of NumPy, whose memory is freed by a thread that waits for Python before the next kernel.
+    return mi.Float64([float(number) for number in numbers])
 
 
 def _numbers(array: Any, first: int, end: int) -> list[Any]:
@@ -231,3 +231,9 @@ def project(gaussians: Gaussians, camera: Any) -> Splats:
         shear_rest=shear_rest,
         **{name: mi.Float(getattr(exact, name)) for name in names},
     )
+
+
+@frozen(lambda gaussians, camera: gaussians.sh.shape)
+def projected(gaussians: Gaussians, camera: Any) -> Splats:
+    """`project`, recorded. Not differentiable."""
+    return project(gaussians, camera)

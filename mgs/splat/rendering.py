@@ -19,7 +19,7 @@ from mgs.memory import padded
 from mgs.notebook import html, picture
 from mgs.splat import blocks, kernels
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists
-from mgs.splat.projection import Splats, camera_array, project
+from mgs.splat.projection import Splats, camera_array, project, projected
 from mgs.splat.recording import one_at_a_time
 from mgs.splat.walking import PIXELS, pack, sums_by_splat
 
@@ -244,7 +244,7 @@ def splats_and_lists(
     Raises InputError if a parameter is not finite or a colour beyond SH_MAX, naming parameter and
     Gaussian; and if the view has too many pairs.
     """
-    splats = project(gaussians, camera_array(camera))
+    splats = (project if dr.grad_enabled(gaussians) else projected)(gaussians, camera_array(camera))
     try:
         return splats, *(cache or ListCache()).get(camera, dr.detach(splats))
     except InputError:
