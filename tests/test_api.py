@@ -109,7 +109,7 @@ def test_objects_are_short_in_text_and_have_pictures_in_notebooks(dataset, prior
     for one, text, pictures in (
         (loaded, f"Dataset({dataset}: 12 frames, 16x12)", 6),
         (known, "Prior(40 points, 40 Gaussians, spacing 0.5 m)", 1),
-        (begun, f"Run({tmp_path / 'begun'}: directional-d, 0 of 12 views)", 0),
+        (begun, f"Run({tmp_path / 'begun'}: directional-i, 0 of 12 views)", 0),
         (run, f"Run({tmp_path / 'run'}: fit, 3 of 3 views)", 4),
         (run.gaussians, "Gaussians(40, SH degree 0)", 1),
         (mgs.render(run.gaussians, loaded.frames[0].camera), "Image(16x12)", 1),

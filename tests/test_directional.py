@@ -143,7 +143,7 @@ def test_a_flight_is_planned_without_looking_at_any_fit(dataset, tmp_path, polic
     seeds, first = states[0].taken[:3], states[0].taken[3]
     left = [i for i in range(tiny.FRAMES) if i not in seeds]
     dome = views(directional.dome_cameras(cameras[0], views(cameras).positions, np.zeros(3)))
-    degree, tau, around = {"directional-d": (1, 0.3, None), "directional-i": (3, 0.1, dome)}[policy]
+    degree, tau, around = {"directional-d": (1, 0.3, None), "directional-i": (2, 0.2, dome)}[policy]
     pools = (views([cameras[i] for i in chosen]) for chosen in (seeds, left))
     lam = criteria.regularisation(tiny.GROUPS)[0]
     expected = gains(start.means, lam, degree, tau, *pools, around)
@@ -173,9 +173,10 @@ def test_what_poses_see_is_measured_once_and_again_when_it_is_forgotten(dataset,
     assert counts[1] == 0 < counts[0] == counts[2] == counts[3]
 
 
-def test_a_run_takes_the_views_of_its_plan(loaded, tmp_path):
-    """Whatever order; after another view a new plan is made, and where reach is limited none."""
-    state = tiny.run(tmp_path / "run", loaded, policy="directional-d", budget=4)
+@pytest.mark.parametrize("policy", ["directional-d", "directional-i"])
+def test_a_run_takes_the_views_of_its_plan(loaded, tmp_path, policy):
+    """Whatever order; after another view a new plan is made, and with a travel cost none."""
+    state = tiny.run(tmp_path / "run", loaded, policy=policy, budget=4)
     settings = run_folder.open_run(tmp_path / "run").settings
     problem = Problem(loaded, settings, tiny.operations())
     seeds, chosen = state.taken[:3], state.taken[3:]
@@ -186,5 +187,21 @@ def test_a_run_takes_the_views_of_its_plan(loaded, tmp_path):
     other = [*seeds, next(i for i in left if i not in chosen)]
     new = problem.planned(other, problem.reachable(other))
     assert len(new) == 3
-    for changes in ({"nearest": 5}, {"travel": 1.0}, {"policy": "directional-i"}):
+    for changes in ({"travel": 1.0}, {"policy": "cover"}):
         assert problem.with_settings(**changes).planned(seeds, left) == left
+
+
+@pytest.mark.parametrize("policy", ["directional-d", "directional-i"])
+def test_a_run_with_limited_reach_follows_its_path(loaded, tmp_path, policy):
+    """After another view a new path is planned."""
+    state = tiny.run(tmp_path / "run", loaded, policy=policy, budget=4, nearest=2)
+    settings = run_folder.open_run(tmp_path / "run").settings
+    problem = Problem(loaded, settings, tiny.operations())
+    seeds, chosen = state.taken[:3], state.taken[3:]
+    for step in range(4):
+        taken = [*seeds, *chosen[:step]]
+        assert chosen[step] in problem.reachable(taken)
+        assert problem.planned(taken, problem.reachable(taken)) == [chosen[step]]
+    other = [*seeds, next(i for i in problem.reachable(seeds) if i != chosen[0])]
+    (new,) = problem.planned(other, problem.reachable(other))
+    assert new in problem.reachable(other)

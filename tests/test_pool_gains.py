@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from mgs.policy import pool_gains as module
 from mgs.policy.directional import Views, gains
-from mgs.policy.pool_gains import PoolGains, planned_views, pool_gains
+from mgs.policy.pool_gains import PoolGains, planned_path, planned_views, pool_gains
 
 LAM = (0.02 / 1.0) ** 2
 POSES = 7
@@ -124,20 +124,31 @@ def circle(count, radius):
     return radius * np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
 
 
-@pytest.mark.parametrize(("taken", "count"), [([0], 2), ([0, 1], 4), ([0, 3, 9], 5)])
-def test_no_exchange_betters_a_plan_which_greedy_choice_misses(taken, count):
-    """Around a disc, where two views after the first are best at thirds of the circle."""
+def disc():
+    """24 points, 16 poses, and a function taken, views -> gain of these views, one by one."""
     points, positions = circle(24, 1), circle(16, 4)
     towards = positions[:, None] - points
     cosine = (towards * points).sum(2) / np.linalg.norm(towards, axis=2)
     pool = Views(positions, np.maximum(cosine, 0).astype(np.float32) ** 2)
+
+    def gain(taken, views):
+        parts = (([*taken, *views[:k]], [view]) for k, view in enumerate(views))
+        return sum(reference(points, pool, None, *part, 1, 0.3, False)[0] for part in parts)
+
+    return points, pool, gain
+
+
+@pytest.mark.parametrize(("taken", "count"), [([0], 2), ([0, 1], 4), ([0, 3, 9], 5)])
+def test_no_exchange_betters_a_plan_which_greedy_choice_misses(taken, count):
+    """Around a disc, where two views after the first are best at thirds of the circle."""
+    points, pool, gain_after = disc()
     free = [view for view in range(16) if view not in taken]
 
     def gains_of(before, views):
         return reference(points, pool, None, taken + before, views, 1, 0.3, False)
 
     def gain(views):
-        return sum(gains_of(views[:k], [view])[0] for k, view in enumerate(views))
+        return gain_after(taken, views)
 
     greedy = []
     for _ in range(count):
@@ -152,3 +163,33 @@ def test_no_exchange_betters_a_plan_which_greedy_choice_misses(taken, count):
             assert gain([*plan[:k], other, *plan[k + 1 :]]) < 1.0001 * gain(plan)
     if taken == [0]:
         assert sorted(plan) == [5, 11]
+
+
+@pytest.mark.parametrize("taken", [[0, 8], [2, 13, 8]])
+def test_a_path_gains_as_much_as_any_within_reach(monkeypatch, taken):
+    """Around a disc in steps of at most two poses, where the way that begins best is not."""
+    points, pool, gain = disc()
+    held = PoolGains(points, pool, LAM, 1, 0.3)
+    held.take(taken)
+
+    def reach(views):
+        near = [(views[-1] + step) % 16 for step in (-2, -1, 1, 2)]
+        return [view for view in near if view not in views]
+
+    paths = [[]]
+    for _ in range(4):
+        paths = [[*path, view] for path in paths for view in reach([*taken, *path])]
+    assert planned_path(held, reach, 4) in paths
+    best = max(gain(taken, path) for path in paths)
+    for width, least, most in ((1, 0, 0.98), (module.WIDTH, 0.99, 1.0001), (99, 0.9999, 1.0001)):
+        monkeypatch.setattr(module, "WIDTH", width)
+        assert least < gain(taken, planned_path(held, reach, 4)) / best < most
+    assert held.taken == taken
+
+
+def test_a_path_ends_where_nothing_is_in_reach():
+    points, pool, _ = disc()
+    held = PoolGains(points, pool, LAM, 1, 0.3)
+    held.take([0])
+    assert planned_path(held, lambda views: [1, 2][len(views) - 1 : 2], 4) == [1, 2]
+    assert planned_path(held, lambda views: [], 4) == []

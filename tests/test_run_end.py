@@ -135,7 +135,7 @@ def test_one_line_says_why_a_run_ended(dataset, prior, tmp_path, capsys):
         mgs("eval", out)
     shown = mgs("report", *runs, "--out", tmp_path / "report")
     rows = table_numbers(runs)
-    assert f"directional-d: a path of {rows[0]['path']:.2f} m; {line}\n" in shown
+    assert f"directional-i: a path of {rows[0]['path']:.2f} m; {line}\n" in shown
     spent = "the run has ended: its budget is spent, 2 chosen views"
     assert f"random: a path of {rows[1]['path']:.2f} m; {spent}\n" in shown
     assert [row.get("ended") for row in rows] == ["gain", None]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from mgs.run.folder import Run
     from mgs.run.state import State
 
-POLICIES = ("directional-d", "paper", "d-optimal", "cover", "random")
+POLICIES = ("directional-i", "paper", "d-optimal", "cover", "random")
 
 ORBIT, DISTANCES = "hemisphere", "1,1.5,2"
 """Options of the orbit. On a ring at one distance even spacing is as good as any choice."""

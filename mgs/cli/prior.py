@@ -149,7 +149,8 @@ def prior(
         )
     if "resolution" in result.numbers:
         console.print(_reason(result.numbers), soft_wrap=True)
-    console.print(f"wrote {folder}: {', '.join(sorted(FILES))}")
+    written = sorted(path.name for path in folder.iterdir())
+    console.print(f"wrote {folder}: {', '.join(written)}")
 
 
 def _built(

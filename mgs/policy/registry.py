@@ -29,26 +29,28 @@ from mgs.policy.criteria import (
 from mgs.policy.criteria import i_optimal as i_optimality
 from mgs.policy.poses import POSE_POLICIES
 
-DIRECTIONAL_D = 1, 0.3
-"""SH degree and tau of `directional-d`, chosen on five rocks that judge nothing."""
+PLANNED = {"directional-d": (1, 0.3, False), "directional-i": (2, 0.2, True)}
+"""Policies that plan all views of a run (`Problem.planned`) -> SH degree, tau and over_dome of the
+gains (`PolicyContext.gains`) that score a view and that the plan maximises. Chosen on five rocks
+that judge nothing."""
 
-PLANNED = {"directional-d": DIRECTIONAL_D}
-"""Policies that plan the whole budget (`Problem.planned`) -> degree and tau of the gains that the
-plan maximises."""
-
-FLOWN = {"directional-d": (1, 0.1, True)}
-"""Policies that plan a whole flight (`mgs.policy.tour.planned_tour`) -> degree, tau and over_dome
-of the gains that its plan maximises. Chosen on two rocks that judge nothing."""
+FLOWN = 1, 0.1, True
+"""SH degree, tau and over_dome of the gains that the tour of a policy of PLANNED maximises
+(`mgs.policy.tour.planned_tour`). Chosen on two rocks that judge nothing."""
 
 
 def directional_d(context: PolicyContext) -> Array:
     """Directional D-optimality, nats (`mgs.policy.directional`)."""
-    return context.gains(context.taken_frames, context.candidate_frames, *DIRECTIONAL_D, False)
+    return _directional(context, "directional-d")
 
 
 def directional_i(context: PolicyContext) -> Array:
-    """Directional I-optimality over a dome, with colours of SH degree 3 and tau 0.1."""
-    return context.gains(context.taken_frames, context.candidate_frames, 3, 0.1, True)
+    """Directional I-optimality over a dome (`mgs.policy.directional`)."""
+    return _directional(context, "directional-i")
+
+
+def _directional(context: PolicyContext, name: str) -> Array:
+    return context.gains(context.taken_frames, context.candidate_frames, *PLANNED[name])
 
 
 def i_optimal(context: PolicyContext) -> Array:

@@ -14,6 +14,7 @@ from mgs.memory import IMAGE_BYTES, kept_within
 from mgs.policy.context import Gains
 from mgs.policy.criteria import Array
 from mgs.policy.directional import Views, dome_cameras, of_points, squared_weights
+from mgs.policy.poses import nearest_poses
 
 if TYPE_CHECKING:
     from mgs.policy.pool_gains import PoolGains
@@ -49,7 +50,7 @@ class Visibility:
         self.turn = np.eye(3) if turn is None else turn
         self.positions = np.array([camera.position for camera in cameras]) @ self.turn.T
         self.seen, self.pool, self.dome = cache(self._seen), cache(self._pool), cache(self._dome)
-        self.planned = cache(self._planned)
+        self.planned, self.path = cache(self._planned), cache(self._path)
         # (frame) -> `exact` of its camera: a copy, because the kernel returns part of a larger
         # array.
         self.information = kept_within(
@@ -68,18 +69,43 @@ class Visibility:
         taken: tuple[int, ...],
         candidates: tuple[int, ...],
         count: int,
-        degree: int,
-        tau: float,
+        model: tuple[int, float, bool],
     ) -> Sequence[int]:
         """Candidates to take next, as a set of at most `count` (`planned_views`); all where the
-        gains of the pool do not fit into the memory."""
+        gains of the pool do not fit into the memory. model: SH degree, tau and over_dome."""
         from mgs.policy.pool_gains import PoolGains, fits, planned_views
 
+        degree, tau, over_dome = model
         if count >= len(candidates) or not fits(self.points, self.pool(), degree):
             return candidates
-        gains = PoolGains(self.points, self.pool(), self.lam, degree, tau)
+        dome = self.dome() if over_dome else None
+        gains = PoolGains(self.points, self.pool(), self.lam, degree, tau, dome)
         gains.take(taken)
         return planned_views(gains, candidates, count)
+
+    def _path(
+        self,
+        taken: tuple[int, ...],
+        candidates: tuple[int, ...],
+        count: int,
+        nearest: int,
+        model: tuple[int, float, bool],
+    ) -> list[int]:
+        """At most `count` candidates to take next, in order, each among the `nearest` to the one
+        before (`planned_path`); none where the gains do not fit into the memory. model: SH degree,
+        tau and over_dome."""
+        from mgs.policy.pool_gains import planned_path
+
+        def reach(views: Sequence[int]) -> list[int]:
+            left = [i for i in candidates if i not in views]
+            near = nearest_poses(self.positions[left], self.positions[views[-1]], nearest)
+            return [left[k] for k in near]
+
+        gains = self.few_gains(*model)
+        if gains is None:
+            return []
+        gains.take(taken)
+        return planned_path(gains, reach, count)
 
     def few_gains(self, degree: int, tau: float, over_dome: bool) -> PoolGains | None:
         """Gains of all cameras for about FEW of the Gaussians, before any view is taken; None where

@@ -12,7 +12,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.gaussians import Gaussians
 from mgs.policy.poses import POSE_POLICIES
-from mgs.policy.registry import DIRECTIONAL_D, PLANNED
+from mgs.policy.registry import PLANNED
 from mgs.run import detectors
 from mgs.run.prediction import predicted_psnr
 from mgs.run.problem import Problem
@@ -81,7 +81,7 @@ class Checks:
         """
 
         def mean_gain(before: list[int], poses: list[int]) -> float:
-            gains = self.problem.visibility.gains(before, poses, *DIRECTIONAL_D, False)
+            gains = self.problem.visibility.gains(before, poses, *PLANNED["directional-d"])
             return float(gains.mean())
 
         entry = {"fitted": float(np.mean([view.srgb_error for view in views]))}

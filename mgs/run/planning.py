@@ -10,7 +10,7 @@ import numpy as np
 from mgs.errors import InputError
 from mgs.policy import poses, tour
 from mgs.policy.context import PolicyContext
-from mgs.policy.registry import FLOWN
+from mgs.policy.registry import FLOWN, PLANNED
 from mgs.run.problem import Problem
 from mgs.run.state import Fitted
 
@@ -64,10 +64,10 @@ def plan_flight(
 ) -> Iterator[tuple[int, float]]:
     """Views of the rest of the flight in flying order, each with its score.
 
-    With a policy of FLOWN it is the rest of `planned_flight`, and scores are those after the views
-    before. Otherwise the tour is `grown` by the view of largest score / cost, as if those before it
-    were taken, and scores are those at that time. The cost is the share of the limits that a view
-    adds, and its share of the views that the budget has left.
+    With a policy of PLANNED it is the rest of `planned_flight`, and scores are those after the
+    views before. Otherwise the tour is `grown` by the view of largest score / cost, as if those
+    before it were taken, and scores are those at that time. The cost is the share of the limits
+    that a view adds, and its share of the views that the budget has left.
     """
     if plan := planned_flight(problem, state.taken):
         for k, frame in enumerate(plan):
@@ -90,19 +90,18 @@ def plan_flight(
 
 
 def planned_flight(problem: Problem, taken: Sequence[int]) -> list[int]:
-    """Rest of the tour that a policy of FLOWN plans after the seeds; empty for other policies.
+    """Rest of the tour that a policy of PLANNED plans after the seeds; empty for other policies.
 
     If another view was taken than the next one of the plan, a new plan is made after all views
     taken.
     """
     settings, flight = problem.settings, problem.flight
-    model = FLOWN.get(settings.policy)
-    if model is None or settings.nearest is not None:
+    if settings.policy not in PLANNED or settings.nearest is not None:
         return []
     for start in (taken[: settings.seeds], taken):
         key = tuple(start), tuple(problem.reachable(start))
         if key not in flight.tours:
-            gains = problem.visibility.few_gains(*model)
+            gains = problem.visibility.few_gains(*FLOWN)
             if gains is None:
                 return []
             problem.progress("planning the flight", 0, 1)

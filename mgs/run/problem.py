@@ -212,11 +212,15 @@ class Problem:
             return Deferred(taken, self.image)
         return Deferred(range(len(taken)), lambda k: without_gain(self.image(taken[k]), gains[k]))
 
+    def free(self, taken: Sequence[int]) -> list[int]:
+        """Frames that are allowed, and not taken or given up."""
+        may = [self.allowed[i] and not frame.given_up for i, frame in enumerate(self.frames)]
+        return [i for i in range(len(self.frames)) if may[i] and i not in taken]
+
     def reachable(self, taken: Sequence[int]) -> list[int]:
-        """Frames not taken or given up, allowed, and within the flight's limits; with the setting
-        `nearest`, that many nearest to the last view."""
-        free = [self.allowed[i] and not frame.given_up for i, frame in enumerate(self.frames)]
-        left = [i for i in range(len(self.frames)) if free[i] and i not in taken]
+        """Those of `free` within the flight's limits; with the setting `nearest`, that many nearest
+        to the last view."""
+        left = self.free(taken)
         if self.settings.flies:
             left = self.flight.in_reach(taken, left)
         if self.settings.nearest is None:
@@ -226,24 +230,29 @@ class Problem:
         return [left[k] for k in near]
 
     def planned(self, taken: Sequence[int], left: list[int]) -> list[int]:
-        """Frames in `left` among which a policy of PLANNED chooses: the rest of its plan.
+        """Frames in `left` among which a policy of PLANNED chooses: the rest of its plan, or the
+        next view of its path where the setting `nearest` limits the reach.
 
         The plan is made after the seeds. If a view outside it was taken, a new plan is made after
-        all views taken. Returns all of `left` for other policies, and where reach or travel cost
-        of a candidate depends on the last view.
+        all views taken. Returns all of `left` for other policies, and where a limit of the flight
+        or the travel cost depends on the last view.
         """
         settings = self.settings
         model = PLANNED.get(settings.policy)
-        if model is None or settings.nearest or settings.travel or settings.flies:
+        if model is None or settings.travel or settings.flies:
             return left
         for start in (taken[: settings.seeds], taken):
             count = settings.budget - (len(start) - settings.seeds)
-            plan = self.visibility.planned(
-                tuple(start), tuple(self.reachable(start)), count, *model
-            )
-            rest = [i for i in left if i in plan]
-            if rest and set(taken[len(start) :]) <= set(plan):
-                return rest
+            known, done = (tuple(start), tuple(self.free(start)), count), list(taken[len(start) :])
+            if settings.nearest:
+                path = self.visibility.path(*known, settings.nearest, model)
+                if path[: len(done)] == done and path[len(done) :]:
+                    return [path[len(done)]]
+            else:
+                plan = self.visibility.planned(*known, model)
+                rest = [i for i in left if i in plan]
+                if rest and set(done) <= set(plan):
+                    return rest
         return left
 
     def travel_cost(self, context: PolicyContext) -> np.ndarray:

@@ -60,7 +60,7 @@ class NbvSettings(BaseModel):
     """Folder of the dataset."""
     prior: Path
     """Folder of the prior."""
-    policy: str = "directional-d"
+    policy: str = "directional-i"
     """Policy that scores candidate views: a name, or FILE.py:FUNCTION of your own."""
     nearest: Annotated[int, Field(ge=1)] | None = None
     """Choose among this many candidates, the nearest to the last view. Default: all."""

@@ -42,11 +42,11 @@ Found = Mapping[str, Mapping[str, Any]]
 """Results of cells by name."""
 
 POLICIES = (
-    "directional-d", "directional-i", "cover", "coverage", "farthest", "uniform", "random",
+    "directional-i", "directional-d", "cover", "coverage", "farthest", "uniform", "random",
     "d-optimal", "paper",
 )  # fmt: skip
 
-LEADER = "directional-d"
+LEADER = "directional-i"
 """Policy whose lead over every other is tested: the default of `mgs nbv`."""
 
 RANDOM, ORACLE = "random", "oracle"
