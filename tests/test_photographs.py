@@ -38,7 +38,6 @@ from mgs.prior import hull
 from mgs.prior.build import build_prior, load_prior, prior_and_cloud
 from mgs.prior.hull import visual_hull
 from mgs.prior.initial import initial_gaussians
-from mgs.prior.photographs import supported
 from mgs.prior.points import _grown, main_cluster, on_surface, reliable
 from mgs.prior.scattered import scattered
 from mgs.prior.settings import PriorSettings
@@ -399,42 +398,9 @@ def test_masks_are_made_of_the_prior(data, tmp_path):
     made = load_dataset(tmp_path / "d")
     pairs = [(a.mask(), b.mask()) for a, b in zip(made.frames, true.frames, strict=True)]
     assert np.mean([(a & b).sum() / (a | b).sum() for a, b in pairs]) > 0.85
-    kept = len(load_prior(tmp_path / "d/prior").cloud)
-    assert kept == read_json(tmp_path / "d/prior/prior.json")["cluster_size"]
     with Image.open(tmp_path / "d/masks.png") as sheet:
         assert sheet.size == (6 * 240, 4 * 180)
     assert exit_code("dataset", "masks", tmp_path / "d") == 2
-
-
-def test_where_no_point_supports_the_mesh_colours_decide(tmp_path, monkeypatch):
-    """Points on half of a bright rock; the mesh also has a box, in front of the dark ground."""
-    centre = synthetic.CENTRE + np.array([0, 0, 0.4])
-
-    def albedo(x: np.ndarray) -> np.ndarray:
-        near = (((x - centre) / synthetic.AXES) ** 2).sum(-1, keepdims=True) < 1.01
-        return np.where(near, 0.7, 0.1) + 0.05 * np.sin(x * 40)
-
-    monkeypatch.setattr(synthetic, "albedo", albedo)
-    cameras, rocks = synthetic.orbit_cameras(6, 96, 72), [(centre, synthetic.AXES)]
-    dataset = synthetic.write_dataset(tmp_path / "d", cameras, rocks, depth=False)
-    true = [frame.mask() for frame in dataset.frames]
-    rock, box = synthetic.rock_mesh(centre), trimesh.creation.box((0.8, 0.8, 0.4))
-    points = rock.vertices[rock.vertices[:, 1] > centre[1]]
-    box.apply_translation(centre + np.array([0.3, -0.3, 0]))
-    both = trimesh.util.concatenate([rock, box])
-    mesh = Mesh(both.vertices, both.faces, np.ones(len(both.faces), bool))
-    bare = Dataset(dataset.root, tuple(replace(f, mask_path=None) for f in dataset.frames))
-
-    def shared(part: Mesh | None) -> float:
-        made = make_masks(bare, mesh, supported=part).frames
-        pairs = [(frame.mask(), mask) for frame, mask in zip(made, true, strict=True)]
-        return min((a & b).sum() / (a | b).sum() for a, b in pairs)
-
-    part = supported(mesh, points)
-    assert 0.4 < len(part.faces) / len(mesh.faces) < 0.6
-    assert shared(None) < 0.85
-    assert shared(part) > 0.97
-    assert supported(mesh, points + 9) is None
 
 
 # What cannot be used: how to make the dataset, options, what the error says.

@@ -30,9 +30,8 @@ def dataset(
     colour, depth, masks and poses agree. It prints every problem and its cure, and exits with code
     2 if there is one. Test views are a dataset of their own: check DATASET/test, too.
 
-    `mgs dataset masks DATASET` projects the prior's mesh into every image and writes masks/. Far
-    from the points of its surface, only pixels of the object's colours count (GrabCut). Look at
-    masks.png, which shows them, before you use them.
+    `mgs dataset masks DATASET` projects the prior's mesh into every image and writes masks/. Look
+    at masks.png, which shows them, before you use them.
     """
     if action == "masks":
         _make_masks(path, prior or path / "prior")
@@ -44,13 +43,11 @@ def _make_masks(path: Path, prior: Path) -> None:
     from mgs.data.dataset import load_dataset
     from mgs.data.masks import SHEET, make_masks
     from mgs.prior.build import load_prior
-    from mgs.prior.photographs import supported
 
     loaded, known = load_dataset(path), load_prior(prior)
     console = Console()
     with working_in(path), progress_bar("masks", console) as progress:
-        near = None if known.cloud is None else supported(known.mesh, known.cloud)
-        made = make_masks(loaded, known.mesh, partial(progress, "masks"), near)
+        made = make_masks(loaded, known.mesh, partial(progress, "masks"))
     console.print(
         f"{path}: {len(made)} masks of {prior}; look at {path / SHEET} before you use them"
     )

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mgs.prior.segmentation import SegmentedCloud
     from mgs.prior.settings import PriorSettings
 
-FILES = ("prior.json", "mesh.ply", "points.ply", "cloud.ply", "prior.png")
+FILES = ("prior.json", "mesh.ply", "points.ply", "prior.png")
 """Names in a folder of this command."""
 
 WHY = {
@@ -95,7 +95,7 @@ def prior(
     its surface (Poisson). From points that came with the cameras: reconstruct the surface of those
     inside the masks or above the ground. From a hull: take the largest body inside all masks. Then
     spread samples evenly over the faces that some frame sees. Writes mesh.ply, points.ply,
-    prior.json, prior.png and, for a surface of points, cloud.ply.
+    prior.json and prior.png.
     """
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF

@@ -15,7 +15,7 @@ import numpy as np
 from plyfile import PlyData, PlyParseError
 
 from mgs.camera import Camera
-from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
+from mgs.data.clouds import SparseCloud, write_cloud
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame
 from mgs.data.lens import shrunk_to
@@ -42,9 +42,6 @@ from mgs.prior.surface import poisson_mesh, sample_surface, spread_first
 from mgs.prior.truth import error_to_truth
 from mgs.seeds import derive_seed
 
-CLOUD = "cloud.ply"
-"""File of a prior with the points that its surface was reconstructed from."""
-
 
 @dataclass(frozen=True, repr=False)
 class Prior:
@@ -59,7 +56,6 @@ class Prior:
     - backed: the first `backed` points, evenly spread, have a second Gaussian behind the surface
       (`mgs.prior.initial`).
     - up: unit vector that points upwards in the world.
-    - cloud: [M,3] points of the object, if the source is "points".
     """
 
     mesh: Mesh
@@ -70,7 +66,6 @@ class Prior:
     numbers: dict[str, Any]
     backed: int = 0
     up: Up = PLUS_Z
-    cloud: np.ndarray | None = None
 
     def __repr__(self) -> str:
         points, unit = len(self.points), self.numbers.get("unit", "m")
@@ -163,9 +158,7 @@ def prior_and_cloud(
         numbers["truth"] = error_to_truth(
             samples, spacing, mesh, truth, dataset.frames, segmented, settings.seed
         )
-    kept = segmented.rock_points if chosen == "points" and segmented is not None else None
-    backed = sampled["backed"]
-    prior = Prior(mesh, samples, normals, spacing, tolerance, numbers, backed, upward, kept)
+    prior = Prior(mesh, samples, normals, spacing, tolerance, numbers, sampled["backed"], upward)
     return prior, segmented
 
 
@@ -301,8 +294,7 @@ def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
 
 
 def save_prior(out: str | Path, prior: Prior) -> Path:
-    """Write mesh.ply, points.ply (x y z nx ny nz), prior.json and, if known, cloud.ply into a new
-    folder, and return it.
+    """Write mesh.ply, points.ply (x y z nx ny nz) and prior.json into a new folder, and return it.
 
     Raises InputError if the folder is not empty or cannot be written.
     """
@@ -312,8 +304,6 @@ def save_prior(out: str | Path, prior: Prior) -> Path:
     with atomic_path(out / "mesh.ply") as temporary:
         trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces, process=False).export(temporary)
     write_cloud(out / "points.ply", SparseCloud(prior.points, prior.normals))
-    if prior.cloud is not None:
-        write_cloud(out / CLOUD, SparseCloud(prior.cloud))
     write_json(out / "prior.json", prior.numbers)
     return out
 
@@ -360,5 +350,4 @@ def load_prior(folder: str | Path) -> Prior:
         )
     mesh = read_mesh(folder / "mesh.ply")
     points, normals = columns[:, :3], columns[:, 3:]
-    cloud = read_cloud(folder / CLOUD).points if (folder / CLOUD).is_file() else None
-    return Prior(mesh, points, normals, spacing, tolerance, numbers, backed, up, cloud)
+    return Prior(mesh, points, normals, spacing, tolerance, numbers, backed, up)

@@ -201,14 +201,6 @@ def _back_of(points: np.ndarray, normals: np.ndarray, spacing: float) -> Plane |
     return Plane(axis, float((points @ axis).min()) - spacing, 0.0, spacing)
 
 
-def supported(mesh: Mesh, points: np.ndarray) -> Mesh | None:
-    """Faces of a mesh within a spacing of the points [M,3] it was reconstructed from; None if there
-    are none."""
-    centres = mesh.vertices[mesh.faces].mean(1)
-    near = cKDTree(points).query(centres)[0] < spacing_of(points)
-    return Mesh(mesh.vertices, mesh.faces[near], mesh.seen[near]) if near.any() else None
-
-
 def _thinned(mesh: Mesh, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Points of a mesh about `spacing` apart, and their unit normals, [M,3]."""
     points, index = voxel_means(mesh.vertices, spacing)
