@@ -43,10 +43,12 @@ NOWHERE = np.zeros((0, 3))
 FALLING = (1.0, 0.5, 0.3, 0.25, 0.249, 0.248)
 
 
-def indicators(views=(GOOD,) * 4, losses=FALLING, coverage=0.95, gains=(0.5, 0.4), drift=0.0):
+def indicators(
+    views=(GOOD,) * 4, losses=FALLING, coverage=0.95, gains=(0.5, 0.4), drift=0.0, last=True
+):
     angles = 2 * np.pi * np.arange(len(views)) / len(views)
     ring = np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
-    return step_indicators(list(views), ring, list(losses), coverage, list(gains), drift)
+    return step_indicators(list(views), ring, list(losses), coverage, list(gains), drift, last)
 
 
 def one_bad(**changes) -> tuple[ViewIndicators, ...]:
@@ -101,6 +103,14 @@ def test_signs_that_a_step_cannot_have_are_left_out():
 @pytest.mark.parametrize("views", [1, 3, 4])
 def test_coverage_is_expected_of_four_views_and_more(views):
     assert bool(alarms(indicators(views=(GOOD,) * views, coverage=0.7))) == (views == 4)
+
+
+@pytest.mark.parametrize("last", [False, True])
+@pytest.mark.parametrize("views", [7, 8])
+def test_few_views_need_not_fit_well_while_more_are_to_come(views, last):
+    bad = (replace(GOOD, unexplained=0.9),) * views
+    said = alarms(indicators(bad, coverage=0.5, last=last))
+    assert len(said) == (2 if last or views == 8 else 0)
 
 
 def test_the_outline_is_the_share_of_pixels_that_disagree_by_more_than_the_margin():

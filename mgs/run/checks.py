@@ -108,8 +108,9 @@ class Checks:
         if std and problem.settings.train.density == "fixed":
             drift = detectors.means_drift(fit.gaussians.means, start.means, std)
         positions = problem.positions[learned.taken]
+        last = len(learned.taken) >= problem.settings.seeds + problem.settings.budget
         indicators = detectors.step_indicators(
-            views, positions, fit.losses, coverage, scores, drift
+            views, positions, fit.losses, coverage, scores, drift, last
         )
         if start.opacities.max() < 0.5:  # random points: no surface to compare with
             for name in ("prior", "pose", "coverage"):

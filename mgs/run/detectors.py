@@ -34,6 +34,10 @@ NEIGHBOURS = 3
 COVERING_VIEWS = 4
 """Fewest views of which a good coverage can be expected."""
 
+MANY_VIEWS = 8
+"""Views from which on a good fit and coverage are expected even if more are to come. A chosen
+constant."""
+
 
 @dataclass(frozen=True)
 class Before:
@@ -149,12 +153,13 @@ def step_indicators(
     coverage: float,
     gains: Sequence[float],
     drift: float,
+    last: bool = True,
 ) -> dict[str, float]:
     """Numbers of a step by the names in DETECTORS, without those that it cannot tell.
 
     views: all taken. positions: of their cameras [V,3]. losses: of the start of the fit, then of
     each pass. coverage: Eq. 9, 0 to 1. gains: information gain of every view chosen so far, in
-    order. drift: of `means_drift`.
+    order. drift: of `means_drift`. last: whether no views are to come.
     """
     indicators = {"means": drift}
     if len(losses) >= 2 and min(losses) > 0 and np.isfinite(losses).all():
@@ -163,12 +168,13 @@ def step_indicators(
         indicators["unconverged"] = float(1 - (lowest[-1] / lowest[-1 - window]) ** (1 / window))
         indicators["worse"] = min(losses[1:]) / losses[0] - 1
     if views:
-        indicators["residual"] = float(np.median([view.unexplained for view in views]))
+        if last or len(views) >= MANY_VIEWS:
+            indicators["residual"] = float(np.median([view.unexplained for view in views]))
+            if len(views) >= COVERING_VIEWS:
+                indicators["coverage"] = 1 - coverage
         indicators["prior"] = float(np.median([view.before.outline for view in views]))
         indicators["exposure"] = _exposure(np.array([view.ratios for view in views]))
         indicators["pose"] = max(view.before.offset for view in views)
-        if len(views) >= COVERING_VIEWS:
-            indicators["coverage"] = 1 - coverage
         if len(views) > NEIGHBOURS:
             errors = np.sqrt([view.srgb_error for view in views])
             indicators["outlier"] = _outlier(errors, positions)
