@@ -12,7 +12,7 @@ def main() -> None:
     only."""
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for products of 3x3, threads only wait
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # products are small: threads only wait
     try:
         from mgs.cli.app import main as run
 

@@ -108,7 +108,7 @@ class Checks:
         if std and problem.settings.train.density == "fixed":
             drift = detectors.means_drift(fit.gaussians.means, start.means, std)
         positions = problem.positions[learned.taken]
-        last = len(learned.taken) >= problem.settings.seeds + problem.settings.budget
+        last = problem.views_left(learned.taken) <= 0
         indicators = detectors.step_indicators(
             views, positions, fit.losses, coverage, scores, drift, last
         )

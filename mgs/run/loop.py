@@ -147,7 +147,7 @@ def choose_batch(
     """
     settings, choices = problem.settings, list[Choice]()
     fisher = problem.view_information(state.gaussians)
-    left = settings.budget - (len(state.taken) - settings.seeds)
+    left = problem.views_left(state.taken)
     planned = state
     for _ in range(min(settings.batch, left)):
         if not problem.reachable(planned.taken):

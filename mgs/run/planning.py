@@ -82,7 +82,7 @@ def plan_flight(
         planned, scores[frame] = with_view(problem, planned, frame, fisher(frame)), score
         return frame, score
 
-    most, ends = views_left(problem, state.taken), [state.taken[-1], problem.flight.home]
+    most, ends = problem.views_left(state.taken), [state.taken[-1], problem.flight.home]
     share = problem.flight.share_from(state.taken, most)
     free = problem.reachable(state.taken)
     way, _ = tour.grown(problem.flight.legs, ends, free, pick, share, 1 / most)
@@ -106,7 +106,7 @@ def planned_flight(problem: Problem, taken: Sequence[int]) -> list[int]:
                 return []
             problem.progress("planning the flight", 0, 1)
             gains.take(start)
-            most = views_left(problem, start)
+            most = problem.views_left(start)
             ends, share = [start[-1], flight.home], flight.share_from(start, most)
             way = tour.planned_tour(flight.legs, ends, key[1], gains, share, 1 / most)
             flight.tours[key] = way[1:-1]
@@ -114,8 +114,3 @@ def planned_flight(problem: Problem, taken: Sequence[int]) -> list[int]:
         if plan[: len(done)] == done and plan[len(done) :]:
             return plan[len(done) :]
     return []
-
-
-def views_left(problem: Problem, taken: Sequence[int]) -> int:
-    """Number of views that the budget has left."""
-    return problem.settings.budget - (len(taken) - problem.settings.seeds)

@@ -212,14 +212,18 @@ class Problem:
             return Deferred(taken, self.image)
         return Deferred(range(len(taken)), lambda k: without_gain(self.image(taken[k]), gains[k]))
 
+    def views_left(self, taken: Sequence[int]) -> int:
+        """Number of views that the budget has left."""
+        return self.settings.budget - (len(taken) - self.settings.seeds)
+
     def free(self, taken: Sequence[int]) -> list[int]:
         """Frames that are allowed, and not taken or given up."""
         may = [self.allowed[i] and not frame.given_up for i, frame in enumerate(self.frames)]
         return [i for i in range(len(self.frames)) if may[i] and i not in taken]
 
     def reachable(self, taken: Sequence[int]) -> list[int]:
-        """Those of `free` within the flight's limits; with the setting `nearest`, that many nearest
-        to the last view."""
+        """Frames of `free` within the flight's limits; with the setting `nearest`, that many
+        nearest to the last view."""
         left = self.free(taken)
         if self.settings.flies:
             left = self.flight.in_reach(taken, left)
@@ -242,8 +246,8 @@ class Problem:
         if model is None or settings.travel or settings.flies:
             return left
         for start in (taken[: settings.seeds], taken):
-            count = settings.budget - (len(start) - settings.seeds)
-            known, done = (tuple(start), tuple(self.free(start)), count), list(taken[len(start) :])
+            known = tuple(start), tuple(self.free(start)), self.views_left(start)
+            done = list(taken[len(start) :])
             if settings.nearest:
                 path = self.visibility.path(*known, settings.nearest, model)
                 if path[: len(done)] == done and path[len(done) :]:

@@ -166,8 +166,8 @@ def _sums(
     normals: np.ndarray | None,
     alpha_weight: float,
 ) -> tuple[Moments, Any, Any, list[ByMean]]:
-    """Sums of `kernels.fisher`, camera and splats of which `geometry` is made, and derivatives by
-    the means. means, normals, alpha_weight: as in `exact`."""
+    """Sums of `kernels.fisher`, the camera and splats for `geometry`, and derivatives by the means.
+    means, normals, alpha_weight: as in `exact`."""
     device = camera_array(camera)
     splats, lists, packed = splats_and_lists(gaussians, camera, cache)
     moving = means != "frozen"

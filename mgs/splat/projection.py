@@ -88,7 +88,7 @@ def camera_array(camera: Camera) -> Any:
     ]
     pose = camera.world_to_camera
     numbers = [*pose[:3, :3].ravel(), *pose[:3, 3], fx, fy, cx, cy, *clamp, *camera.position]
-    # Not of NumPy, whose memory is freed by a thread that waits for Python before the next kernel.
+    # A list: Dr.Jit frees NumPy arrays between kernels, on a thread that waits for Python's lock.
     return mi.Float64([float(number) for number in numbers])
 
 
