@@ -38,7 +38,7 @@ from mgs.run.prediction import predicted_psnr
 from mgs.splat import as_drjit, render
 
 FITS = Before(outline=0.001, offset=0.01)
-GOOD = ViewIndicators(FITS, 0.05, 0.02, srgb_error=1e-3, ratios=(-0.08, 0.0, 0.08))
+GOOD = ViewIndicators(FITS, 0.05, 0.02, 1e-3, ratios=(-0.08, 0.0, 0.08), pixels=2000)
 NOWHERE = np.zeros((0, 3))
 FALLING = (1.0, 0.5, 0.3, 0.25, 0.249, 0.248)
 
@@ -65,7 +65,7 @@ BAD = {
         {"views": (GOOD, GOOD, GOOD, replace(GOOD, ratios=(-0.21, -0.13, -0.05)))},
         "by 50 % of",
     ),
-    "pose": ({"views": one_bad(offset=0.2)}, "20.0 % of the rock's size"),
+    "pose": ({"views": one_bad(offset=0.3)}, "10.0 times farther apart"),
     "outlier": ({"views": (GOOD, GOOD, GOOD, replace(GOOD, srgb_error=0.1))}, "10.0 times"),
     "means": ({"drift": 5.0}, "5.0 standard deviations"),
     "coverage": ({"coverage": 0.2}, "only 20 %"),
@@ -133,6 +133,29 @@ def test_views_that_are_hard_to_fit_are_no_outliers_beside_others_of_their_side(
     assert indicators(views)["outlier"] == pytest.approx(4)
 
 
+FAR = replace(GOOD, unexplained=0.5, srgb_error=9e-3, ratios=(-0.18, -0.1, -0.02), pixels=200)
+
+
+def test_views_of_few_pixels_may_fit_worse_and_one_wrong_view_among_them_is_found():
+    views, alike = [GOOD] * 8 + [FAR] * 4, indicators([GOOD] * 12)
+    mixed = indicators(views)
+    for name in ("outlier", "exposure"):
+        assert mixed[name] == pytest.approx(alike[name], abs=1e-9)
+    assert mixed["residual"] == pytest.approx(0.05)
+    for k in (0, 8):
+        ratios = tuple(ratio + 0.26 for ratio in views[k].ratios)
+        wrong = replace(views[k], srgb_error=9 * views[k].srgb_error, ratios=ratios)
+        found = indicators([*views[:k], wrong, *views[k + 1 :]])
+        assert found["outlier"] == pytest.approx(3)
+        assert found["exposure"] == pytest.approx(1)
+
+
+def test_a_prior_need_not_be_better_than_a_pixel_of_the_farthest_views():
+    apart = replace(GOOD, before=replace(FITS, offset=0.06))
+    assert indicators([apart, GOOD, GOOD, FAR])["pose"] == pytest.approx(2), "one far view"
+    assert indicators([apart, GOOD, FAR, FAR])["pose"] == pytest.approx(0.06 * 200**0.5)
+
+
 def test_an_exposure_shifts_all_pixels_and_a_highlight_some():
     rng = np.random.default_rng(0)
     model = rng.uniform(0.1, 0.5, (30, 40, 1)) * np.ones(3)
@@ -175,7 +198,8 @@ def test_a_perfect_render_explains_all_and_a_single_colour_nothing():
     assert flat.error == pytest.approx(truth.std(axis=(0, 1)).mean(), rel=0.05)
     unlike = srgb_from_linear(truth) - srgb_from_linear(truth.mean((0, 1)))
     assert flat.srgb_error == pytest.approx(np.mean(unlike**2), rel=1e-5)
-    assert view_indicators(target, mask, truth, FITS) == ViewIndicators(FITS, 0.0, 0.0)
+    perfect = ViewIndicators(FITS, 0.0, 0.0, pixels=48)
+    assert view_indicators(target, mask, truth, FITS) == perfect
     assert view_indicators(target, ~mask, truth, FITS) == ViewIndicators(FITS, 0.0, 0.0)
 
 

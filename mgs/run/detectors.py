@@ -31,12 +31,18 @@ residual has no exposure to report."""
 NEIGHBOURS = 3
 """Number of nearest views with which a view's error is compared."""
 
+CLOSER = 2.0
+"""Ratio of pixels from which on views count as taken from different distances."""
+
+OFFSET = 0.03
+"""Largest offset of a view that is right, unless the farthest views have larger pixels."""
+
 COVERING_VIEWS = 4
 """Fewest views of which a good coverage can be expected."""
 
 MANY_VIEWS = 8
-"""Views from which on a good fit and coverage are expected even if more are to come. A chosen
-constant."""
+"""Views from which on a good fit, equal exposures and coverage are expected even if more are to
+come. A chosen constant."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +65,7 @@ class ViewIndicators:
     unexplained: mean squared error in the mask over the variance of the image there: 0 is a perfect
     fit, 1 a single colour. error: root of that mean squared error, linear RGB. srgb_error: mean
     squared error of sRGB values in the mask. ratios: quantiles (RATIO_QUANTILES) of the log ratio
-    of the image's brightness to the render's, over the mask.
+    of the image's brightness to the render's, over the mask. pixels: number compared, or 1.
     """
 
     before: Before
@@ -67,6 +73,7 @@ class ViewIndicators:
     error: float
     srgb_error: float = 0.0
     ratios: tuple[float, ...] = (0.0, 0.0, 0.0)
+    pixels: int = 1
 
 
 def before_fit(mask: np.ndarray, alpha: np.ndarray, margin: int) -> Before:
@@ -120,7 +127,28 @@ def view_indicators(
     brightness = np.log(truth.mean(axis=1) + DARK) - np.log(drawn.mean(axis=1) + DARK)
     ratios = tuple(np.quantile(brightness, RATIO_QUANTILES).tolist())
     srgb = float(np.mean(np.square(srgb_from_linear(truth) - srgb_from_linear(drawn))))
-    return ViewIndicators(before, squared / max(variance, 1e-12), squared**0.5, srgb, ratios)
+    unexplained, pixels = squared / max(variance, 1e-12), int(counted.sum())
+    return ViewIndicators(before, unexplained, squared**0.5, srgb, ratios, pixels)
+
+
+def _trend(values: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Part of the views' values [V] that is proportional to the logarithm of their pixels [V].
+
+    Far views fit worse. The slope is the median of those between all near and far views (CLOSER),
+    and 0 if there are none, so that one wrong view hardly changes it.
+    """
+    logs = np.log(pixels)
+    near, far = np.nonzero(logs[:, None] - logs >= math.log(CLOSER))
+    if not len(near):
+        return np.zeros(len(values))
+    return np.median((values[near] - values[far]) / (logs[near] - logs[far])) * logs
+
+
+def _median(values: np.ndarray, pixels: np.ndarray) -> float:
+    """Median of the views' values [V], weighted by their pixels [V]."""
+    order = np.argsort(values)
+    below = np.cumsum(pixels[order]) - pixels[order] / 2
+    return float(np.interp(pixels.sum() / 2, below, values[order]))
 
 
 def _exposure(ratios: np.ndarray) -> float:
@@ -168,15 +196,21 @@ def step_indicators(
         indicators["unconverged"] = float(1 - (lowest[-1] / lowest[-1 - window]) ** (1 / window))
         indicators["worse"] = min(losses[1:]) / losses[0] - 1
     if views:
+        pixels = np.array([view.pixels for view in views])
         if last or len(views) >= MANY_VIEWS:
-            indicators["residual"] = float(np.median([view.unexplained for view in views]))
+            unexplained = np.array([view.unexplained for view in views])
+            indicators["residual"] = _median(unexplained, pixels)
+            ratios = np.array([view.ratios for view in views])
+            indicators["exposure"] = _exposure(ratios - _trend(ratios[:, 1], pixels)[:, None])
             if len(views) >= COVERING_VIEWS:
                 indicators["coverage"] = 1 - coverage
         indicators["prior"] = float(np.median([view.before.outline for view in views]))
-        indicators["exposure"] = _exposure(np.array([view.ratios for view in views]))
-        indicators["pose"] = max(view.before.offset for view in views)
+        # The second fewest pixels, because the fewest may be those of a wrong mask.
+        pixel = float(np.sort(pixels)[:2][-1]) ** -0.5
+        indicators["pose"] = max(view.before.offset for view in views) / max(OFFSET, pixel)
         if len(views) > NEIGHBOURS:
-            errors = np.sqrt([view.srgb_error for view in views])
+            errors = np.log([max(view.srgb_error, 1e-24) for view in views]) / 2
+            errors = np.exp(errors - _trend(errors, pixels))
             indicators["outlier"] = _outlier(errors, positions)
     if len(gains) >= 2 and max(gains) > 0:
         indicators["saturated"] = 1 - gains[-1] / max(gains)
@@ -218,17 +252,17 @@ DETECTORS: dict[str, Detector] = {
         ),
     ),
     "prior": Detector(
-        0.005,
+        0.006,
         lambda v, limit: (
             f"the prior's outline and the masks disagree in {percent(v, 1)} of the covered pixels "
             f"of the median view (limit {percent(limit, 1)}); check prior, masks and poses"
         ),
     ),
     "residual": Detector(
-        0.15,
+        0.145,
         lambda v, limit: (
             f"the fit leaves {percent(v)} of the images' variance inside the masks unexplained "
-            f"in the median view (limit {percent(limit)}); check poses and masks, or give more "
+            f"in the median view (limit {percent(limit, 1)}); check poses and masks, or give more "
             "Gaussians"
         ),
     ),
@@ -241,10 +275,11 @@ DETECTORS: dict[str, Detector] = {
         ),
     ),
     "pose": Detector(
-        0.03,
+        1.0,  # good runs: up to 0.96
         lambda v, limit: (
-            f"in one view, prior and mask are {percent(v, 1)} of the rock's size apart "
-            f"(limit {percent(limit, 1)}); check its pose, its mask, and the prior"
+            f"in one view, prior and mask are {v:.1f} times farther apart than the limit, "
+            f"{percent(OFFSET)} of the rock's size or a pixel of the farthest views; "
+            "check its pose, its mask, and the prior"
         ),
     ),
     "outlier": Detector(
