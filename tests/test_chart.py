@@ -225,7 +225,9 @@ def test_photographs_are_charted_beside_another_program(dataset, tmp_path, capsy
         peer.write_text("cpu_seconds,psnr\n1,20\n")
         said = refused(capsys, ["chart", out, "--dataset", dataset, *option], out)
         assert f"{option[0]}: is of photographs alone" in said
-    peer.write_text("cpu_seconds,step,psnr\n0.5,9,20\n2,50,21.5\n")
+    peer.write_text("cpu_seconds,dataset,psnr\n0.5,third,20\n")
+    assert "third is not charted" in refused(capsys, [*charted, "--peer", peer], out)
+    peer.write_text("cpu_seconds,step,psnr,dataset\n0.5,9,20,\n2,50,21.5,second\n")
     second = Path(shutil.copytree(dataset, tmp_path / "second"))
     charted += ["--dataset", second]
     namesake = shutil.copytree(dataset, tmp_path / "other" / "second")
@@ -240,7 +242,7 @@ def test_photographs_are_charted_beside_another_program(dataset, tmp_path, capsy
     assert all(row["cpu_seconds"] > 0 and row["psnr"] > 5 for row in ours)
     assert others == [
         {"dataset": dataset.name, "program": "other", "cpu_seconds": 0.5, "psnr": 20},
-        {"dataset": dataset.name, "program": "other", "cpu_seconds": 2, "psnr": 21.5},
+        {"dataset": "second", "program": "other", "cpu_seconds": 2, "psnr": 21.5},
     ]
     assert parsed(record["command"])["peer"] == [peer]
     assert all(parsed(row["command"])["passes"] == row["passes"] for row in ours)

@@ -204,8 +204,8 @@ def chart(
     peer: Annotated[
         list[Path] | None,
         option(
-            "CSV of another program on the first dataset of photographs: `cpu_seconds`, `psnr`; "
-            "repeat for more."
+            "CSV of another program on photographs: `cpu_seconds`, `psnr` and, if not of the first "
+            "dataset, `dataset`; repeat for more."
         ),
     ] = None,
 ) -> None:
@@ -221,8 +221,6 @@ def chart(
 
     kinds = names_of(only or ",".join(KINDS), (*KINDS, NAME))
     counts = [parse_gaussians(count) or "auto" for count in gaussians or ["auto"]]
-    for file in peer or []:
-        read_peer(file)
     datasets = dataset or []
     for folder in datasets:
         check_dataset(folder)
@@ -235,6 +233,8 @@ def chart(
         raise InputError(f"--only {NAME}: needs photographs; give --dataset DATASET")
     if kinds != [NAME] and len(datasets) > 1:
         raise InputError(f"--dataset: only --only {NAME} takes more than one")
+    for file in peer or []:
+        read_peer(file, [folder.absolute().name for folder in datasets])
     with _study(out, SIZES, preset) as (_, console, report):
         if NAME in kinds:
             kinds.remove(NAME)

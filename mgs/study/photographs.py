@@ -52,11 +52,12 @@ def measure(root: Path, out: Path, dataset: str, gaussians: Any, passes: int) ->
     return seconds | found | {"gaussians": len(model)}
 
 
-def read_peer(file: Path) -> list[Row]:
+def read_peer(file: Path, datasets: Sequence[str]) -> list[Row]:
     """Read the rows of another program, which is named as its file.
 
     The file is a CSV with the columns `cpu_seconds` and `psnr`, dB on the test views. The others of
-    NUMBERS are optional. Raises InputError for other contents.
+    NUMBERS are optional, and `dataset`, one of these names: by default the first. Raises InputError
+    for other contents.
     """
     with reading(file):
         lines = list(
@@ -70,7 +71,13 @@ def read_peer(file: Path) -> list[Row]:
     except (KeyError, TypeError, ValueError):
         columns = "a column `cpu_seconds` and one `psnr`, positive numbers"
         raise InputError(f"{file}: needs {columns}, one row or more; correct it") from None
-    return [{"program": file.stem} | row for row in numbers]
+    about = [
+        {"dataset": line.get("dataset") or datasets[0], "program": file.stem} for line in lines
+    ]
+    if unknown := [row["dataset"] for row in about if row["dataset"] not in datasets]:
+        known = ", ".join(datasets)
+        raise InputError(f"{file}: dataset {unknown[0]} is not charted; choose of {known}")
+    return [names | row for names, row in zip(about, numbers, strict=True)]
 
 
 def chart_photographs(
@@ -84,7 +91,7 @@ def chart_photographs(
     """Time fits of PASSES of each dataset with each number of Gaussians, and write photographs.csv,
     .json, .md and .png. Returns the rows.
 
-    datasets: of different names. peers: files of other programs on the first one (`read_peer`).
+    datasets: of different names. peers: files of other programs (`read_peer`).
     """
     names = [dataset.absolute().name for dataset in datasets]
     asked = [
@@ -110,7 +117,7 @@ def chart_photographs(
         program = f"mgs, {result['gaussians']:,} Gaussians"
         about = {"dataset": dataset.absolute().name, "program": program, "passes": passes}
         rows.append(about | result | {"command": shlex.join([*words, "--out", "RUN"])})
-    rows += [{"dataset": names[0]} | row for file in peers for row in read_peer(file)]
+    rows += [row for file in peers for row in read_peer(file, names)]
     words = ["mgs", "chart", str(out), "--only", NAME, "--scale", preset]
     words += [word for dataset in datasets for word in ("--dataset", str(dataset))]
     words += [word for count in gaussians for word in ("--gaussians", str(count))]
