@@ -24,8 +24,8 @@ from mgs.fit.stopping import StopReason
 from mgs.policy import criteria
 from mgs.policy.poses import POSE_POLICIES
 from mgs.policy.registry import policy_names
+from mgs.run import ending, loop
 from mgs.run import folder as run_folder
-from mgs.run import loop
 from mgs.splat_ply import read_ply
 
 
@@ -266,6 +266,18 @@ def test_a_fit_that_diverges_ends_the_run_which_can_go_on(
     whole = run(tmp_path / "whole", dataset, batch=batch)
     assert resume(out, dataset).taken == whole.taken
     assert (out / "gaussians.ply").read_bytes() == (tmp_path / "whole/gaussians.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("losses", "cure"),
+    [
+        ([0.01, 0.02], "; raise `train.passes`, or lower"),
+        ([0.01, math.nan], "passes; lower"),
+        ([0.01] + 5 * [0.02], "passes; lower"),
+    ],
+)
+def test_a_short_fit_that_diverges_may_need_more_passes(losses, cure):
+    assert cure in ending.diverged(Path("run"), 0, 0, losses)
 
 
 @pytest.mark.parametrize("batch", [1, 2])

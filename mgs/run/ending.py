@@ -8,6 +8,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mgs.fit.stopping import DIVERGED_PASSES
 from mgs.policy.criteria import GAIN_UNIT
 
 if TYPE_CHECKING:
@@ -31,9 +32,12 @@ def diverged(out: Path, step: int, kept: int, losses: Sequence[float]) -> str:
     fit = "the fit to the seeds" if step == 0 else f"the fit of step {step}"
     left = {0: "", 1: "; step 0 is kept"}.get(kept, f"; steps 0 to {kept - 1} are kept")
     rates = "`train.rates`" if step == 0 else "`warm_rate` or `train.rates`"
+    longer = "`train.passes`" if step == 0 else "`warm_passes`"
+    short = len(passes) < DIVERGED_PASSES and math.isfinite(losses[-1])
+    more = f"raise {longer}, or " if short else ""
     return (
         f"{out}: {fit} diverged: its loss was {first} at the start, and {', '.join(passes[-3:])} "
-        f"in the last passes; lower the learning rates ({rates} in {out / 'config.json'}) "
+        f"in the last passes; {more}lower the learning rates ({rates} in {out / 'config.json'}) "
         f"and go on with `mgs nbv --resume {out}`{left}"
     )
 
