@@ -21,6 +21,7 @@ from mgs.prior.exposure import DARK, GAIN_STD, RATIO_STD, SATURATED, solve_gains
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate_run
 from mgs.report.tables import markdown_table
+from mgs.run.detectors import DETECTORS
 from mgs.run.folder import State, read_checkpoint
 from mgs.run.nbv import resume_nbv, run_nbv
 
@@ -178,12 +179,10 @@ def test_a_fit_with_gains_is_nearly_as_good_as_one_of_constant_exposure_and_with
     assert not any("corrected" in key for key in runs["constant"][0].steps[-1])
 
 
-def test_the_alarm_of_exposure_is_silent_where_gains_explain_it(runs):
-    alarmed = {}
-    for name, (state, _) in runs.items():
-        warnings = [warning for line in state.steps for warning in line.get("warnings", [])]
-        alarmed[name] = any("exposure drifts" in warning for warning in warnings)
-    assert alarmed == {"constant": False, "without": True, "with": False}
+def test_the_indicator_of_exposure_is_low_where_gains_explain_it(runs):
+    last = {name: state.steps[-1]["indicators"]["exposure"] for name, (state, _) in runs.items()}
+    limit = DETECTORS["exposure"].limit
+    assert max(last["constant"], last["with"]) < limit / 2 < last["without"]
 
 
 def test_an_interrupted_run_goes_on_bit_for_bit(varied, runs, tmp_path):
