@@ -205,6 +205,22 @@ def test_depth_of_a_mesh_that_comes_within_a_micrometre_of_the_camera_plane():
     assert np.allclose(found, np.broadcast_to(0.5 / (1 - slope), (480, 640)), rtol=1e-5)
 
 
+def test_prior_of_mixed_distances_is_as_fine_as_that_of_the_nearest(built, tmp_path):
+    """Two in three cameras are two and three times as far away."""
+    cameras = synthetic.orbit_cameras(12, 96, 72)
+    for k, camera in enumerate(cameras):
+        eye = synthetic.CENTRE + (1 + k % 3) * (camera.position - synthetic.CENTRE)
+        cameras[k] = Camera(camera.K, 96, 72, look_at(eye, synthetic.CENTRE))
+    dataset = synthetic.write_dataset(tmp_path, cameras)
+    prior, rock = prior_and_cloud(dataset, PriorSettings(gaussians=1500, backing=0))
+    voxel = built[1].cloud.voxel
+    assert rock.cloud.voxel == pytest.approx(voxel, rel=0.1)
+    truth = prior.numbers["truth"]
+    assert truth["accuracy"] < 0.2 * voxel
+    assert truth["completeness"] < 0.2 * voxel
+    assert truth["visible_within_2_spacing"] == 1
+
+
 def test_prior_is_near_the_truth(built):
     prior, rock = built
     numbers, voxel = prior.numbers, rock.cloud.voxel

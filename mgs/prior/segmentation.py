@@ -133,21 +133,24 @@ def rock_cluster(
     target: np.ndarray,
     name: str = "cloud",
     weight: Callable[[np.ndarray], np.ndarray] = lambda points: np.ones(len(points)),
+    sparse: float = 0.0,
 ) -> tuple[np.ndarray, float, int]:
     """Find the rock among points above the ground [N,3], by DBSCAN (Ester et al. 1996,
     scikit-learn).
 
     voxel: distance between neighbours, metres. target: [3] point that the cameras look at, metres.
-    name: of the cloud, for messages. weight: points [N,3] -> weights [N]. The rock is the cluster
-    of largest weight, or of several nearly as large ones (EQUAL_SIZE) the nearest to the target.
-    Returns (inside [N] bool, eps in metres, number of clusters). Raises InputError if there is no
-    cluster, or two are equally large and about equally near.
+    name: of the cloud, for messages. weight: points [N,3] -> weights [N]. sparse: distance between
+    neighbours where the cloud is sparse, metres; DBSCAN sees no finer points, since it takes one
+    density for all. The rock is the cluster of largest weight, or of several nearly as large ones
+    (EQUAL_SIZE) the nearest to the target. Returns (inside [N] bool, eps in metres, number of
+    clusters). Raises InputError if there is no cluster, or two are equally large and about equally
+    near.
     """
     from sklearn.cluster import DBSCAN
 
     thin, cell = points, voxel
-    while len(thin) > CLUSTER_POINTS:
-        cell *= 1.25
+    while cell < sparse or len(thin) > CLUSTER_POINTS:
+        cell = max(1.25 * cell, sparse)
         thin = voxel_means(points, cell)[0]
     if len(thin) <= CLUSTER_NEIGHBOURS:
         raise InputError(
@@ -251,7 +254,7 @@ def segment_dataset(
         return height * (mask_share(points, dataset.frames)[0] if masked else 1)
 
     inside, eps, clusters = rock_cluster(
-        cloud.points[above], cloud.voxel, target, str(dataset.root), weight
+        cloud.points[above], cloud.voxel, target, str(dataset.root), weight, cloud.sparse
     )
     points, views = cloud.points[above][inside], cloud.views[above][inside]
     rng = generator(settings.seed, "prior/degrade")

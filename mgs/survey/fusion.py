@@ -24,6 +24,10 @@ REACH = 1.0
 """Radius of the cloud around the focus, over the cameras' distance from it. The ground farther away
 says nothing of the ground under the rock."""
 
+ALIKE = 1.25
+"""Largest ratio of a frame's pixel on the rock to the lower quartile of all for one of the nearest
+frames: all frames, if their distances are alike."""
+
 FILTERED_SHARE = 0.5
 """Noise left by the bilateral filter, over the noise before; measured 0.27, with a margin."""
 
@@ -35,6 +39,7 @@ class Cloud:
     points: [N,3] world, metres. views: [N,3] unit, mean direction to the cameras that saw each
     point. voxel: cell of the grid, metres, about the distance between neighbours. noise: standard
     deviation of the measured depths before filtering, metres. pixels: number of fused depths.
+    sparse: distance between neighbours where only far cameras look, metres.
     """
 
     points: np.ndarray
@@ -42,6 +47,7 @@ class Cloud:
     voxel: float
     noise: float
     pixels: int
+    sparse: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -84,9 +90,10 @@ def usable_depth(depth: np.ndarray, size: int = 3) -> np.ndarray:
 def fuse_frames(frames: Sequence[Frame]) -> Cloud:
     """Fuse the depth images of frames into one cloud, averaged on a grid.
 
-    A cell is as large as a pixel on the rock, or larger if the depths are noisy. With `depth_noise`
-    over a quarter of a cell, the images are smoothed first by `filter_depth`. Raises InputError if
-    a frame has no depth image or cannot be read, or no depth can be used.
+    A cell is as large as a pixel of the nearest frames on the rock, or larger if the depths are
+    noisy. With `depth_noise` over a quarter of a cell, the images are smoothed first by
+    `filter_depth`. Raises InputError if a frame has no depth image or cannot be read, or no depth
+    can be used.
     """
     depths = [frame.depth() for frame in frames]
     returns = [depth[depth > 0] for depth in depths]
@@ -98,11 +105,9 @@ def fuse_frames(frames: Sequence[Frame]) -> Cloud:
         )
     stride = max(1, int(np.ceil(np.sqrt(total / MAX_FUSED_PIXELS))))
     # The lower quartile of depths is about that of the rock; most of a frame is ground behind it.
-    near = [
-        np.quantile(z, 0.25) / frame.camera.K[0, 0]
-        for frame, z in zip(frames, returns, strict=True)
-        if len(z)
-    ]
+    focal = [frame.camera.K[0, 0] for frame in frames]
+    pixels = [np.quantile(z, 0.25) / f for f, z in zip(focal, returns, strict=True) if len(z)]
+    near = [p for p in pixels if p <= ALIKE * np.quantile(pixels, 0.25)]
     noise = float(np.median([depth_noise(depth) for depth in depths]))
     voxel = max(float(np.median(near)), FILTERED_SHARE * noise)
     target = focus(frames)
@@ -124,7 +129,8 @@ def fuse_frames(frames: Sequence[Frame]) -> Cloud:
         )
     view = _group_means(np.concatenate(views), index, len(p))
     norm = np.linalg.norm(view, axis=1, keepdims=True)
-    return Cloud(p, view / np.where(norm > 0, norm, 1.0), voxel, noise, len(index))
+    unit = view / np.where(norm > 0, norm, 1.0)
+    return Cloud(p, unit, voxel, noise, len(index), float(np.median(pixels)))
 
 
 def _group_means(values: np.ndarray, index: np.ndarray, groups: int) -> np.ndarray:
