@@ -146,7 +146,7 @@ def nbv(
     """Choose the next best views: fit to a few seed views, choose a view, read its image, fit
     again.
 
-    Ends when the budget is spent, or earlier by --stop-gain or --stop-uncertainty. Writes
+    Ends when the budget is spent, or earlier by a --stop option or a limit of the flight. Writes
     config.json, steps.jsonl (a line for each view), checkpoint.npz, gaussians.ply and metrics.json
     into the run folder. An interrupted run continues with --resume and chooses the same views.
     """
