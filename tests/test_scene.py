@@ -87,7 +87,7 @@ def ball():
 def test_the_image_is_that_of_the_inner_integrator_and_the_rock_a_part_of_it(ball):
     scene, _ = ball
     aov = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
-    for integrator, inner, spp in ((scene.path, scene.path.inner, 5), (scene.guides, aov, 8)):
+    for integrator, inner, spp in ((scene.path, scene.path.inner, 6), (scene.guides, aov, 8)):
         image, rock, share = render_layers(scene.scene, integrator, spp, seed=4)
         alone = np.array(mi.render(scene.scene, integrator=inner, spp=spp, seed=4))
         np.testing.assert_array_equal(image[..., -alone.shape[-1] :], alone)

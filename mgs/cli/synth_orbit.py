@@ -52,7 +52,8 @@ def synth_orbit(
         str, option("quick: 32 frames of 320x240. paper: 100 frames of 640x480.", "--scale")
     ] = "quick",
     spp: Annotated[
-        int | None, option("Samples per pixel. Default: as --scale says.", min=1)
+        int | None,
+        option("Samples per pixel, rounded up to a full grid. Default: as --scale says.", min=1),
     ] = None,
     frames: Annotated[
         int | None, option("Number of views on the orbit. Default: as --scale says.", min=1)

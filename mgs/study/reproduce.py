@@ -100,7 +100,7 @@ SIZES = {
         RunSize(Size(320, 240, 32, 12), 10_000, 8), SetupSize(), SetupSize(gaussians=6000)
     ),
     "paper": ReproduceSize(
-        RunSize(Size(640, 480, 100, 24, spp=16), 100_000, 50, rows_3dgs=3),
+        RunSize(Size(640, 480, 100, 24, spp=12), 100_000, 50, rows_3dgs=3),
         SetupSize(320, 240, 24, 16),
         SetupSize(320, 240, 24, 16),
     ),

@@ -37,7 +37,7 @@ from mgs.provenance import versions
 from mgs.seeds import derive_seed, generator
 from mgs.synth.orbit import PoseNoise, evaluation_cameras, perturb, rock_cameras
 from mgs.synth.rock import load_rock, make_rock, up_axis
-from mgs.synth.scene import GUIDES_PER_SAMPLE, MitsubaScene, Traced
+from mgs.synth.scene import GUIDES_PER_SAMPLE, MitsubaScene, Traced, whole_grid
 from mgs.synth.scene_file import SceneFile, load_scene_file
 
 NOISY_FACTOR = 8
@@ -76,7 +76,7 @@ class RenderPreset:
     spp: int
 
 
-PRESETS = {"quick": RenderPreset(320, 240, 32, 8), "paper": RenderPreset(640, 480, 100, 16)}
+PRESETS = {"quick": RenderPreset(320, 240, 32, 8), "paper": RenderPreset(640, 480, 100, 12)}
 
 
 def synthesise(
@@ -114,7 +114,7 @@ def synthesise(
     settings = scene if isinstance(scene, SceneFile) else load_scene_file(scene)
     preset = row_named(PRESETS, preset, "preset") if isinstance(preset, str) else preset
     denoise = importlib.util.find_spec("pyoidn") is not None
-    spp = preset.spp * (1 if denoise else NOISY_FACTOR)
+    spp = whole_grid(preset.spp * (1 if denoise else NOISY_FACTOR))
     made_of = None
     if mesh is not None:
         with reading(Path(mesh), "mesh; give a GLB, OBJ or PLY file"):
@@ -194,7 +194,8 @@ def _check_cost(
     needed = views * pixels * PIXEL_BYTES
     free = shutil.disk_usage(next(p for p in out.resolve().parents if p.exists())).free
     cost = f"take about {hours:,.0f} hours and {needed / 2**30:,.1f} GiB on disk"
-    if GUIDES_PER_SAMPLE * samples >= MOST_SAMPLES or hours > MOST_HOURS or needed > free:
+    guides = pixels * whole_grid(GUIDES_PER_SAMPLE * spp)
+    if guides >= MOST_SAMPLES or hours > MOST_HOURS or needed > free:
         raise InputError(
             f"synth-orbit: {what} {cost}; at most {MOST_HOURS:,} hours, {free / 2**30:,.1f} GiB "
             f"and {MOST_SAMPLES // GUIDES_PER_SAMPLE:,} samples per view are possible; {instead}"

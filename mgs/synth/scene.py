@@ -6,6 +6,7 @@ The variant must be set before this module is imported (`mgs.runtime.start`).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isqrt
 from typing import Any
 
 import drjit as dr
@@ -145,7 +146,8 @@ class MitsubaScene:
         alpha = self.coverage(camera, mask, light[2])
         guides = None
         if denoise:
-            guides = render_layers(self.scene, self.guides, GUIDES_PER_SAMPLE * spp, seed)
+            samples = whole_grid(GUIDES_PER_SAMPLE * spp)
+            guides = render_layers(self.scene, self.guides, samples, seed)
         return Traced(light, guides, alpha, depth, mask)
 
     def light(self, camera: Camera, spp: int, seed: int) -> Layers:
@@ -211,8 +213,19 @@ def _denoise(rgb: np.ndarray, guides: np.ndarray) -> np.ndarray:
     )
 
 
+def whole_grid(spp: int) -> int:
+    """Samples per pixel, rounded up to a grid of about as many rows as columns: the sampler takes
+    only those."""
+    columns = isqrt(spp)
+    return columns * -(-spp // columns)
+
+
 def sensor_dict(camera: Camera) -> dict[str, Any]:
-    """Mitsuba perspective sensor of a camera; a pixel is the mean over its area."""
+    """Mitsuba perspective sensor of a camera; a pixel is the mean over its area.
+
+    Samples are correlated multi-jittered: with 16, frames are 2.5 dB nearer to the truth than with
+    independent ones (docs/data.md).
+    """
     K, w, h = camera.K, camera.width, camera.height
     film = {"type": "hdrfilm", "width": w, "height": h, "pixel_format": "rgb"}
     return {
@@ -224,7 +237,7 @@ def sensor_dict(camera: Camera) -> dict[str, Any]:
         "near_clip": 0.01,
         "to_world": mi.ScalarTransform4f(_to_world(camera)),
         "film": film | {"rfilter": {"type": "box"}},
-        "sampler": {"type": "independent"},
+        "sampler": {"type": "multijitter"},
     }
 
 
