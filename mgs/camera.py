@@ -184,6 +184,19 @@ def look_at(
     return pose
 
 
+def heading_and_pitch(camera: Camera, turn: ArrayLike = np.eye(3)) -> tuple[float, float]:
+    """Direction of view, degrees: heading clockwise from +Y (0 to 360), pitch above the horizon.
+
+    turn: rotation [3,3] from the camera's world to one with +Z up. Straight up or down, the top of
+    the image is ahead.
+    """
+    _, (down_x, down_y, _), (x, y, z) = camera.world_to_camera[:3, :3] @ np.transpose(turn)
+    if np.hypot(x, y) < 1e-6:
+        x, y = np.sign(z) * down_x, np.sign(z) * down_y
+    heading, pitch = np.degrees(np.arctan2(x, y)), np.degrees(np.arcsin(np.clip(z, -1, 1)))
+    return float(heading % 360), float(pitch)
+
+
 def opencv_from_opengl(camera_to_world: ArrayLike) -> NDArray[np.float64]:
     """Invert nerfstudio's camera-to-world [4,4] (OpenGL axes) to world_to_camera [4,4] (OpenCV).
 

@@ -49,24 +49,16 @@ OTHERS = {
 def load_gaussians(path: str | Path) -> Gaussians:
     """Read Gaussians from a PLY in the layout of 3DGS, a compressed PLY, a GLB, or an SPZ.
 
-    Colours are unchanged: see `colour_space`. Raises InputError if the file is missing, damaged or
-    of another format, or if a package that it needs is missing.
+    Colours are unchanged: see `gaussians_and_space`. Raises InputError if the file is missing,
+    damaged or of another format, or if a package that it needs is missing.
     """
-    return _load(Path(path))[0]
+    return gaussians_and_space(path)[0]
 
 
-def colour_space(path: str | Path) -> str:
-    """Space in which the colours of a file of Gaussians are blended, "linear" or "srgb": as the
-    file says, or else srgb. Raises OSError or InputError if it cannot be read."""
+def gaussians_and_space(path: str | Path) -> tuple[Gaussians, str]:
+    """Gaussians of a file, and the space in which their colours are blended, "linear" or "srgb": as
+    the file says, or else srgb. Raises InputError as `load_gaussians`."""
     path = Path(path)
-    kind = _kind(path)
-    if kind == "glb":
-        return _load(path)[1]
-    return ply_colour_space(path) if kind == "ply" else "srgb"
-
-
-def _load(path: Path) -> tuple[Gaussians, str]:
-    """Gaussians of a file, and the space of its colours."""
     kind = _kind(path)
     if kind == "glb":
         return read_glb(path)

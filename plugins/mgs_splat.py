@@ -34,7 +34,7 @@ from mgs.gaussians import Gaussians
 from mgs.splat import ListCache, as_drjit, render
 from mgs.splat.mitsuba_sensor import camera_from_sensor
 from mgs.splat.rendering import as_colour
-from mgs.splat_files import colour_space, load_gaussians
+from mgs.splat_files import gaussians_and_space
 
 
 class MgsSplat(mi.CppADIntegrator):
@@ -46,8 +46,9 @@ class MgsSplat(mi.CppADIntegrator):
         if not isinstance(props.get("filename"), str):
             raise InputError("mgs_splat: `filename` is missing or no string; name a 3DGS PLY")
         path = str(mi.file_resolver().resolve(props["filename"]))
-        self.gaussians = as_drjit(load_gaussians(path))
-        self.colour_space = props.get("colour_space", colour_space(path))
+        gaussians, space = gaussians_and_space(path)
+        self.gaussians = as_drjit(gaussians)
+        self.colour_space = props.get("colour_space", space)
         if self.colour_space not in ("linear", "srgb"):
             raise InputError(
                 f"mgs_splat: colour_space {self.colour_space!r} is unknown; choose linear or srgb"

@@ -18,7 +18,7 @@ from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.report.exporting import Model, in_srgb, to_y_up
 from mgs.splat.reference import sh_basis
-from mgs.splat_files import FORMATS, Y_UP_SH, colour_space, load_gaussians, write_gaussians
+from mgs.splat_files import FORMATS, Y_UP_SH, gaussians_and_space, load_gaussians, write_gaussians
 from mgs.splat_ply import write_ply
 
 TOLERANCES = {
@@ -88,7 +88,9 @@ def test_a_compressed_ply_holds_the_same_gaussians(tmp_path, degree):
 @pytest.mark.parametrize("kind", FORMATS)
 def test_the_space_of_the_colours_is_kept_where_a_format_can(tmp_path, kind):
     pytest.importorskip("gsply_cpp")
-    spaces = [colour_space(written(tmp_path, kind, gaussians(0), s)) for s in ("srgb", "linear")]
+    spaces = [
+        gaussians_and_space(written(tmp_path, kind, gaussians(0), s))[1] for s in ("srgb", "linear")
+    ]
     assert spaces == ["srgb", "linear" if kind in ("ply", "glb") else "srgb"]
 
 

@@ -16,8 +16,9 @@ from program import command, steps, timeless
 from refusals import refused
 from scipy.ndimage import gaussian_filter
 
-from mgs.camera import Camera, look_at, opengl_from_opencv
+from mgs.camera import Camera, heading_and_pitch, look_at, opengl_from_opencv
 from mgs.data.dataset import load_dataset
+from mgs.data.up import upright
 from mgs.errors import InputError, Notice
 from mgs.images import read_exr, read_rgba, write_png
 from mgs.prior.build import load_prior
@@ -195,6 +196,11 @@ def aside(pose: Path, out: Path) -> None:
     out.with_suffix(".flown.json").write_text(json.dumps(flown))
 
 
+def test_no_distance_from_the_pose_may_be_allowed(flight, data):
+    with pytest.raises(InputError, match=r"is 0\.0866 from the pose asked for, more than 0"):
+        flight.fly(copying(data, aside), tries=1, failure="stop", distance=0.0)
+
+
 def test_the_pose_flown_counts_and_a_resumed_run_is_the_same(flight, data, whole, tmp_path):
     calls = []
 
@@ -256,7 +262,10 @@ def test_the_pose_file_says_where_to_be_and_look(flight, data):
 )
 def test_heading_is_clockwise_from_y(target, heading):
     camera = Camera(np.diag([9.0, 9, 1]), 9, 9, look_at((0, 0, 0), target))
-    assert live.heading_and_pitch(camera, (0, 0, 1)) == pytest.approx((heading, 0))
+    assert heading_and_pitch(camera) == pytest.approx((heading, 0))
+    x, y, z = target
+    turned = Camera(np.diag([9.0, 9, 1]), 9, 9, look_at((0, 0, 0), (x, -z, y), (0, -1, 0)))
+    assert heading_and_pitch(turned, upright((0, -1, 0))) == pytest.approx((heading, 0))
 
 
 def test_a_watched_folder(flight, data, whole, tmp_path, monkeypatch):

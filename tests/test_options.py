@@ -112,7 +112,7 @@ OPTIONS: dict[str, list[tuple[str, str]]] = {
         ("--drift nan", "factors of 0 or more"),
     ],
     "prior {rock} --out {out}": [
-        ("--gaussians 0", "0 Gaussians are too few"),
+        ("--gaussians 0", "--gaussians 0: must be at least 1, or auto"),
         ("--gaussians many", NO_GAUSSIANS),
         ("--gaussians 50 --spacing 0.1", "give one of them"),
         ("--spacing 9", "samples are too few"),

@@ -53,6 +53,9 @@ def parse_gaussians(text: str | None) -> int | Literal["auto"] | None:
     if text == "auto":
         return "auto"
     try:
-        return int(text)
+        count = int(text)
     except ValueError:
         raise InputError(f"--gaussians {text!r}: expected a whole number, or auto") from None
+    if count < 1:
+        raise InputError(f"--gaussians {count}: must be at least 1, or auto")
+    return count

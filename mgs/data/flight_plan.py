@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from mgs.camera import Camera
+from mgs.camera import Camera, heading_and_pitch
 from mgs.errors import InputError
 from mgs.files import atomic_path, write_json
 
@@ -93,11 +93,8 @@ class Stop:
     def heading_and_pitch(self, bearing: float) -> tuple[float, float]:
         """Heading clockwise from north, and pitch of the camera above the horizon, degrees."""
         assert self.camera is not None
-        x, y, z = self.camera.world_to_camera[2, :3]
-        if math.hypot(x, y) < 1e-6:  # straight up or down: the top of the image is ahead
-            x, y = -np.sign(z) * -self.camera.world_to_camera[1, :2]
-        heading = (math.degrees(math.atan2(x, y)) + bearing) % 360
-        return heading, math.degrees(math.asin(max(-1.0, min(1.0, z))))
+        heading, pitch = heading_and_pitch(self.camera)
+        return (heading + bearing) % 360, pitch
 
 
 def check_plan_path(path: Path) -> None:

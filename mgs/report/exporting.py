@@ -13,7 +13,7 @@ from mgs.gaussians import Gaussians
 from mgs.report.runs import up_of
 from mgs.run.folder import open_run
 from mgs.splat.reference import sh_basis
-from mgs.splat_files import colour_space, load_gaussians
+from mgs.splat_files import gaussians_and_space
 
 DIRECTIONS = 64
 """Directions to which the coefficients of a converted colour are fitted."""
@@ -36,7 +36,7 @@ def read_model(source: str | Path) -> Model:
     InputError as `open_run`, `Run.state` and `load_gaussians`."""
     source = Path(source)
     if not source.is_dir():
-        return Model(load_gaussians(source), colour_space(source))
+        return Model(*gaussians_and_space(source))
     run = open_run(source)
     return Model(run.state.gaussians, "linear", up_of(run.settings.prior, run.dataset))
 

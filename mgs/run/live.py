@@ -16,13 +16,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mgs.camera import Camera, opengl_from_opencv
+from mgs.camera import Camera, heading_and_pitch, opengl_from_opencv
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import FILES, Dataset, intrinsics, load_dataset, read_records
 from mgs.data.frames import Frame, as_captured, capture_record
 from mgs.data.importers import import_shot, silhouette_of
 from mgs.data.sources import Shot, record_camera
-from mgs.data.up import Up, upright
+from mgs.data.up import upright
 from mgs.errors import InputError, Notice
 from mgs.files import read_json, write_json
 from mgs.prior.build import Prior
@@ -135,7 +135,7 @@ def ask(folder: Path, frame: Frame, dataset: Dataset, attempt: int) -> tuple[Pat
 
     Raises InputError where an answer lies there already though this pose was never asked for.
     """
-    heading, pitch = heading_and_pitch(frame.camera, dataset.up)
+    heading, pitch = heading_and_pitch(frame.camera, upright(dataset.up))
     asked = {
         "name": frame.name,
         "convention": CONVENTION,
@@ -157,14 +157,6 @@ def ask(folder: Path, frame: Frame, dataset: Dataset, attempt: int) -> tuple[Pat
     return pose, out
 
 
-def heading_and_pitch(camera: Camera, up: Up) -> tuple[float, float]:
-    """Direction of view, degrees: heading clockwise from +Y (0 to 360), pitch above the horizon."""
-    x, y, z = upright(up) @ camera.world_to_camera[2, :3]
-    return float(np.degrees(np.arctan2(x, y)) % 360), float(
-        np.degrees(np.arcsin(np.clip(z, -1, 1)))
-    )
-
-
 def _received(
     root: Path,
     frame: Frame,
@@ -179,7 +171,9 @@ def _received(
     if flown := found.get(".flown.json"):
         camera, distortion = _flown(flown, frame, image)
     away = float(np.linalg.norm(camera.position - frame.camera.position))
-    limit = live.distance or REACH * float(np.linalg.norm(frame.camera.position - centre))
+    limit = live.distance
+    if limit is None:
+        limit = REACH * float(np.linalg.norm(frame.camera.position - centre))
     if away > limit:
         raise InputError(f"{flown}: is {away:.3g} from the pose asked for, more than {limit:.3g}")
     depth = found.get(".depth.exr") or found.get(".depth.png")

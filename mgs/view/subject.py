@@ -18,7 +18,7 @@ from mgs.report.page_facts import step_facts
 from mgs.report.runs import read_metrics, up_of
 from mgs.run.ending import RunEnd
 from mgs.run.folder import Run, open_run
-from mgs.splat_files import colour_space, load_gaussians
+from mgs.splat_files import gaussians_and_space
 
 SCALARS = ("information", "uncertainty", "unobserved")
 """Scalars of `mgs.report.diagnostics` that the viewer shows."""
@@ -79,7 +79,7 @@ def read_subject(path: str | Path, follow: bool = False) -> Subject:
         raise InputError(f"{path}: --follow needs the folder of a run")
     if not path.is_file():
         raise InputError(f"{path}: no such run folder or PLY file")
-    return scaled(Subject(path.name, load_gaussians(path), colour_space(path), unit="unit"))
+    return scaled(Subject(path.name, *gaussians_and_space(path), unit="unit"))
 
 
 def scaled(subject: Subject) -> Subject:
