@@ -15,7 +15,7 @@ from mgs.synth import arena
 from mgs.synth.arena import make_ground, make_stones
 from mgs.synth.rock import make_rock
 from mgs.synth.rock_layer import RockLayer, continued, lattice, render_layers, with_coverage
-from mgs.synth.scene import MitsubaScene, sensor_dict
+from mgs.synth.scene import MitsubaScene, sensor_dict, whole_grid
 from mgs.synth.scene_file import Arena, Rock, SceneFile, Sensor, load_scene_file, sensor_of
 
 K = np.array([[70.0, 0, 30.5], [0, 70.0, 27.25], [0, 0, 1]])
@@ -95,6 +95,13 @@ def test_the_image_is_that_of_the_inner_integrator_and_the_rock_a_part_of_it(bal
         assert not rock[share == 0].any()
         assert (share == 1).sum() > 100
         assert set(np.unique(np.round(share * spp, 4))) == set(range(spp + 1))
+
+
+def test_samples_are_rounded_up_as_the_sampler_rounds_them():
+    kind = sensor_dict(Camera(K, 64, 48, np.eye(4)))["sampler"]
+    for spp in (*range(1, 70), 1000):
+        taken = mi.load_dict(kind | {"sample_count": spp}).sample_count()
+        assert whole_grid(spp) == taken == whole_grid(taken)
 
 
 def test_light_of_rock_and_of_all_else_adds_up_to_the_image(ball):
