@@ -68,8 +68,8 @@ SHEET_COLUMNS, SHEET_WIDTH, SHEET_FRAMES = 8, 160, 32
 
 @dataclass(frozen=True)
 class RenderPreset:
-    """Size of a rendered dataset: image size in pixels, number of frames, samples per pixel (rounded
-    up by `whole_grid`)."""
+    """Size of a rendered dataset: image size in pixels, number of frames, and samples per
+    pixel, rounded up by `whole_grid`."""
 
     width: int
     height: int
