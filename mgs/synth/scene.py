@@ -223,7 +223,7 @@ def whole_grid(spp: int) -> int:
 def sensor_dict(camera: Camera) -> dict[str, Any]:
     """Mitsuba perspective sensor of a camera; a pixel is the mean over its area.
 
-    Samples are correlated multi-jittered: with 16, frames are 2.5 dB nearer to the truth than with
+    Samples are correlated multi-jittered: with 16, frames are 3 dB nearer to the truth than with
     independent ones (docs/data.md).
     """
     K, w, h = camera.K, camera.width, camera.height
