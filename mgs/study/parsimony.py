@@ -200,15 +200,11 @@ def fit_lean_and_judge(
     images, began = last_images(settings, known, frames), time.perf_counter()
     found = lean_fit(images, settings, cache=ListCache())
     seconds = time.perf_counter() - began
-    assert found.left_out is not None
     return _quality(found.gaussians, root / dataset) | {
-        "whole": _quality(found.whole, root / dataset),
         "gaussians": len(found.gaussians),
         "parameters": found.parameters,
         "seconds": seconds,
         "degree": found.gaussians.sh_degree,
-        "directional_gain": found.left_out.gain,
-        "directional_error": found.left_out.error,
         "shares": {kind: float(mask.mean()) for kind, mask in found.learned.items()},
     }
 
