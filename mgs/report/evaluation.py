@@ -319,19 +319,17 @@ def _measured_before(file: Path, subject: str) -> dict[str, Any] | None:
     return metrics if metrics is not None and metrics.get("of") == subject else None
 
 
-def compare_models(
-    models: Sequence[Gaussians], dataset: Dataset, taken: Sequence[str]
-) -> tuple[str, list[float] | None]:
+def compare_models(models: Sequence[Gaussians], run: Run) -> tuple[str, list[float] | None]:
     """Mean PSNR of each model, dB, full frame, on views that a run did not train on.
 
-    taken: names of the run's frames. Returns the name of the set, "test" if the dataset has test
-    views, else "held-out", and the means, None if there is no such view.
+    Returns the name of the set, "test" if the dataset has test views, else "held-out", and the
+    means, None if there is no such view.
     """
-    tests = dataset.test_views()
+    tests, taken = run.dataset.test_views(), [frame.name for frame in run.taken]
     name, frames = "test", tests.frames if tests else ()
     if not tests:
         name = "held-out"
-        frames = tuple(f for f in dataset.with_images(taken) if f.name not in taken)
+        frames = tuple(f for f in run.dataset.with_images(taken) if f.name not in taken)
     if not frames:
         return name, None
     return name, [float(evaluate_model(model, frames, ())["all"]["psnr"]) for model in models]

@@ -194,7 +194,6 @@ def lean_fit(
     learn: Literal["all", "auto"] = "auto",
     sh: Literal["0", "auto"] = "auto",
     loss: float = LEARN_LOSS,
-    cache: ListCache | None = None,
     say: Callable[[str], None] = lambda stage: None,
 ) -> LeanModel:
     """Fit a model that has no more parameters than the images need.
@@ -208,7 +207,7 @@ def lean_fit(
 
     say(stage): called as a stage starts. Raises InputError as `fitted`.
     """
-    cache, views = cache or ListCache(), range(len(images))
+    cache, views = ListCache(), range(len(images))
     left_out = None
     if sh == "auto" and len(images) >= BLOCKS:
         left_out = directional_gain(images, settings, cache, say)

@@ -64,7 +64,7 @@ def prune_run(
     found = prune(gaussians, cameras, noise)
     smaller = gaussians[found.kept]
     say("comparing")
-    views, psnr = compare_models([gaussians, smaller], opened.dataset, names)
+    views, psnr = compare_models([gaussians, smaller], opened)
     write_ply(opened.folder / PRUNED, smaller)
     return PrunedRun(len(gaussians), len(smaller), found.predicted, found.actual, views, psnr)
 
@@ -119,8 +119,7 @@ def refit_run(
     images = last_images(settings, prior, opened.taken)
     found = lean_fit(images, settings, learn, sh, loss, say=say)
     say("comparing")
-    models, taken = [own, found.whole, found.gaussians], [frame.name for frame in opened.taken]
-    views, psnr = compare_models(models, opened.dataset, taken)
+    views, psnr = compare_models([own, found.whole, found.gaussians], opened)
     marks = {f"learned_{kind}": mask for kind, mask in found.learned.items()}
     write_ply(path, found.gaussians, marks)
     return RefittedRun(len(own) * parameters_of_each(settings), found, views, psnr)

@@ -134,7 +134,9 @@ def start_run(
     where = Path(prior) if isinstance(prior, str | Path) else out / "prior"
     policy = settings.get("policy", NbvSettings.model_fields["policy"].default)
     named = name_of(policy) if isinstance(policy, str) or callable(policy) else policy
-    wanted = _with_defaults(settings | {"policy": named}, row, loaded)
+    outlined = not loaded or all(frame.mask_path or frame.rock_path for frame in loaded.frames)
+    weight = ALPHA_WEIGHT if outlined else 0.0
+    wanted = with_defaults(settings | {"policy": named}, row, weight)
     known = validated(
         NbvSettings, {"dataset": images.resolve(), "prior": where.resolve(), **wanted}
     )
@@ -210,12 +212,6 @@ def start_fit(
     every = {"seeds": len(loaded), "budget": 0, "train": train, "loose": loose}
     built: dict[str, Any] = {"prior": prior, "gaussians": gaussians, "source": whole}
     return start_run(root, out, progress=progress, **built, **settings | every)
-
-
-def _with_defaults(settings: dict[str, Any], row: Any, loaded: Dataset | None) -> dict[str, Any]:
-    """Settings with the preset's defaults, and alpha fitted where all frames have an outline."""
-    outlined = loaded is None or all(frame.mask_path or frame.rock_path for frame in loaded.frames)
-    return with_defaults(settings, row, ALPHA_WEIGHT if outlined else 0.0)
 
 
 def _resolved(given: NbvSettings, count: int, budget_given: bool) -> NbvSettings:

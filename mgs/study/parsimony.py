@@ -28,7 +28,7 @@ from mgs.run.operations import operations_of
 from mgs.run.problem import Problem
 from mgs.run.settings import NbvSettings
 from mgs.run.state import Fitted
-from mgs.splat import ListCache, groups
+from mgs.splat import groups
 from mgs.splat.pruning import prune
 from mgs.study.case import Case, Scene, Size, judge
 from mgs.study.output import Content, Panel, draw_panels, table, write_table
@@ -198,7 +198,7 @@ def fit_lean_and_judge(
     order = views_in_order(positions, known.points.mean(0), views, seeds)
     frames = [data.frames[i] for i in order]
     images, began = last_images(settings, known, frames), time.perf_counter()
-    found = lean_fit(images, settings, cache=ListCache())
+    found = lean_fit(images, settings)
     seconds = time.perf_counter() - began
     return _quality(found.gaussians, root / dataset) | {
         "gaussians": len(found.gaussians),
