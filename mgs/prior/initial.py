@@ -191,24 +191,15 @@ def _with_backing(surface: Gaussians, prior: Prior) -> Gaussians:
     )
 
 
-def sees(
-    points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float
-) -> np.ndarray:
-    """Whether a frame sees surface points [N] inside its mask, bool.
-
-    normals, depth [H,W], tolerance: as `visible`. Raises InputError if the mask cannot be read.
-    """
-    return visible(points, normals, frame.camera, depth, tolerance) & in_mask(points, frame)
-
-
 def seen_colours(
     points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float
 ) -> Colours:
-    """Mask [N] of the surface points that a frame `sees`, and their colours, [seen,3] linear RGB.
+    """Mask [N] of the surface points that a frame sees inside its mask, and their colours, [seen,3]
+    linear RGB.
 
-    Raises InputError if a file cannot be read.
+    normals, depth [H,W], tolerance: as `visible`. Raises InputError if a file cannot be read.
     """
-    seen = sees(points, normals, frame, depth, tolerance)
+    seen = visible(points, normals, frame.camera, depth, tolerance) & in_mask(points, frame)
     pixels, _ = frame.camera.project(points[seen])
     at, rgb = [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], frame.rgb()
     colours = [map_coordinates(rgb[..., k], at, order=1, mode="nearest") for k in range(3)]

@@ -20,6 +20,7 @@ import numpy as np
 from mgs.data.dataset import load_dataset
 from mgs.data.frames import Frame
 from mgs.policy import from_file as policy_file
+from mgs.policy.poses import path_length
 from mgs.policy.registry import needs_model
 from mgs.prior.build import load_prior
 from mgs.run.inputs import policy_record
@@ -204,13 +205,12 @@ def choose_and_judge(
     left = [i for i in range(len(shared.frames)) if i not in taken]
     on_tests, on_pool = tests(model), pool(model, left)
     mine = dataset == ring  # the poses of the ring, of which some may be taken
-    positions = problem.positions[taken]
     return {
         "test": float(on_tests["psnr"].mean()),
         "test_mask": float(on_tests["psnr_mask"].mean()),
         "pool": float(on_pool["psnr"].mean()),
         "ring": float((on_pool if mine else on_ring(model))["psnr"].mean()),
-        "path": float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()),
+        "path": path_length(problem.positions[taken]),
         "taken": taken,
     } | ({"foretold": _means(tried)} if tried else {})
 
