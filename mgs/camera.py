@@ -187,8 +187,8 @@ def look_at(
 def heading_and_pitch(camera: Camera, turn: ArrayLike = np.eye(3)) -> tuple[float, float]:
     """Direction of view, degrees: heading clockwise from +Y (0 to 360), pitch above the horizon.
 
-    turn: rotation [3,3] from the camera's world to one with +Z up. Straight up or down, the top of
-    the image is ahead.
+    turn: rotation [3,3] from the camera's world to one with +Z up. Where the camera looks straight
+    down, the heading is that of the image's top; straight up, that of its bottom.
     """
     _, (down_x, down_y, _), (x, y, z) = camera.world_to_camera[:3, :3] @ np.transpose(turn)
     if np.hypot(x, y) < 1e-6:

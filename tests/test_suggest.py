@@ -12,7 +12,7 @@ from pymavlink import mavutil, mavwp
 from refusals import refused
 
 import mgs
-from mgs.camera import Camera, look_at
+from mgs.camera import Camera, heading_and_pitch, look_at
 from mgs.data import flight_plan
 from mgs.data.dataset import load_cameras, load_dataset
 from mgs.run.candidates import Site, inside, place_poses, read_poses
@@ -231,7 +231,9 @@ def test_a_suggestion_that_cannot_be_made_is_one_line(run, tmp_path, capsys, giv
     assert not out.exists()
 
 
-def test_straight_down_the_top_of_the_image_is_ahead():
+def test_straight_down_the_top_of_the_image_is_ahead_and_straight_up_its_bottom():
     camera = Camera(np.diag([9.0, 9, 1]), 8, 8, look_at([0, 0, 5], [0, 0, 0], [1, 0, 0]))
     heading, pitch = flight_plan.Stop(camera.position, camera=camera).heading_and_pitch(10)
     assert (heading, pitch) == (pytest.approx(100), pytest.approx(-90))
+    up = Camera(camera.K, 8, 8, look_at([0, 0, 0], [0, 0, 5], [-1, 0, 0]))
+    assert heading_and_pitch(up) == pytest.approx((90, 90))

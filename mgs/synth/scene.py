@@ -214,8 +214,8 @@ def _denoise(rgb: np.ndarray, guides: np.ndarray) -> np.ndarray:
 
 
 def whole_grid(spp: int) -> int:
-    """Samples per pixel, rounded up to a grid of about as many rows as columns: the sampler takes
-    only those."""
+    """Round samples per pixel up to a full grid of about as many rows as columns, as Mitsuba's
+    `multijitter` does."""
     columns = isqrt(spp)
     return columns * -(-spp // columns)
 
