@@ -6,7 +6,8 @@ everywhere except inside `mgs.splat`, where they are Dr.Jit tensors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,9 @@ LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
 (K colour coefficients for each of r, g, b), 3, 4 and 1 columns. Means are learned on request
 (`learned`)."""
 
+ARRAYS = ("means", "log_scales", "quats", "logit_opacities", "sh")
+"""Parameters of `Gaussians`: its fields that are arrays."""
+
 KINDS = ("colour", "scale", "rotation", "opacity")
 """Names of the LEARNED parameters in settings and columns, in the same order."""
 
@@ -57,9 +61,12 @@ class Gaussians:
     - sh: [N,K,3] colour, linear RGB, as K = (d+1)^2 coefficients of spherical harmonics of degree d
       from 0 to 3, in the order and with the signs of 3DGS: rgb = max(0, 0.5 + sum over k of
       Y_k(direction) sh_k), with the direction from the camera.
+    - antialiased: whether a footprint that the low-pass of the image (`EPS2D`) makes larger is
+      fainter in proportion (Yu et al. 2024, Mip-Splatting), as `antialiased` of gsplat; else its
+      opacity stays, as in 3DGS.
 
     `gaussians[10:20]`, `gaussians[mask]` and `gaussians[indices]` are Gaussians again. Two are
-    equal if all numbers are.
+    equal if all numbers are, and `antialiased`.
     """
 
     means: Any
@@ -67,6 +74,7 @@ class Gaussians:
     quats: Any
     logit_opacities: Any
     sh: Any
+    antialiased: bool = True
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -75,24 +83,32 @@ class Gaussians:
         return f"Gaussians({len(self):,}, SH degree {self.sh_degree})"
 
     def _repr_html_(self) -> str:
-        g = Gaussians(*(np.asarray(getattr(self, field.name)) for field in fields(self)))
+        g = self.map(np.asarray)
         return html(repr(self), [cloud(g.means, g.rgb)])
 
     def __getitem__(self, index: Any) -> Gaussians:
         """Select Gaussians by a slice, a mask [N], indices [M] in their order, or one index."""
         chosen = [index] if isinstance(index, int | np.integer) else index
-        return Gaussians(*(getattr(self, field.name)[chosen] for field in fields(self)))
+        return self.map(lambda array: array[chosen])
+
+    def map(self, function: Callable[[Any], Any]) -> Gaussians:
+        """Gaussians of the results of a function of each array."""
+        return replace(self, **{name: function(getattr(self, name)) for name in ARRAYS})
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Gaussians):
             return NotImplemented
-        pairs = (
-            (np.asarray(getattr(self, f.name)), np.asarray(getattr(other, f.name)))
-            for f in fields(self)
+        pairs = ((getattr(self, name), getattr(other, name)) for name in ARRAYS)
+        return self.antialiased == other.antialiased and all(
+            np.array_equal(np.asarray(mine), np.asarray(theirs)) for mine, theirs in pairs
         )
-        return all(np.array_equal(mine, theirs) for mine, theirs in pairs)
 
     __hash__ = None  # type: ignore[assignment]  # its arrays can change
+
+    @property
+    def recorded(self) -> tuple[int, ...]:
+        """What a recording holds as constants (`mgs.splat.recording.frozen`)."""
+        return (*self.sh.shape, int(self.antialiased))
 
     @property
     def sh_degree(self) -> int:
@@ -122,16 +138,15 @@ class Gaussians:
         exceeds SH_MAX. The message names the parameter and the first such Gaussian.
         """
         self.check_shapes()
-        for field in fields(self):
-            values = np.asarray(getattr(self, field.name))
-            bad = ~np.isfinite(values) if field.name != "sh" else ~(np.abs(values) <= SH_MAX)
+        for name in ARRAYS:
+            values = np.asarray(getattr(self, name))
+            bad = ~np.isfinite(values) if name != "sh" else ~(np.abs(values) <= SH_MAX)
             if bad.any():
                 first = tuple(np.argwhere(bad)[0])
                 finite = np.isfinite(values[first])
                 what = f"is beyond {SH_MAX:,.0f}" if finite else "is NaN or infinite"
                 raise InputError(
-                    f"gaussians: {field.name} {what}, first at Gaussian {first[0]}; "
-                    "remove or repair it"
+                    f"gaussians: {name} {what}, first at Gaussian {first[0]}; remove or repair it"
                 )
         return self
 

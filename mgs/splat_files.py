@@ -141,6 +141,7 @@ def _read_spz(path: Path) -> Gaussians:
                 quats=found["quats"],
                 logit_opacities=found["opacities"],
                 sh=np.concatenate(parts, axis=1),
+                antialiased=False,
             ).check()
             return _flip_y_up(y_up)
     except (RuntimeError, ValueError) as error:

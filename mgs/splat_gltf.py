@@ -78,6 +78,7 @@ def write_glb(path: str | Path, gaussians: Gaussians, space: str, to_y_up: np.nd
         "attributes": {name: index for index, name in enumerate(attributes)},
         "mode": 0,
         "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": SPACES[space]}},
+        "extras": {"antialiased": g.antialiased},
     }
     matrix = np.eye(4)
     matrix[:3, :3] = to_y_up
@@ -157,6 +158,7 @@ def _gaussians(content: Any, body: bytes) -> tuple[Gaussians, str]:
         quats=np.roll(values(f"{EXTENSION}:ROTATION"), 1, axis=1),
         logit_opacities=logit(np.clip(opacities, CLEAREST, 1 - CLEAREST)).astype(np.float32),
         sh=np.stack([values(name) for name in _sh_names(coefficients)], axis=1),
+        antialiased=found.get("extras", {}).get("antialiased") is True,
     )
     linear = extension.get("colorSpace") == SPACES["linear"]
     return gaussians.check(), "linear" if linear else "srgb"

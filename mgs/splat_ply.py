@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 
@@ -26,6 +27,9 @@ from mgs.memory import decoding
 LINEAR_COMMENT = "mgs: colours are linear RGB"
 """Comment in the header of the files that mgs writes; the layout has no field for the colour space.
 Most other tools train on sRGB values, so the colours in their files must be blended as sRGB."""
+
+ANTIALIASED_COMMENT = "mgs: antialiased"
+"""Comment in the header of files of antialiased Gaussians (`mgs.gaussians.Gaussians`)."""
 
 CHUNK = 256
 """Consecutive splats of a compressed PLY that share one row of its element `chunk`."""
@@ -77,7 +81,8 @@ def write_ply(
         vertices[name] = columns[:, i]
     for name, mask in marks.items():
         vertices[name] = mask
-    ply = PlyData([PlyElement.describe(vertices, "vertex")], comments=[LINEAR_COMMENT] * linear)
+    comments = [LINEAR_COMMENT] * linear + [ANTIALIASED_COMMENT] * gaussians.antialiased
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], comments=comments)
     with atomic_path(path) as temporary:
         ply.write(str(temporary))
 
@@ -101,8 +106,8 @@ def read_ply(path: str | Path) -> Gaussians:
     """Read a PLY in the layout of 3DGS (binary or ASCII, SH degree 0 to 3), or a compressed one.
 
     Properties are found by name, in any order; others are ignored. Colours are unchanged: see
-    `ply_colour_space`. Raises InputError if the file is missing, is not a PLY, lacks a property, or
-    holds values that `Gaussians.check` refuses.
+    `ply_colour_space`. Only files of mgs say that they are antialiased. Raises InputError if the
+    file is missing, is not a PLY, lacks a property, or holds values that `Gaussians.check` refuses.
     """
     path = Path(path)
     ply = _parse(path)
@@ -115,7 +120,8 @@ def read_ply(path: str | Path) -> Gaussians:
         columns = _decompress(path, ply)
     else:
         columns = {name: vertices[name] for name in vertices.dtype.names}
-    gaussians = _from_columns(path, columns, len(vertices))
+    antialiased = ANTIALIASED_COMMENT in ply.comments
+    gaussians = replace(_from_columns(path, columns, len(vertices)), antialiased=antialiased)
     try:
         return gaussians.check()
     except InputError as error:
@@ -301,8 +307,9 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
         steps = np.clip(np.floor((higher / 8 + 0.5) * 256), 0, 255)
         tables["sh"] = _table([(f"f_rest_{i}", "u1") for i in range(rest)], list(steps.T))
     elements = [PlyElement.describe(table, name) for name, table in tables.items()]
+    comments = [ANTIALIASED_COMMENT] * gaussians.antialiased
     with atomic_path(path) as temporary:
-        PlyData(elements, byte_order="<").write(str(temporary))
+        PlyData(elements, byte_order="<", comments=comments).write(str(temporary))
 
 
 def _table(types: list[tuple[str, str]], columns: list[np.ndarray]) -> np.ndarray:

@@ -23,14 +23,13 @@ differentiated.
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mgs.errors import InputError
-from mgs.gaussians import Gaussians
+from mgs.gaussians import ARRAYS
 from mgs.splat import ListCache, as_drjit, render
 from mgs.splat.mitsuba_sensor import camera_from_sensor
 from mgs.splat.rendering import as_colour
@@ -62,8 +61,8 @@ class MgsSplat(mi.CppADIntegrator):
 
     def traverse(self, cb: Any) -> None:
         """Expose the five parameters, with shapes as in `mgs.gaussians.Gaussians`."""
-        for field in fields(Gaussians):
-            cb.put(field.name, getattr(self.gaussians, field.name), mi.ParamFlags.Differentiable)
+        for name in ARRAYS:
+            cb.put(name, getattr(self.gaussians, name), mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Any) -> None:
         """Do nothing: block lists are checked against the Gaussians at each use."""

@@ -1,6 +1,5 @@
 """The loop in a few lines of a user's own program takes the views of `mgs.run_nbv`."""
 
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 import synthetic
 
 import mgs
+from mgs.gaussians import ARRAYS
 from mgs.run.planning import surface_information
 
 
@@ -48,6 +48,6 @@ def test_a_loop_by_hand_gives_the_same_views_and_gaussians(rock, tmp_path, polic
     assert ours.taken == whole.taken
     np.testing.assert_array_equal(ours.H, whole.H)
     np.testing.assert_array_equal(ours.surface, whole.surface)
-    for field in fields(ours.gaussians):
-        one, other = (getattr(state.gaussians, field.name) for state in (ours, whole))
-        np.testing.assert_array_equal(one, other, err_msg=field.name)
+    for name in ARRAYS:
+        one, other = (getattr(state.gaussians, name) for state in (ours, whole))
+        np.testing.assert_array_equal(one, other, err_msg=name)

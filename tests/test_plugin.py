@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from dataclasses import fields
 from pathlib import Path
 
 import drjit as dr
@@ -15,13 +14,12 @@ import mgs.splat.plugins  # noqa: F401  registers mgs_splat
 from mgs.camera import Camera, look_at
 from mgs.colour import linear_from_srgb
 from mgs.errors import InputError
-from mgs.gaussians import Gaussians
+from mgs.gaussians import ARRAYS, Gaussians
 from mgs.splat import as_drjit, camera_from_sensor, jvp, render
 from mgs.splat_ply import read_ply, write_ply
 
 WIDTH, HEIGHT, FOV = 70, 46, 38.0
 EYE, TARGET = (0.3, -2.0, 0.9), (0.05, 0.0, 0.0)
-NAMES = [field.name for field in fields(Gaussians)]
 LOOK_AT = look_at(EYE, TARGET)
 
 
@@ -147,7 +145,7 @@ def test_colours_in_display_space(ply):
 def test_traverse_lists_the_parameters(ply):
     params = mi.traverse(load(ply))
     model = gaussians()
-    for name in NAMES:
+    for name in ARRAYS:
         key = f"integrator.{name}"
         assert not params.flags(key) & mi.ParamFlags.NonDifferentiable
         np.testing.assert_array_equal(np.asarray(params[key]), getattr(model, name))
@@ -159,7 +157,7 @@ def test_a_changed_parameter_changes_the_image(ply):
     params = mi.traverse(scene)
     first = np.asarray(mi.render(scene, params)).copy()
     other = gaussians(n=90)
-    for name in NAMES:
+    for name in ARRAYS:
         params[f"integrator.{name}"] = mi.TensorXf(getattr(other, name))
     params.update()
     second = np.asarray(mi.render(scene, params))
@@ -175,14 +173,14 @@ def test_gradients_are_those_of_the_api(ply, pixel_format, depth, film):
     """Gradients of each parameter, means included, through colour, alpha and depth."""
     scene = load(ply, sensor_dict({"pixel_format": pixel_format} | film), depth=depth)
     params = mi.traverse(scene)
-    for name in NAMES:
+    for name in ARRAYS:
         dr.enable_grad(params[f"integrator.{name}"])
     image = mi.render(scene, params)
     weights = mi.TensorXf(np.random.default_rng(0).normal(size=image.shape).astype(np.float32))
     dr.backward(dr.sum(image * weights, axis=None))
 
     model = as_drjit(read_ply(ply))
-    for name in NAMES:
+    for name in ARRAYS:
         dr.enable_grad(getattr(model, name))
     drawn = render(model, camera(crop=CROP) if film else camera())
     loss = dr.sum(drawn.rgb * weights[..., :3], axis=None)
@@ -191,7 +189,7 @@ def test_gradients_are_those_of_the_api(ply, pixel_format, depth, film):
     if depth:
         loss += dr.sum(drawn.depth * weights[..., 4], axis=None)
     dr.backward(loss)
-    for name in NAMES:
+    for name in ARRAYS:
         assert_near(dr.grad(params[f"integrator.{name}"]), dr.grad(getattr(model, name)))
 
 
@@ -283,7 +281,7 @@ def test_forward_mode_is_that_of_the_api(ply, space):
     options = {"depth": True, "colour_space": space, "background": list(background)}
     scene = load(ply, sensor_dict(film), **options)
     params, model, rng = mi.traverse(scene), gaussians(), np.random.default_rng(4)
-    tangents = {n: rng.normal(size=getattr(model, n).shape).astype(np.float32) for n in NAMES}
+    tangents = {n: rng.normal(size=getattr(model, n).shape).astype(np.float32) for n in ARRAYS}
     t = mi.Float(0)
     dr.enable_grad(t)
     for name, tangent in tangents.items():

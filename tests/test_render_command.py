@@ -31,7 +31,7 @@ def gaussians(degree: int, n: int = 40) -> Gaussians:
         rng.normal(1, 2, n),
         0.3 * rng.normal(size=(n, (degree + 1) ** 2, 3)),
     )
-    return Gaussians(*(part.astype(np.float32) for part in parts))
+    return Gaussians(*(part.astype(np.float32) for part in parts), antialiased=False)
 
 
 def columns(g: Gaussians) -> dict[str, np.ndarray]:

@@ -133,6 +133,7 @@ def die(root, out):
 def real_run(root, out, data, killed=False):
     """A task: `mgs nbv`; its process is killed after the first choice of the first attempt, if
     asked for."""
+    from mgs.gaussians import ARRAYS
     from mgs.run.inputs import array_digest
     from mgs.run.nbv import resume_nbv, run_nbv
 
@@ -145,7 +146,7 @@ def real_run(root, out, data, killed=False):
     given = {"gaussians": 150, "seeds": 2, "budget": 2}
     done = run_nbv(data, run, on_step=on_step, **given) if first else resume_nbv(run)
     state = done.state
-    arrays = [*vars(state.gaussians).values(), state.H, state.surface]
+    arrays = [*(getattr(state.gaussians, name) for name in ARRAYS), state.H, state.surface]
     losses = [step["loss"] for step in state.steps]
     return {"taken": state.taken, "arrays": array_digest(arrays), "losses": losses}
 

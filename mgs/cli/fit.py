@@ -16,8 +16,8 @@ from mgs.cli.options import DatasetFolder, Force, option, parse_gaussians
 
 PANELS = {
     "Fitting": (
-        "passes", "means", "sh", "density", "most_gaussians", "loss", "exposure", "alpha_weight",
-        "optimiser", "rates",
+        "passes", "means", "sh", "density", "most_gaussians", "loss", "exposure", "antialiased",
+        "alpha_weight", "optimiser", "rates",
     ),
     "Advanced": ("pixel_noise", "prior_std", "seed"),
 }  # fmt: skip

@@ -28,7 +28,8 @@ PANELS = {
     "Choosing": ("batch", "nearest", "travel", "stop_gain", "stop_uncertainty", "stop_psnr"),
     "Flight": ("flight_length", "flight_time", "speed", "hover", "no_fly", "clearance"),
     "Fitting": (
-        *("passes", "warm_passes", "means", "sh", "exposure", "alpha_weight", "optimiser", "rates"),
+        *("passes", "warm_passes", "means", "sh", "exposure", "antialiased", "alpha_weight"),
+        *("optimiser", "rates"),
     ),
     "Advanced": ("estimator", "lam", "pixel_noise", "prior_std", "evaluate_every", "seed"),
 }
@@ -263,7 +264,9 @@ def _option(name: str, panel: str, more_help: str) -> inspect.Parameter:
         kind, default = list[str], ", ".join(f"{k}={v:g}" for k, v in default.items())
     if default is not None and not isinstance(default, bool) and "Default:" not in text:
         text += f" Default: {default}."
-    flags = ["--exposure"] if kind is bool else [FLAGS[name]] if name in FLAGS else []
+    flags = [FLAGS[name]] if name in FLAGS else []
+    if kind is bool:
+        flags = [f"{flag(name)}/--no-{name}" if default else flag(name)]
     option = typer.Option(
         *flags, metavar=METAVARS.get(name), help=text, rich_help_panel=panel, show_default=False
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -16,7 +16,7 @@ from scipy.special import comb, logit
 from mgs.camera import Camera, extent_of
 from mgs.colour import SH_C0
 from mgs.fit.objective import Objective, View
-from mgs.gaussians import Gaussians
+from mgs.gaussians import ARRAYS, Gaussians
 from mgs.memory import padded
 from mgs.rotation import rotmat_from_quat
 from mgs.splat import as_drjit
@@ -138,13 +138,12 @@ def relocate(
     split_ones = np.flatnonzero(count)
     sources = np.repeat(np.arange(n), count)
     moved = rng.permutation(np.flatnonzero(dead))[: len(sources)]
-    parts = [np.array(getattr(model, f.name)) for f in fields(model)]
-    new = Gaussians(*parts)
+    new = model.map(np.array)
     opacities, factors = split(opacity[split_ones], count[split_ones] + 1)
     new.logit_opacities[split_ones] = logit(opacities)
     new.log_scales[split_ones] += np.log(factors)[:, None]
-    for part in parts:
-        part[moved] = part[sources]
+    for name in ARRAYS:
+        getattr(new, name)[moved] = getattr(new, name)[sources]
     along = SPREAD * np.exp(new.log_scales[moved].astype(np.float64))
     new.means[moved] += _rotated(new.quats[moved], along * rng.normal(size=along.shape))
     kept = np.arange(n)
@@ -233,7 +232,7 @@ def controlled(
 ) -> tuple[Objective, Gaussians, list[list[Any]]]:
     """Call a control. A Gaussian that changed is its own start in the prior; buffers are zero where
     a parameter changed. found: None for `Statistics`, which are measured here."""
-    before = Gaussians(*(np.array(getattr(model, f.name)) for f in fields(model)))
+    before = model.map(np.array)
     after, kept = density.control(before, found or statistics(goal, model), rng)
     same, source, prior = kept >= 0, np.where(kept < 0, ~kept, kept), goal.prior
 
@@ -256,7 +255,7 @@ def controlled(
 
     refilled = replace(
         prior,
-        start=Gaussians(*(start(f.name) for f in fields(after))),
+        start=replace(after, **{name: start(name) for name in ARRAYS}),
         lam={name: lam(name) for name in prior.lam},
     )
     kept_buffers = [
@@ -275,7 +274,7 @@ def statistics(goal: Objective, model: Gaussians) -> Statistics:
     return Statistics(weight, error)
 
 
-@frozen(lambda model, view: (*model.sh.shape, *view.recorded_sizes))
+@frozen(lambda model, view: (*model.recorded, *view.recorded_sizes))
 def _image_statistics(model: Gaussians, view: View) -> list[Any]:
     """Blending weights, and squared residuals times blending weights, of one image, Float [N] each.
 

@@ -6,7 +6,7 @@ One optimiser step uses one image. A pass uses every image once, in random order
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -30,7 +30,7 @@ from mgs.fit.objective import (
 from mgs.fit.optimisers import INFORMATION_PASSES, OPTIMISERS
 from mgs.fit.settings import TrainSettings
 from mgs.fit.stopping import StopReason, stop_reason
-from mgs.gaussians import MAX_SH_DEGREE, Gaussians, learned
+from mgs.gaussians import ARRAYS, MAX_SH_DEGREE, Gaussians, learned
 from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit
 from mgs.splat.recording import frozen
@@ -75,7 +75,7 @@ def _in_bounds(model: Gaussians) -> Gaussians:
         optimiser,
         error,
         prior.means,
-        *model.sh.shape,
+        *model.recorded,
         *view.recorded_sizes,
         len(others[-1]),
     )
@@ -209,9 +209,8 @@ def fit(
         tolerance = 0.0 if done < end else settings.tolerance
         stop = stop_reason(losses, tolerance, settings.passes)
     passes = len(losses) - 1
-    numpy = Gaussians(*(np.asarray(getattr(best, f.name)) for f in fields(best)))
     lowest = min((loss for loss in losses[1:] if np.isfinite(loss)), default=losses[0])
-    return Fit(numpy, lowest, tuple(losses), passes, passes * len(goal.photos), stop)
+    return Fit(best.map(np.asarray), lowest, tuple(losses), passes, passes * len(goal.photos), stop)
 
 
 def _rates(
@@ -270,5 +269,5 @@ def _pass(
 
 def _is_finite(model: Gaussians) -> bool:
     """Whether all parameters are finite."""
-    parts = [dr.all(dr.isfinite(getattr(model, f.name).array)) for f in fields(model)]
+    parts = [dr.all(dr.isfinite(getattr(model, name).array)) for name in ARRAYS]
     return bool(dr.all(parts)[0])

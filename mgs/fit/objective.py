@@ -29,7 +29,7 @@ one in reverse mode for each image.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -340,9 +340,7 @@ def objective(
         )
     # A copy, because Dr.Jit uses NumPy's memory in place. If parameters and start shared memory
     # when a step is recorded, its replays would take them for the same array (Dr.Jit 1.5).
-    start = as_drjit(
-        Gaussians(*(np.array(getattr(start, f.name), np.float32) for f in fields(start)))
-    )
+    start = as_drjit(start.map(lambda array: np.array(array, np.float32)))
     values = {
         name: filled((lam or {}).get(kind, 0.0), getattr(start, name).shape)
         for name, kind in learned(means).items()
@@ -448,7 +446,7 @@ def with_gradients(model: Gaussians, prior: ParameterPrior) -> Gaussians:
 
 
 def _sizes(model: Gaussians, prior: ParameterPrior, view: View, *others: Any) -> tuple[Any, ...]:
-    return prior.means, *model.sh.shape, *view.recorded_sizes
+    return prior.means, *model.recorded, *view.recorded_sizes
 
 
 @frozen(_sizes)

@@ -69,6 +69,9 @@ class TrainSettings(BaseModel):
     """The fit has settled when two passes in a row lower the loss by less than this share."""
     rates: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = RATES
     """Learning rate by kind of parameter, 0: not learned; `mean`, in metres, only if means move."""
+    antialiased: bool = True
+    """Draw Gaussians that are smaller than a pixel fainter (default), so that views from any
+    distance agree; or with their opacity, as in 3DGS and in the paper."""
     alpha_weight: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 0.0
     """Weight of alpha as a fourth channel in the loss, (sigma_rgb / sigma_alpha)^2; 0: not used."""
     decay: Positive = 0.1
@@ -102,5 +105,6 @@ def as_3dgs(extent: float) -> dict[str, Any]:
         "tolerance": 0.0,
         "sh_steps": 1000,
         "directional_rate": 1 / 20,
+        "antialiased": False,
         **COLOURS_ALONE,
     }

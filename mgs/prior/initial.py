@@ -8,9 +8,9 @@ behind it (docs/fit.md). All are fitted alike.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -20,7 +20,7 @@ from scipy.special import logit
 from mgs.camera import Camera
 from mgs.data.frames import Frame
 from mgs.data.visibility import in_image, in_mask, visible
-from mgs.gaussians import Gaussians, sh_from_rgb
+from mgs.gaussians import ARRAYS, Gaussians, sh_from_rgb
 from mgs.rotation import quat_from_normals
 
 if TYPE_CHECKING:
@@ -34,9 +34,10 @@ INITIAL_OPACITY = 0.9
 the mean log transmittance across the surface is -2 pi (s / spacing)^2 Li2(o) = -3.45. With 0.99 the
 derivative by the logit, o (1 - o), would be almost zero."""
 
-INSET = 0.6
-"""Depth of a Gaussian below the surface, pixels on the rock: EPS2D widens every footprint by about
-half a pixel, which would draw the rock too large. A chosen constant (docs/fit.md)."""
+INSET = {True: 0.3, False: 0.6}
+"""Depth of a Gaussian below the surface, pixels on the rock, by whether it is antialiased: EPS2D
+widens every footprint by about half a pixel, which would draw the rock too large. Chosen constants
+(docs/fit.md)."""
 
 THICKNESS = 0.1
 """Standard deviation of a Gaussian across the surface, over the spacing."""
@@ -70,16 +71,17 @@ Colours = tuple[np.ndarray, np.ndarray]
 def initial_gaussians(
     prior: Prior,
     frames: Sequence[Frame],
-    inset: float = INSET,
+    inset: float | None = None,
     gains: np.ndarray | None = None,
     colours: Callable[[Frame], Colours] | None = None,
+    antialiased: bool = True,
 ) -> tuple[Gaussians, np.ndarray]:
     """Place one flat Gaussian per sample of a prior, in its mean colour, then one behind each
     backed sample.
 
-    inset: depth of the Gaussians below the samples, in pixels on the surface (`pixel_on`). gains:
-    [V,3] exposures that divide the colours (`mgs.prior.exposure`). colours: `colours_of(prior)`, to
-    reuse it between calls.
+    inset: depth of the Gaussians below the samples, in pixels on the surface (`pixel_on`), by
+    default INSET. gains: [V,3] exposures that divide the colours (`mgs.prior.exposure`). colours:
+    `colours_of(prior)`, to reuse it between calls. antialiased: as in `Gaussians`.
 
     Returns (N + backed Gaussians of degree 0, seen [N] bool). A frame sees a sample that lies in
     its rock mask, faces the camera and agrees with the depth image (or else the mesh's depth) up to
@@ -87,7 +89,8 @@ def initial_gaussians(
     a file of a frame cannot be read, and as `mesh_depth`.
     """
     if prior.numbers.get("from") == "random":
-        return round_gaussians(prior.points, frames, gains)
+        start, seen = round_gaussians(prior.points, frames, gains)
+        return replace(start, antialiased=antialiased), seen
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)
     colours = colours or colours_of(prior)
@@ -97,6 +100,7 @@ def initial_gaussians(
         count[seen] += 1
     seen = count > 0
     rgb = np.where(seen[:, None], total / np.maximum(count, 1)[:, None], GREY)
+    inset = INSET[antialiased] if inset is None else inset
     below = inset * pixel_on(prior, [frame.camera for frame in frames])
     scales = np.log(prior.spacing * np.array([IN_PLANE_SCALE, IN_PLANE_SCALE, THICKNESS]))
     surface = Gaussians(
@@ -105,6 +109,7 @@ def initial_gaussians(
         quats=quat_from_normals(prior.normals).astype(np.float32),
         logit_opacities=np.full(n, logit(INITIAL_OPACITY), np.float32),
         sh=sh_from_rgb(rgb),
+        antialiased=antialiased,
     )
     return _with_backing(surface, prior), seen
 
@@ -185,10 +190,10 @@ def _with_backing(surface: Gaussians, prior: Prior) -> Gaussians:
         logit_opacities=np.full(count, logit(BACKING_OPACITY), np.float32),
         sh=over.sh,
     )
-    names = [field.name for field in fields(Gaussians)]
-    return Gaussians(
-        *(np.concatenate([getattr(surface, name), getattr(backing, name)]) for name in names)
-    )
+    both: dict[str, Any] = {
+        name: np.concatenate([getattr(surface, name), getattr(backing, name)]) for name in ARRAYS
+    }
+    return replace(surface, **both)
 
 
 def seen_colours(

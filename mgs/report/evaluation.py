@@ -17,7 +17,6 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path, working_in, write_json
-from mgs.gaussians import Gaussians
+from mgs.gaussians import ARRAYS, Gaussians
 from mgs.images import PNG_LEVEL, read_png
 from mgs.memory import KEPT_BYTES, release
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_surface
@@ -306,7 +305,8 @@ def _subject(gaussians: Gaussians, frames: Sequence[Frame], trained: list[str]) 
         [frame.name, camera_digest(frame.camera), frame_digests(frame, kinds)] for frame in frames
     ]
     known = {name: version for name, version in versions().items() if name != "commit"}
-    text = json.dumps([array_digest(asdict(gaussians).values()), views, trained, known])
+    model = array_digest(getattr(gaussians, name) for name in ARRAYS), gaussians.antialiased
+    text = json.dumps([*model, views, trained, known])
     return array_digest([np.frombuffer(text.encode(), np.uint8)])
 
 

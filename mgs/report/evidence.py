@@ -109,7 +109,8 @@ def last_images(settings: NbvSettings, prior: Prior, frames: Sequence[Frame]) ->
     Raises InputError if a frame cannot be read."""
     gains = exposure_of(prior)(frames) if settings.exposure else np.ones((len(frames), 3))
     with_alpha = settings.train.alpha_weight > 0
-    of_seeds = initial_gaussians(prior, frames[: settings.seeds])[0]
+    antialiased = settings.train.antialiased
+    of_seeds = initial_gaussians(prior, frames[: settings.seeds], antialiased=antialiased)[0]
 
     def start(views: Sequence[int]) -> Gaussians:
         shown = [frames[i] for i in views]

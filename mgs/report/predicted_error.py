@@ -161,7 +161,8 @@ def predictor(
 
 def _without(frames: Sequence[Frame], prior: Prior, settings: NbvSettings) -> Predictor:
     """`Predictor` of a model that is fitted to some frames of the run."""
-    start = initial_gaussians(prior, frames)[0].with_degree(settings.sh)
+    how = settings.train.antialiased
+    start = initial_gaussians(prior, frames, antialiased=how)[0].with_degree(settings.sh)
     cache = ListCache()
     columns = groups(start.sh_degree)
     cameras = [frame.camera for frame in frames]

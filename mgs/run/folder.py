@@ -30,7 +30,6 @@ import math
 import warnings
 import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -43,7 +42,7 @@ from mgs.data.frames import Frame
 from mgs.data.up import upright
 from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, read_json, reading, write_json
-from mgs.gaussians import Gaussians
+from mgs.gaussians import ARRAYS, Gaussians
 from mgs.notebook import cloud, html, thumbnails
 from mgs.policy.from_file import label
 from mgs.prior.build import Prior, load_prior
@@ -225,12 +224,17 @@ def check_same_frames(out: Path, dataset: Dataset) -> None:
 def write_checkpoint(out: Path, state: State) -> None:
     """Commit a step: the state in one file, renamed into place; then the readable lines."""
     text = json.dumps(
-        {"taken": state.taken, "steps": state.steps, "inputs": state.inputs}, allow_nan=False
+        {
+            "taken": state.taken,
+            "steps": state.steps,
+            "inputs": state.inputs,
+            "antialiased": state.gaussians.antialiased,
+        },
+        allow_nan=False,
     )
+    arrays = {name: getattr(state.gaussians, name) for name in ARRAYS}
     with atomic_path(out / "checkpoint.npz") as temporary, open(temporary, "wb") as file:
-        np.savez(
-            file, H=state.H, surface=state.surface, json=np.array(text), **asdict(state.gaussians)
-        )
+        np.savez(file, H=state.H, surface=state.surface, json=np.array(text), **arrays)
     write_steps(out, state)
 
 
@@ -249,13 +253,14 @@ def read_checkpoint(out: Path) -> State | None:
     path = out / "checkpoint.npz"
     if not path.is_file():
         return None
-    kinds = {"json": "U", "H": "f", "surface": "f"} | {f.name: "f" for f in fields(Gaussians)}
+    kinds = {"json": "U", "H": "f", "surface": "f"} | dict.fromkeys(ARRAYS, "f")
     try:
         with reading(path), zipfile.ZipFile(path) as file:
             arrays = {name: _member(file, name, kind) for name, kind in kinds.items()}
         record = json.loads(str(arrays.pop("json")[()]))
         H, surface = arrays.pop("H"), arrays.pop("surface")
-        state = State(Gaussians(**arrays).check(), H, surface, **record)
+        gaussians = Gaussians(**arrays, antialiased=record.pop("antialiased") is True).check()
+        state = State(gaussians, H, surface, **record)
         for number, line in enumerate(state.steps, 1):
             check_line(number, line)
         if not isinstance(state.inputs, dict) or frames_of(state.steps) != state.taken:

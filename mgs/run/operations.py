@@ -43,8 +43,8 @@ def operations_of(
 
     def initial(frames: Sequence[Frame]) -> Gaussians:
         gains = exposure(frames) if exposure else None
-        start = initial_gaussians(prior, frames, gains=gains, colours=colours)[0]
-        return start.with_degree(settings.sh)
+        how = gains, colours, settings.train.antialiased
+        return initial_gaussians(prior, frames, None, *how)[0].with_degree(settings.sh)
 
     def run_fit(
         gaussians: Gaussians,

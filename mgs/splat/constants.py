@@ -4,6 +4,11 @@ kernels."""
 EPS2D = 0.3
 """px^2. Added to the diagonal of the 2D covariance: a low-pass filter of about one pixel (3DGS)."""
 
+COMPENSATION_MIN = 1e-6
+"""No unit. Lower bound of sqrt(det S / det(S + EPS2D I)), the factor on the opacity of antialiased
+Gaussians with the 2D covariance S (Yu et al. 2024, Mip-Splatting, Eq. 10; `compensations` of
+gsplat). At the bound, where its derivative is 0, alpha is far below ALPHA_MIN."""
+
 ALPHA_MIN = 1.0 / 255.0
 """No unit. A splat is not drawn on a pixel where its alpha is below one step of an 8-bit image
 (3DGS)."""

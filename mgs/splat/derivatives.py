@@ -13,7 +13,7 @@ Symbols: docs/notation.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -22,7 +22,7 @@ import numpy as np
 
 from mgs.gaussians import Gaussians
 from mgs.memory import padded
-from mgs.splat.constants import LOG_SCALE_RANGE
+from mgs.splat.constants import COMPENSATION_MIN, LOG_SCALE_RANGE
 from mgs.splat.kernels import LN2, POWERS, log_alpha_tangent
 from mgs.splat.projection import (
     axes2d,
@@ -42,7 +42,7 @@ class Geometry:
     """Derivatives by all parameters of a Gaussian but its mean; Dr.Jit arrays [N].
 
     shape: derivative of ln alpha by each of 3 log-scales and 4 quaternion entries, polynomials in
-        xi^2, xi eta and eta^2.
+        1, xi^2, xi eta and eta^2.
     logit: derivative of ln alpha by the opacity logit, 1 - opacity.
     basis: values of the K spherical harmonics.
     positive: for r, g, b: 1, or 0 where the colour is clamped at 0.
@@ -58,7 +58,7 @@ class Geometry:
 class ByMean:
     """Derivatives by a displacement of the mean along some direction, per metre.
 
-    log_alpha: of ln alpha, a polynomial without constant.
+    log_alpha: of ln alpha, a polynomial.
     colour: of r, g, b of the splat; empty for SH degree 0.
     """
 
@@ -88,6 +88,11 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
     cyclic shift of (0, 1, 2). A change dq of a quaternion q of norm n rotates the local axes by
     (2/n) Im(conj(q/n) dq).
 
+    If the Gaussians are antialiased, the factor on their opacity changes, too. Both derivatives
+    then have a constant: with the pair (i, i) or (i, j) and its s_i^2 or s_i^2 - s_j^2 as s, and
+    det S / det(S + EPS2D I) = r, it is s (4 ln2^2 / r sum_k s_k^2 (b_k x b_i) (b_k x b_j) - 2 ln2
+    b_i.b_j).
+
     gaussians: TensorXf fields. camera: `camera_array`. splats: their projection.
     """
     mean = mi.Vector3d(rows_as_vectors(gaussians.means, mi.Vector3f))
@@ -95,13 +100,18 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
     log_scales = mi.Vector3d(rows_as_vectors(gaussians.log_scales, mi.Vector3f))
     _, unit, _ = axes2d(mean, quats, camera)
     scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
-    k, p, e = whitening([a * s for a, s in zip(unit, scales, strict=True)])
+    k, p, e, share = whitening([a * s for a, s in zip(unit, scales, strict=True)])
     b = [mi.Vector2d(p * (t.x - k * t.y), e * t.y) for t in unit]
+    axes = list(zip(b, scales, strict=True))
 
     def product(s: Any, i: int, j: int) -> Any:
-        x, y = b[i], b[j]
-        f = 4 * LN2 * LN2 * s
-        return mi.Vector3d(f * x.x * y.x, f * (x.x * y.y + x.y * y.x), f * x.y * y.y)
+        x, y, f, constant = b[i], b[j], 4 * LN2 * LN2 * s, mi.Float64(0)
+        if gaussians.antialiased:
+            areas = ((v * (c.x * x.y - c.y * x.x), v * (c.x * y.y - c.y * y.x)) for c, v in axes)
+            own = f * sum(one * other for one, other in areas) / share
+            bounded = share <= COMPENSATION_MIN**2
+            constant = dr.select(bounded, 0, own - 2 * LN2 * s * dr.dot(x, y))
+        return mi.Vector4d(constant, f * x.x * y.x, f * (x.x * y.y + x.y * y.x), f * x.y * y.y)
 
     free = [(s > LOG_SCALE_RANGE[0]) & (s < LOG_SCALE_RANGE[1]) for s in log_scales]
     by_scale = [dr.select(free[i], product(scales[i] * scales[i], i, i), 0) for i in range(3)]
@@ -119,7 +129,8 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
     transparency = 1 / (1 + dr.exp(mi.Float64(gaussians.logit_opacities.array)))
     basis = sh_basis(mean, camera, gaussians.sh.shape[1])
     positive = [dr.select(c > 0, mi.Float(1), 0) for c in (splats.red, splats.green, splats.blue)]
-    shape = [dict(zip(POWERS[3:], m, strict=True)) for m in (*by_scale, *by_quat)]
+    powers = POWERS[0], *POWERS[3:]
+    shape = [dict(zip(powers, m, strict=True)) for m in (*by_scale, *by_quat)]
     return Geometry(shape, transparency, basis, positive)
 
 
@@ -131,18 +142,17 @@ def by_means(gaussians: Gaussians, camera: Any) -> list[ByMean]:
     `camera_array`.
     """
     columns = []
-    values = {field.name: dr.detach(getattr(gaussians, field.name)) for field in fields(gaussians)}
+    fixed = gaussians.map(dr.detach)
     for axis in np.eye(3, dtype=np.float32):
         with dr.resume_grad():
-            means = dr.copy(values["means"])
+            means = dr.copy(fixed.means)
             dr.enable_grad(means)
             dr.set_grad(means, mi.TensorXf(padded(np.tile(axis, (len(gaussians), 1)))))
-            splats = project64(Gaussians(**{**values, "means": means}), camera)
-            # AllowNoGrad: the opacity does not depend on the means.
+            splats = project64(replace(fixed, means=means), camera)
+            # AllowNoGrad: without antialiasing, the opacity does not depend on the means.
             dr.forward_to(splats, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
             tangents, splats = dr.grad(splats), dr.detach(splats)
         polynomial = log_alpha_tangent(tangents, splats)
-        del polynomial[0, 0]  # the part of the opacity
         columns.append(ByMean(polynomial, tangents.colour if gaussians.sh_degree else []))
     return columns
 
@@ -156,7 +166,7 @@ def along_normals(columns: list[ByMean], normals: np.ndarray) -> ByMean:
     parts = [mi.Float64(padded(part, np.float64)) for part in normals.T]
     polynomial = {
         powers: sum(n * c.log_alpha[powers] for n, c in zip(parts, columns, strict=True))
-        for powers in POWERS[1:]
+        for powers in POWERS
     }
     by_axis = zip(*(c.colour for c in columns), strict=True)
     colour = [sum(n * g for n, g in zip(parts, channel, strict=True)) for channel in by_axis]

@@ -11,6 +11,7 @@ r g b in each), 3 log-scales, 4 of the quaternion, 1 opacity logit; then 0, 1 or
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -209,7 +210,7 @@ def exact(
     normals: np.ndarray | None = None,
     alpha_weight: float = 0.0,
 ) -> np.ndarray:
-    """Exact diagonal of J^T J, in one pass over the image: seven sums per splat, no Jacobian.
+    """Exact diagonal of J^T J, in one pass over the image: ten sums per splat, no Jacobian.
 
     With means it takes 16 sums, or 34 above SH degree 0. means, alpha_weight: as in `fisher`.
     normals: float64 [N,3] of length 1 for means="normal", else None.
@@ -221,7 +222,7 @@ def exact(
     return np.asarray(_diagonal(*parts, sums, by_mean))[:, :size]
 
 
-@frozen(lambda gaussians, camera, splats, sums, by_mean: (*gaussians.sh.shape, len(by_mean)))
+@frozen(lambda gaussians, camera, splats, sums, by_mean: (*gaussians.recorded, len(by_mean)))
 def _diagonal(
     gaussians: Gaussians, camera: Any, splats: Any, sums: Moments, by_mean: list[ByMean]
 ) -> Any:
@@ -295,7 +296,7 @@ def _gradient(
     with dr.resume_grad():
         learned = {name: dr.copy(dr.detach(getattr(gaussians, name))) for name in LEARNED}
         dr.enable_grad(list(learned.values()))
-        model = Gaussians(dr.detach(gaussians.means), **learned)
+        model = replace(gaussians, means=dr.detach(gaussians.means), **learned)
         rgb = render(model, camera, background, cache).rgb
         dr.backward_from(dr.sum(rgb * image_gradient(dr.detach(rgb)), axis=None))
         gradients = [np.asarray(dr.grad(value)) for value in learned.values()]

@@ -306,9 +306,7 @@ def fisher_moments(cross: bool, means: bool) -> tuple[list[tuple[int, int]], lis
     cross: products with colours are needed. means: derivatives by the means are needed, which alone
     contain xi and eta to the first power.
     """
-    squared, mixed = [0, 4], [0, 2] if cross else []
-    if cross or means:
-        squared.append(2)
+    squared, mixed = [0, 4, 2], [0, 2] if cross else []
     if means:
         squared += [1, 3]
         mixed += [1] if cross else []
@@ -319,8 +317,8 @@ def fisher_moments(cross: bool, means: bool) -> tuple[list[tuple[int, int]], lis
 
 
 def fisher_sums(cross: bool, means: bool) -> int:
-    """Number of sums per splat of `fisher`: 7 for the exact diagonal, 22 for blocks; with means 16,
-    and 34 with `cross`."""
+    """Number of sums per splat of `fisher`: 10 for the exact diagonal, 22 for blocks; with means
+    16, and 34 with `cross`."""
     squared, mixed = fisher_moments(cross, means)
     return 1 + len(squared) + 3 * len(mixed)
 

@@ -26,7 +26,13 @@ import mitsuba as mi
 from mgs.camera import Camera
 from mgs.gaussians import SH_MAX, Gaussians
 from mgs.rotation import QUAT_MIN
-from mgs.splat.constants import EPS2D, FRUSTUM_MARGIN, LOG_SCALE_RANGE, NEAR
+from mgs.splat.constants import (
+    COMPENSATION_MIN,
+    EPS2D,
+    FRUSTUM_MARGIN,
+    LOG_SCALE_RANGE,
+    NEAR,
+)
 from mgs.splat.recording import frozen
 
 LOG2E = 1.4426950408889634
@@ -165,8 +171,9 @@ def axes2d(mean: Any, quats: Any, camera: Any) -> tuple[Any, list[Any], Any]:
     return (fx * x + cx, fy * y + cy, z), unit, visible
 
 
-def whitening(axes: list[Any]) -> tuple[Any, Any, Any]:
-    """(shear, white_x, white_y) of the 2D covariance sum_i axis_i axis_i^T + EPS2D I, px^2.
+def whitening(axes: list[Any]) -> tuple[Any, Any, Any, Any]:
+    """(shear, white_x, white_y) of the 2D covariance sum_i axis_i axis_i^T + EPS2D I, px^2, and
+    the share of its determinant without EPS2D, 0 to 1.
 
     axes: the three semi-axes of the Gaussian in the image, pixels, Vector2d.
     The determinant is a sum of squared 2x2 minors of the axes (Cauchy-Binet formula). All terms are
@@ -176,8 +183,9 @@ def whitening(axes: list[Any]) -> tuple[Any, Any, Any]:
     b = sum(a.x * a.y for a in axes)
     trace = sum(dr.squared_norm(a) for a in axes)
     minors = [axes[i].x * axes[j].y - axes[i].y * axes[j].x for i, j in ((0, 1), (0, 2), (1, 2))]
-    det = sum(m * m for m in minors) + EPS2D * trace + EPS2D * EPS2D
-    return b / c, dr.sqrt(0.5 * LOG2E * c / det), dr.sqrt(0.5 * LOG2E / c)
+    own = sum(m * m for m in minors)
+    det = own + EPS2D * trace + EPS2D * EPS2D
+    return b / c, dr.sqrt(0.5 * LOG2E * c / det), dr.sqrt(0.5 * LOG2E / c), own / det
 
 
 def _with_rest(value: Any) -> tuple[Any, Any]:
@@ -198,8 +206,11 @@ def project64(gaussians: Gaussians, camera: Any) -> Splats:
     logit = mi.Float64(gaussians.logit_opacities.array)
     (x, y, depth), unit, visible = axes2d(mean, quats, camera)
     scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
-    shear, white_x, white_y = whitening([a * s for a, s in zip(unit, scales, strict=True)])
+    axes = [a * s for a, s in zip(unit, scales, strict=True)]
+    shear, white_x, white_y, share = whitening(axes)
     log2_opacity = LOG2E * (dr.minimum(logit, 0) - dr.log(1 + dr.exp(-dr.abs(logit))))
+    if gaussians.antialiased:
+        log2_opacity += 0.5 * LOG2E * dr.log(dr.maximum(share, COMPENSATION_MIN**2))
     finite = dr.all(dr.isfinite(mean)) & dr.all(dr.isfinite(quats))
     finite &= dr.all(dr.isfinite(log_scales)) & dr.isfinite(logit)
     colour, index = mi.Color3d(0.5), dr.arange(mi.UInt32, len(gaussians))
@@ -233,7 +244,7 @@ def project(gaussians: Gaussians, camera: Any) -> Splats:
     )
 
 
-@frozen(lambda gaussians, camera: gaussians.sh.shape)
+@frozen(lambda gaussians, camera: gaussians.recorded)
 def projected(gaussians: Gaussians, camera: Any) -> Splats:
     """`project`, recorded. Not differentiable."""
     return project(gaussians, camera)

@@ -9,7 +9,7 @@ central differences.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from mgs.rotation import rotmat_from_quat
 from mgs.splat.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
+    COMPENSATION_MIN,
     EPS2D,
     FRUSTUM_MARGIN,
     LOG_SCALE_RANGE,
@@ -34,13 +35,15 @@ class Projected:
     """Projected Gaussians.
 
     means2d: [N,2] px. cov2d: [N,2,2] px^2, EPS2D included. depths: [N] m, 1 where not visible.
-    opacities: [N]. colours: [N,3] linear RGB. visible: [N] bool, in front of the near plane.
+    opacities: [N], of it compensations [N] the factor of antialiased Gaussians, else 1. colours:
+    [N,3] linear RGB. visible: [N] bool, in front of the near plane.
     """
 
     means2d: np.ndarray
     cov2d: np.ndarray
     depths: np.ndarray
     opacities: np.ndarray
+    compensations: np.ndarray
     colours: np.ndarray
     visible: np.ndarray
 
@@ -102,8 +105,13 @@ def project(gaussians: Gaussians, camera: Camera) -> Projected:
     sh = np.asarray(gaussians.sh, np.float64)
     raw = 0.5 + np.einsum("nk,nkc->nc", sh_basis(directions, gaussians.sh_degree), sh)
     opacities = expit(np.asarray(gaussians.logit_opacities, np.float64))
+    compensations = np.ones(len(means))
+    if gaussians.antialiased:  # |x cross y|^2 of the rows x, y of A is det(A A^T)
+        own = (np.cross(A[:, 0], A[:, 1]) ** 2).sum(1)
+        compensations = np.maximum(np.sqrt(own / np.linalg.det(cov2d)), COMPENSATION_MIN)
     means2d = np.stack([fx * x / z + cx, fy * y / z + cy], 1)
-    return Projected(means2d, cov2d, z, opacities, np.maximum(raw, 0), visible)
+    opacities = opacities * compensations
+    return Projected(means2d, cov2d, z, opacities, compensations, np.maximum(raw, 0), visible)
 
 
 def _half_square(d: np.ndarray, cov: np.ndarray) -> np.ndarray:
@@ -192,16 +200,16 @@ def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 def _moved(gaussians: Gaussians, name: str, step: np.ndarray) -> Gaussians:
     """A float64 copy with `step` added to one parameter of every Gaussian."""
-    values = {field: np.array(value, np.float64) for field, value in vars(gaussians).items()}
-    return Gaussians(**{**values, name: values[name] + step})
+    moved = gaussians.map(lambda array: np.array(array, np.float64))
+    return replace(moved, **{name: getattr(moved, name) + step})
 
 
 def _projection_jacobian(
     gaussians: Gaussians, camera: Camera, directions: np.ndarray, step: float = 1e-5
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, ...]:
     """Central differences of `project` by the 3 log-scales, the 4 entries of the quaternion and the
-    means along `directions` [N,m,3], metres: of means2d [N,7+m,2], cov2d [N,7+m,2,2] and colours
-    [N,7+m,3]."""
+    means along `directions` [N,m,3], metres: of means2d [N,7+m,2], cov2d [N,7+m,2,2], colours
+    [N,7+m,3] and the logarithm of the compensations [N,7+m]."""
     moves = [("log_scales", row) for row in np.eye(3)] + [("quats", row) for row in np.eye(4)]
     moves += [("means", direction) for direction in directions.transpose(1, 0, 2)]
     derivatives = []
@@ -209,10 +217,14 @@ def _projection_jacobian(
         up, down = (
             project(_moved(gaussians, name, sign * step * direction), camera) for sign in (+1, -1)
         )
-        changes = (up.means2d - down.means2d, up.cov2d - down.cov2d, up.colours - down.colours)
+        changes = (
+            up.means2d - down.means2d,
+            up.cov2d - down.cov2d,
+            up.colours - down.colours,
+            np.log(up.compensations / down.compensations),
+        )
         derivatives.append([change / (2 * step) for change in changes])
-    means2d, cov2d, colours = (np.stack(columns, 1) for columns in zip(*derivatives, strict=True))
-    return means2d, cov2d, colours
+    return tuple(np.stack(columns, 1) for columns in zip(*derivatives, strict=True))
 
 
 def mean_directions(n: int, means: str = "frozen", normals: np.ndarray | None = None) -> np.ndarray:
@@ -253,7 +265,8 @@ def jacobian(
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     pixels = np.stack([u.ravel(), v.ravel()], 1)
     moves = mean_directions(n, means, normals)
-    d_means2d, d_cov2d, d_colours = _projection_jacobian(gaussians, camera, moves)
+    transparency = expit(-np.asarray(gaussians.logit_opacities, np.float64))
+    d_means2d, d_cov2d, d_colours, d_log = _projection_jacobian(gaussians, camera, moves)
     J = np.zeros((len(pixels), 3 + extra, n, 3 * K + 1 + d_cov2d.shape[1]))
     for i, j in enumerate(order):
         drawn = np.flatnonzero(alpha[:, i])  # on other pixels the splat changes nothing
@@ -263,10 +276,10 @@ def jacobian(
         dalpha = np.where(clipped[drawn, i], 0.0, alpha[drawn, i])
         e = (pixels[drawn] - projected.means2d[j]) @ np.linalg.inv(projected.cov2d[j])
         dlog = [
-            e @ d_mean + ((e @ d_cov) * e).sum(1) / 2
-            for d_mean, d_cov in zip(d_means2d[j], d_cov2d[j], strict=True)
+            e @ d_mean + ((e @ d_cov) * e).sum(1) / 2 + d
+            for d_mean, d_cov, d in zip(d_means2d[j], d_cov2d[j], d_log[j], strict=True)
         ]
-        dlog.insert(7, np.full(len(e), 1 - projected.opacities[j]))
+        dlog.insert(7, np.full(len(e), transparency[j]))
         J[drawn, :, j, 3 * K :] = D[:, :, None] * (dalpha[:, None] * np.stack(dlog, 1))[:, None, :]
         J[drawn, :3, j, 3 * K + 8 :] += weights[drawn, i, None, None] * d_colours[j, 7:].T
     return J

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -14,7 +14,7 @@ import numpy as np
 from mgs import runtime
 from mgs.camera import Camera
 from mgs.errors import InputError
-from mgs.gaussians import SH_MAX, Gaussians
+from mgs.gaussians import ARRAYS, SH_MAX, Gaussians
 from mgs.memory import padded
 from mgs.notebook import html, picture
 from mgs.splat import blocks, kernels
@@ -172,8 +172,7 @@ def as_drjit(gaussians: Gaussians) -> Gaussians:
     """
     runtime.start()
     gaussians.check_shapes()
-    values = (getattr(gaussians, f.name) for f in fields(gaussians))
-    return Gaussians(*(v if dr.is_array_v(v) else mi.TensorXf(padded(v)) for v in values))
+    return gaussians.map(lambda v: v if dr.is_array_v(v) else mi.TensorXf(padded(v)))
 
 
 class _Rasterise(dr.CustomOp):
@@ -248,8 +247,7 @@ def splats_and_lists(
     try:
         return splats, *(cache or ListCache()).get(camera, dr.detach(splats))
     except InputError:
-        values = (np.asarray(dr.detach(getattr(gaussians, f.name))) for f in fields(gaussians))
-        Gaussians(*values).check()
+        gaussians.map(lambda v: np.asarray(dr.detach(v))).check()
         raise
 
 
@@ -306,7 +304,7 @@ def jvp(
     model = as_drjit(gaussians)
     given = {name: _checked_tangent(model, name, tangent) for name, tangent in tangents.items()}
     with dr.resume_grad():
-        copy = Gaussians(*(dr.copy(dr.detach(getattr(model, f.name))) for f in fields(model)))
+        copy = model.map(lambda v: dr.copy(dr.detach(v)))
         for name, tangent in given.items():
             dr.enable_grad(getattr(copy, name))
             dr.set_grad(getattr(copy, name), tangent)
@@ -318,9 +316,8 @@ def jvp(
 
 def _checked_tangent(gaussians: Gaussians, name: str, tangent: Any) -> Any:
     """A tangent as detached TensorXf. Raises InputError as `jvp`."""
-    names = [f.name for f in fields(gaussians)]
-    if name not in names:
-        raise InputError(f"tangents: {name!r} is no parameter; choose from {', '.join(names)}")
+    if name not in ARRAYS:
+        raise InputError(f"tangents: {name!r} is no parameter; choose from {', '.join(ARRAYS)}")
     shape = tuple(getattr(gaussians, name).shape)
     try:
         with np.errstate(over="ignore"):

@@ -11,6 +11,7 @@ less than 30,000 steps it changes during the first half of the steps.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,7 @@ def _fit(dataset: Path, prior: Path, settings: dict[str, Any]) -> dict[str, Any]
     passes = settings.get("passes", 1) * PASSES
     train = TrainSettings(**as_3dgs(extent_of(cameras)), passes=passes, seed=seed)
     start = round_gaussians(points, frames)[0].with_degree(DEGREE)
+    start = replace(start, antialiased=train.antialiased)
     kept = kept_within(IMAGE_BYTES, lambda i: target_of(frames[i]), lambda target: target.nbytes)
     targets = Deferred(range(len(frames)), kept)
     model = fit(start, cameras, targets, train).gaussians

@@ -12,11 +12,9 @@ import drjit as dr
 import numpy as np
 
 from mgs.camera import Camera, look_at
-from mgs.gaussians import Gaussians
+from mgs.gaussians import ARRAYS, Gaussians
 from mgs.splat import as_drjit
 from mgs.splat.reference import margins
-
-PARAMETERS = ("means", "log_scales", "quats", "logit_opacities", "sh")
 
 SIZE = (45, 27)
 """Width and height of most scenes, pixels: no multiple of the 8x4 block in either direction."""
@@ -34,7 +32,14 @@ def make_camera(
 
 
 def make_gaussians(
-    n, seed, degree=0, log_scales=(-4.0, -1.2), logits=(-4.0, 5.0), spread=0.6, colour=2.5
+    n,
+    seed,
+    degree=0,
+    log_scales=(-4.0, -1.2),
+    logits=(-4.0, 5.0),
+    spread=0.6,
+    colour=2.5,
+    antialiased=True,
 ) -> Gaussians:
     """n random Gaussians around the origin, float32: anisotropic, some nearly opaque, some colours
     clamped at 0."""
@@ -45,6 +50,7 @@ def make_gaussians(
         quats=rng.normal(0, 1, (n, 4)).astype(np.float32),
         logit_opacities=rng.uniform(*logits, n).astype(np.float32),
         sh=rng.normal(0, colour / (degree + 1), (n, (degree + 1) ** 2, 3)).astype(np.float32),
+        antialiased=antialiased,
     )
 
 
@@ -59,7 +65,7 @@ def place(camera: Camera, pixels, depths) -> np.ndarray:
 
 def double(gaussians: Gaussians) -> Gaussians:
     """A float64 copy, for central differences of the reference."""
-    return Gaussians(*(np.array(value, np.float64) for value in vars(gaussians).values()))
+    return gaussians.map(lambda array: np.array(array, np.float64))
 
 
 def changed(gaussians: Gaussians, **values) -> Gaussians:
@@ -68,7 +74,7 @@ def changed(gaussians: Gaussians, **values) -> Gaussians:
     return replace(gaussians, **single)
 
 
-def with_gradients(gaussians: Gaussians, names=PARAMETERS) -> Gaussians:
+def with_gradients(gaussians: Gaussians, names=ARRAYS) -> Gaussians:
     """A Dr.Jit copy with gradients enabled for some parameters."""
     model = as_drjit(gaussians)
     for name in names:
@@ -77,7 +83,7 @@ def with_gradients(gaussians: Gaussians, names=PARAMETERS) -> Gaussians:
     return model
 
 
-def gradients_of(model: Gaussians, names=PARAMETERS) -> dict[str, np.ndarray]:
+def gradients_of(model: Gaussians, names=ARRAYS) -> dict[str, np.ndarray]:
     return {name: np.asarray(dr.grad(getattr(model, name))) for name in names}
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mgs import memory
 from mgs.camera import MAX_PIXELS, MAX_SIDE
 from mgs.errors import InputError
-from mgs.gaussians import MAX_GAUSSIANS, Gaussians
+from mgs.gaussians import ARRAYS, MAX_GAUSSIANS
 from mgs.splat import (
     ListCache,
     as_drjit,
@@ -35,7 +35,6 @@ from mgs.splat.projection import camera_array, project
 from mgs.splat.walking import PIXELS, packet_count
 
 from .scenes import (
-    PARAMETERS,
     changed,
     gradients_of,
     make_camera,
@@ -183,7 +182,7 @@ def assert_cached_is_cold(gaussians, camera, cache) -> None:
 @given(
     seed=st.integers(0, 2**31),
     drift=st.sampled_from([1e-3, 1e-2, 0.1, 1.0]),
-    names=st.sets(st.sampled_from(PARAMETERS), min_size=1),
+    names=st.sets(st.sampled_from(ARRAYS), min_size=1),
     teleport=st.booleans(),
 )
 def test_stale_lists_never_change_an_image(seed, drift, names, teleport):
@@ -317,7 +316,7 @@ def test_one_view_larger_than_the_budget_still_renders():
 def test_pairs_are_counted_in_64_bits(size, n, what):
     """2^32 pairs, which 32 bits count as none, are refused before memory is taken."""
     camera, one = make_camera(size, focal=100.0), make_gaussians(1, 0, spread=0)
-    many = Gaussians(*(np.repeat(getattr(one, name), n, 0) for name in vars(one)))
+    many = one.map(lambda array: np.repeat(array, n, 0))
     many.log_scales[:], many.logit_opacities[:] = 9, 2
     said = f"^view: 4,294,967,296 pairs of a Gaussian and one of its {what} .* 512.0 GiB.*$"
     with pytest.raises(InputError, match=said):
@@ -393,7 +392,7 @@ def test_what_is_too_large_for_the_kernels_is_refused_at_once():
     one = make_gaussians(1, 0, 3)
 
     def many(n):
-        return Gaussians(*(np.broadcast_to(v[0], (n, *v.shape[1:])) for v in vars(one).values()))
+        return one.map(lambda array: np.broadcast_to(array[0], (n, *array.shape[1:])))
 
     for call in (render, fisher):
         with pytest.raises(InputError, match="gaussians: 33,554,433 are more than 33,554,432"):

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mgs.gaussians import ARRAYS
 from mgs.splat import Image, reference, render
 from mgs.splat.rendering import composite_channels, splats_and_lists
 
 from .scenes import (
-    PARAMETERS,
     calm,
     changed,
     compare,
@@ -39,7 +39,7 @@ def image_weights(camera, seed=0) -> dict[str, np.ndarray]:
     return {name: rng.normal(0, 1, size) for name, size in sizes.items()}
 
 
-def gradients(gaussians, camera, weights, wanted=PARAMETERS) -> dict[str, np.ndarray]:
+def gradients(gaussians, camera, weights, wanted=ARRAYS) -> dict[str, np.ndarray]:
     """Gradient of sum(weight * image), summed over the outputs, by `dr.backward`."""
     model = with_gradients(gaussians, wanted)
     image = render(model, camera, BACKGROUND)
@@ -75,13 +75,13 @@ def case(degree: int, n=10):
     camera, style = make_camera(), {"log_scales": (-4.0, -1.0)}
     gaussians = calm(lambda seed: make_gaussians(n, seed, degree, **style), camera, 10 + degree)
     weights = image_weights(camera, degree)
-    expected = differences(gaussians, camera, weights, PARAMETERS[:4])
+    expected = differences(gaussians, camera, weights, ARRAYS[:4])
     J = reference.jacobian(gaussians, camera, BACKGROUND)
     flat = np.tensordot(weights["rgb"].reshape(-1, 3), J, axes=([0, 1], [0, 1]))
     K = (degree + 1) ** 2
     expected["sh"] = np.zeros((len(OUTPUTS), n, K, 3))
     expected["sh"][0] = flat[:, : 3 * K].reshape(n, K, 3)
-    shapes = [expected[name][0].reshape(n, -1) for name in PARAMETERS[1:4]]
+    shapes = [expected[name][0].reshape(n, -1) for name in ARRAYS[1:4]]
     assert compare(flat[:, 3 * K :], np.concatenate(shapes, 1))[0] < 1e-7
     return gaussians, camera, weights, expected
 
@@ -90,7 +90,7 @@ def case(degree: int, n=10):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_gradient_of_each_output(degree, output, record_property):
     gaussians, camera, weights, expected = case(degree)
-    wanted = PARAMETERS if output == "rgb" else PARAMETERS[:4]
+    wanted = ARRAYS if output == "rgb" else ARRAYS[:4]
     found = gradients(gaussians, camera, {output: weights[output]}, wanted)
     for name in wanted:
         truth = expected[name][OUTPUTS.index(output)]
@@ -109,7 +109,7 @@ def test_gradient_of_the_depth_of_faint_splats(seed):
     gaussians = make_gaussians(5, seed, logits=(-3, -1))
     assert margins(gaussians, camera).min() > 1e-3
     weights = image_weights(camera, seed)
-    wanted = PARAMETERS[:4]
+    wanted = ARRAYS[:4]
     found = gradients(gaussians, camera, {"depth": weights["depth"]}, wanted)
     expected = differences(gaussians, camera, weights, wanted)
     for name in wanted:
@@ -147,7 +147,7 @@ def test_some_channels_alone_have_the_same_image_and_derivatives(means, channels
     camera, gaussians = make_camera(), make_gaussians(60, 3, 1, log_scales=(-5.0, -1.5))
     weights = image_weights(camera)
     weights = np.dstack([weights["rgb"], weights["alpha"]])[..., :channels].astype(np.float32)
-    wanted = PARAMETERS if means else PARAMETERS[1:]
+    wanted = ARRAYS if means else ARRAYS[1:]
 
     def alone(model):
         splats, lists, packed = splats_and_lists(model, camera, None)
@@ -182,8 +182,8 @@ def test_frozen_means_change_no_other_gradient():
     """The kernel then leaves out two sums."""
     gaussians, camera, weights, _ = case(1)
     free = gradients(gaussians, camera, weights)
-    frozen = gradients(gaussians, camera, weights, PARAMETERS[1:])
-    for name in PARAMETERS[1:]:
+    frozen = gradients(gaussians, camera, weights, ARRAYS[1:])
+    for name in ARRAYS[1:]:
         np.testing.assert_array_equal(free[name], frozen[name], err_msg=name)
 
 
@@ -208,16 +208,18 @@ def test_gradient_stops_where_something_is_clamped():
     stretch=st.floats(0.1, 4),
     logit=st.floats(-2, 10),
     focal=st.floats(20, 80),
+    antialiased=st.booleans(),
 )
-def test_gradient_for_any_scene(seed, degree, scale, stretch, logit, focal):
-    camera, style = make_camera(focal=focal), ((scale - stretch, scale), (logit - 4, logit))
-    gaussians = calm(lambda s: make_gaussians(10, s, degree, *style), camera, seed)
+def test_gradient_for_any_scene(seed, degree, scale, stretch, logit, focal, antialiased):
+    camera, style = make_camera(focal=focal), {"antialiased": antialiased}
+    style |= {"log_scales": (scale - stretch, scale), "logits": (logit - 4, logit)}
+    gaussians = calm(lambda s: make_gaussians(10, s, degree, **style), camera, seed)
     weights = {"rgb": image_weights(camera, seed)["rgb"]}
     J = reference.jacobian(gaussians, camera, BACKGROUND)
     expected = np.tensordot(weights["rgb"].reshape(-1, 3), J, axes=([0, 1], [0, 1]))
-    found = gradients(gaussians, camera, weights, PARAMETERS[1:])
+    found = gradients(gaussians, camera, weights, ARRAYS[1:])
     K = 3 * (degree + 1) ** 2
     parts = np.split(expected, (K, K + 3, K + 7), axis=1)
-    for name, part in zip(("sh", *PARAMETERS[1:4]), parts, strict=True):
+    for name, part in zip(("sh", *ARRAYS[1:4]), parts, strict=True):
         error = np.linalg.norm(found[name].reshape(10, -1) - part)
         assert error < TOLERANCE * np.linalg.norm(part) + 1e-12, name

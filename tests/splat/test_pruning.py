@@ -30,7 +30,7 @@ def brute_force(gaussians, camera):
 
 def never_finished(seed, n=12, logits=(-3.0, 1.0)):
     """A scene in which no pixel is finished, so that no removal makes splats appear."""
-    g = make_gaussians(n, seed, log_scales=(-4.0, -1.0), logits=logits)
+    g = make_gaussians(n, seed, log_scales=(-4.0, -1.0), logits=logits, antialiased=False)
     g.logit_opacities[1:] = np.minimum(g.logit_opacities[1:], -0.5)
     g.logit_opacities[0] = 8.0  # clamped at ALPHA_MAX, where derivatives are 0
     return g

@@ -71,12 +71,13 @@ def test_errors_and_flipped_pixels(record_property):
     background=st.tuples(*[st.floats(0, 1)] * 3),
     eye=st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(0.1, 2)),
     focal=st.floats(10, 100),
+    filtered=st.booleans(),
 )
 def test_matches_oracle_for_any_scene(
-    seed, n, size, degree, scale, stretch, logit, background, eye, focal
+    seed, n, size, degree, scale, stretch, logit, background, eye, focal, filtered
 ):
     style = (scale - stretch, scale), (logit - 3, logit)
-    gaussians = make_gaussians(n, seed, degree, *style, colour=1.0)
+    gaussians = make_gaussians(n, seed, degree, *style, colour=1.0, antialiased=filtered)
     camera = make_camera(size, focal, eye, target=(0.05, 0.02, 0.01))
     error, decided = errors(gaussians, camera, background)
     assert np.isfinite(error).all()
@@ -106,6 +107,7 @@ def stack(camera, opacities, rgb=1.0) -> Gaussians:
         np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
         np.log(opacities / (1 - opacities)).astype(np.float32),
         np.full((n, 1, 3), (rgb - 0.5) / SH_C0, np.float32),
+        antialiased=False,
     )
 
 
