@@ -295,7 +295,8 @@ def test_a_run_is_pruned_beside_its_model(run, capsys):
 
 def test_the_images_of_the_last_fit_are_those_of_the_run(run):
     opened = open_run(run)
-    images = last_images(opened.settings, opened.prior, opened.taken)
+    cameras = [frame.camera for frame in opened.dataset.frames]
+    images = last_images(opened.settings, opened.prior, opened.taken, cameras)
     positions = np.array([images.cameras[i].position for i in images.order])
     around = np.unwrap(np.arctan2(positions[:, 1], positions[:, 0]))
     assert (np.diff(around) > 0).all()

@@ -34,10 +34,13 @@ INITIAL_OPACITY = 0.9
 the mean log transmittance across the surface is -2 pi (s / spacing)^2 Li2(o) = -3.45. With 0.99 the
 derivative by the logit, o (1 - o), would be almost zero."""
 
-INSET = {True: 0.3, False: 0.6}
-"""Depth of a Gaussian below the surface, pixels on the rock, by whether it is antialiased: EPS2D
-widens every footprint by about half a pixel, which would draw the rock too large. Chosen constants
-(docs/fit.md)."""
+INSET = {True: 0.5, False: 0.6}
+"""Depth of a Gaussian below the surface, in pixels of the closest cameras, by whether it is
+antialiased: EPS2D widens every footprint by about half a pixel, which would draw the rock too
+large. Chosen constants (docs/fit.md)."""
+
+CLOSEST = 10
+"""Percentile of the cameras' distances that counts as the closest, as one camera may be wrong."""
 
 THICKNESS = 0.1
 """Standard deviation of a Gaussian across the surface, over the spacing."""
@@ -71,7 +74,7 @@ Colours = tuple[np.ndarray, np.ndarray]
 def initial_gaussians(
     prior: Prior,
     frames: Sequence[Frame],
-    inset: float | None = None,
+    pixel: float | None = None,
     gains: np.ndarray | None = None,
     colours: Callable[[Frame], Colours] | None = None,
     antialiased: bool = True,
@@ -79,9 +82,9 @@ def initial_gaussians(
     """Place one flat Gaussian per sample of a prior, in its mean colour, then one behind each
     backed sample.
 
-    inset: depth of the Gaussians below the samples, in pixels on the surface (`pixel_on`), by
-    default INSET. gains: [V,3] exposures that divide the colours (`mgs.prior.exposure`). colours:
-    `colours_of(prior)`, to reuse it between calls. antialiased: as in `Gaussians`.
+    pixel: unit of INSET, metres, by default `pixel_on` for the frames' cameras. gains: [V,3]
+    exposures that divide the colours (`mgs.prior.exposure`). colours: `colours_of(prior)`, to reuse
+    it between calls. antialiased: as in `Gaussians`.
 
     Returns (N + backed Gaussians of degree 0, seen [N] bool). A frame sees a sample that lies in
     its rock mask, faces the camera and agrees with the depth image (or else the mesh's depth) up to
@@ -100,8 +103,9 @@ def initial_gaussians(
         count[seen] += 1
     seen = count > 0
     rgb = np.where(seen[:, None], total / np.maximum(count, 1)[:, None], GREY)
-    inset = INSET[antialiased] if inset is None else inset
-    below = inset * pixel_on(prior, [frame.camera for frame in frames])
+    if pixel is None:
+        pixel = pixel_on(prior, [frame.camera for frame in frames])
+    below = INSET[antialiased] * pixel
     scales = np.log(prior.spacing * np.array([IN_PLANE_SCALE, IN_PLANE_SCALE, THICKNESS]))
     surface = Gaussians(
         means=(prior.points - below * prior.normals).astype(np.float32),
@@ -160,14 +164,15 @@ def colours_of(prior: Prior) -> Callable[[Frame], Colours]:
 
 
 def pixel_on(prior: Prior, cameras: Sequence[Camera]) -> float:
-    """Size of a pixel on the surface, metres: z-depth over focal length, median over samples, then
-    over cameras that have some in front; 0 if none has."""
+    """Size of a pixel of the closest cameras on the surface, metres: z-depth over focal length,
+    median over samples, then percentile CLOSEST of the cameras that have some in front; 0 if none
+    has."""
     sizes = []
     for camera in cameras:
         z = camera.project(prior.points)[1]
         if (z > 0).any():
             sizes.append(np.median(z[z > 0]) / np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
-    return float(np.median(sizes)) if sizes else 0.0
+    return float(np.percentile(sizes, CLOSEST)) if sizes else 0.0
 
 
 def initial_normals(prior: Prior) -> np.ndarray:

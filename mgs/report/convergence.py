@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from mgs.camera import Camera
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.fit.objective import newton_decrease, objective
@@ -31,11 +32,13 @@ def remaining_decrease(
     settings: NbvSettings,
     prior: Prior,
     frames: Sequence[Frame],
+    cameras: Sequence[Camera],
     progress: Callable[[int, int], None] = lambda done, most: None,
 ) -> dict[str, Any]:
     """Objective of the last fit of a run, and its predicted further fall.
 
-    gaussians: the fitted model; frames: those taken, in their order, so the seeds first.
+    gaussians: the fitted model; frames: those taken, in their order, so the seeds first. cameras:
+    of all frames of the dataset.
 
     Returns "phi" (`mgs.fit.objective`, squared pixel values); "predicted_decrease", a share of phi;
     and "converged", whether that is at most CONVERGED_SHARE. Raises InputError if a frame cannot be
@@ -47,7 +50,7 @@ def remaining_decrease(
             "--convergence: is for a fixed number of Gaussians and squared differences; "
             "leave it out, or fit with --density fixed --loss squared"
         )
-    images = last_images(settings, prior, frames)
+    images = last_images(settings, prior, frames, cameras)
     kinds = groups(settings.sh, train.means)
     by_kind = lam_by_kind(settings.regularisation(kinds), kinds)
     start = images.start(range(len(images))).with_degree(settings.sh)

@@ -280,8 +280,9 @@ def _fit(run: Run, progress: Progress) -> dict[str, Any]:
     """Entry "fit" of metrics.json. Raises InputError if the prior is gone or is not the run's."""
     from mgs.report.convergence import remaining_decrease
 
-    model, settings = run.state.gaussians, run.settings
-    return {"fit": remaining_decrease(model, settings, run.prior, run.taken, progress)}
+    cameras = [frame.camera for frame in run.dataset.frames]
+    given = run.state.gaussians, run.settings, run.prior, run.taken, cameras
+    return {"fit": remaining_decrease(*given, progress)}
 
 
 def _informed(run: Run) -> dict[str, dict[str, int]]:

@@ -17,7 +17,7 @@ left out together, so the others must predict views beyond them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -37,7 +37,7 @@ from mgs.policy.criteria import LEARN_LOSS, lam_by_kind
 from mgs.policy.poses import azimuths
 from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of, without_gain
-from mgs.prior.initial import initial_gaussians, initial_normals
+from mgs.prior.initial import initial_gaussians, initial_normals, pixel_on
 from mgs.run.settings import NbvSettings
 from mgs.splat import ListCache, as_drjit, groups, render
 
@@ -104,17 +104,18 @@ class LeanModel:
     left_out: LeftOut | None
 
 
-def last_images(settings: NbvSettings, prior: Prior, frames: Sequence[Frame]) -> Images:
+def last_images(
+    settings: NbvSettings, prior: Prior, frames: Sequence[Frame], cameras: Sequence[Camera]
+) -> Images:
     """Input of the last fit of a run. frames: those taken, in their order, so the seeds first.
-    Raises InputError if a frame cannot be read."""
+    cameras: of all frames of the dataset. Raises InputError if a frame cannot be read."""
     gains = exposure_of(prior)(frames) if settings.exposure else np.ones((len(frames), 3))
     with_alpha = settings.train.alpha_weight > 0
-    antialiased = settings.train.antialiased
-    of_seeds = initial_gaussians(prior, frames[: settings.seeds], antialiased=antialiased)[0]
+    pixel = pixel_on(prior, cameras)
 
     def start(views: Sequence[int]) -> Gaussians:
-        shown = [frames[i] for i in views]
-        return replace(of_seeds, sh=initial_gaussians(prior, shown, gains=gains[list(views)])[0].sh)
+        how = pixel, gains[list(views)], None, settings.train.antialiased
+        return initial_gaussians(prior, [frames[i] for i in views], *how)[0]
 
     def target(view: int) -> np.ndarray:
         return without_gain(target_of(frames[view], with_alpha), gains[view])

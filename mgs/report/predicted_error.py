@@ -34,7 +34,7 @@ from mgs.images import write_exr
 from mgs.memory import padded
 from mgs.policy.criteria import lam_by_kind
 from mgs.prior.build import Prior
-from mgs.prior.initial import initial_gaussians
+from mgs.prior.initial import initial_gaussians, pixel_on
 from mgs.provenance import versions
 from mgs.report.calibration import NORMAL, Calibration, fit_calibration, judged
 from mgs.report.figures import uncertainty_figure
@@ -159,10 +159,12 @@ def predictor(
     return Predictor(gaussians, variance, residual_variance(gaussians, frames))
 
 
-def _without(frames: Sequence[Frame], prior: Prior, settings: NbvSettings) -> Predictor:
-    """`Predictor` of a model that is fitted to some frames of the run."""
-    how = settings.train.antialiased
-    start = initial_gaussians(prior, frames, antialiased=how)[0].with_degree(settings.sh)
+def _without(
+    frames: Sequence[Frame], prior: Prior, settings: NbvSettings, pixel: float
+) -> Predictor:
+    """`Predictor` of a model that is fitted to some frames of the run. pixel: `pixel_on` all."""
+    how = pixel, None, None, settings.train.antialiased
+    start = initial_gaussians(prior, frames, *how)[0].with_degree(settings.sh)
     cache = ListCache()
     columns = groups(start.sh_degree)
     cameras = [frame.camera for frame in frames]
@@ -225,10 +227,11 @@ def calibrate_run(
             progress(done, total)
         return Pixels.joined(parts)
 
-    folds = []
+    folds, prior = [], opened.prior
+    pixel = pixel_on(prior, [frame.camera for frame in opened.dataset.frames])
     for fold in range(FOLDS):
         kept = [frame for i, frame in enumerate(frames) if i % FOLDS != fold]
-        folds.append(measured(_without(kept, opened.prior, settings), frames[fold::FOLDS]))
+        folds.append(measured(_without(kept, prior, settings, pixel), frames[fold::FOLDS]))
     own = Pixels.joined(folds)
     final = predictor(opened.state.gaussians, opened.state.H, frames, settings)
     sets = {"folds": own} | {name: measured(final, views) for name, views in unseen.items()}

@@ -20,7 +20,7 @@ from mgs.metrics import colour_corrected, psnr
 from mgs.policy.criteria import lam_by_kind
 from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of
-from mgs.prior.initial import Colours, colours_of, initial_gaussians, initial_normals
+from mgs.prior.initial import Colours, colours_of, initial_gaussians, initial_normals, pixel_on
 from mgs.run.inputs import prior_digest
 from mgs.run.live import Live, live_capture
 from mgs.run.problem import Operations
@@ -40,11 +40,12 @@ def operations_of(
     lam = lam_by_kind(settings.regularisation(columns), columns)
     exposure = exposure_of(prior) if settings.exposure else None
     colours = kept_colours(prior)
+    pixel = pixel_on(prior, [frame.camera for frame in dataset.frames])
 
     def initial(frames: Sequence[Frame]) -> Gaussians:
         gains = exposure(frames) if exposure else None
-        how = gains, colours, settings.train.antialiased
-        return initial_gaussians(prior, frames, None, *how)[0].with_degree(settings.sh)
+        how = pixel, gains, colours, settings.train.antialiased
+        return initial_gaussians(prior, frames, *how)[0].with_degree(settings.sh)
 
     def run_fit(
         gaussians: Gaussians,

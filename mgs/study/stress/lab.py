@@ -20,7 +20,7 @@ from mgs.gaussians import Gaussians
 from mgs.policy.criteria import MEAN_STD, PRIOR_STD, Score, d_optimal, lam_by_kind, regularisation
 from mgs.policy.poses import seed_views
 from mgs.prior.build import Prior, load_prior
-from mgs.prior.initial import initial_gaussians, initial_normals
+from mgs.prior.initial import initial_gaussians, initial_normals, pixel_on
 from mgs.splat import ListCache, fisher, groups
 from mgs.study.case import Case, Scene, Size, judge
 from mgs.study.output import Panel
@@ -152,7 +152,8 @@ class Lab:
 
     def start(self, taken: Sequence[int]) -> Gaussians:
         """Gaussians before training, in the colours of the views taken."""
-        return initial_gaussians(self.prior, [self.frames[i] for i in taken])[0]
+        pixel = pixel_on(self.prior, self.cameras)
+        return initial_gaussians(self.prior, [self.frames[i] for i in taken], pixel)[0]
 
     def lam(self, means: str = "frozen") -> Array:
         """Lambda of each column of the information [P], with the default settings of `mgs nbv`."""
