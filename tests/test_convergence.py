@@ -49,7 +49,10 @@ def fitted(case, passes, lam=None, decay=0.01):
 def test_a_short_fit_is_called_early_and_a_long_one_comes_nearer(case):
     settings, prior, frames, _, _ = case
     short, long = (
-        remaining_decrease(fitted(case, passes), settings, prior, frames) for passes in (2, 120)
+        remaining_decrease(
+            fitted(case, passes), settings, prior, frames, [frame.camera for frame in frames]
+        )
+        for passes in (2, 120)
     )
     assert not short["converged"]
     assert short["predicted_decrease"] > 3 * long["predicted_decrease"] > 0
@@ -60,7 +63,9 @@ def test_phi_is_the_objective_of_the_run(case):
     settings, prior, frames, start, lam = case
     model = fitted(case, 2)
     goal = objective(model, [f.camera for f in frames], [target_of(f) for f in frames], start, lam)
-    found = remaining_decrease(model, settings, prior, frames)["phi"]
+    found = remaining_decrease(model, settings, prior, frames, [frame.camera for frame in frames])[
+        "phi"
+    ]
     assert found == pytest.approx(goal.phi(as_drjit(model)), rel=1e-6)
 
 

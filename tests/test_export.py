@@ -5,6 +5,7 @@ import json
 import struct
 import sys
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -83,6 +84,15 @@ def test_a_compressed_ply_holds_the_same_gaussians(tmp_path, degree):
     table = np.hstack([model.means, model.log_scales, 0.5 + 0.28209479 * model.sh[:, 0]])
     assert len(RANGES) == 2 * table.shape[1]
     assert_close(read, model[nearest], np.ptp(table, 0))
+
+
+@pytest.mark.parametrize("antialiased", [True, False])
+@pytest.mark.parametrize("kind", FORMATS)
+def test_antialiasing_is_kept_where_a_format_can(tmp_path, kind, antialiased):
+    pytest.importorskip("gsply_cpp")
+    model = replace(gaussians(0), antialiased=antialiased)
+    read = load_gaussians(written(tmp_path, kind, model))
+    assert read.antialiased == (antialiased and kind != "spz")
 
 
 @pytest.mark.parametrize("kind", FORMATS)

@@ -187,7 +187,9 @@ def test_units_are_spacings_of_the_prior_unless_given(files, tmp_path):
 def test_criteria_see_the_means_and_coverage_does_not(files, whole):
     means, out, state = whole
     made, prior = run_folder.open_run(out).settings, load_prior(files[1])
-    frames = [load_dataset(files[0]).frames[i] for i in state.taken]
+    dataset = load_dataset(files[0])
+    frames = [dataset.frames[i] for i in state.taken]
+    cameras = [frame.camera for frame in dataset.frames]
     facing = initial_normals(prior)
     H = sum(
         fisher(state.gaussians, frame.camera, means=means, normals=facing).astype(float)
@@ -207,7 +209,7 @@ def test_criteria_see_the_means_and_coverage_does_not(files, whole):
     assert np.abs(moved).max() > 1e-3
     sideways = moved - (moved * facing).sum(1, keepdims=True) * facing
     assert (np.abs(sideways).max() < 1e-6) == (means == "normal")
-    left = remaining_decrease(state.gaussians, made, prior, frames)
+    left = remaining_decrease(state.gaussians, made, prior, frames, cameras)
     assert 0 < left["predicted_decrease"] < 1
 
 

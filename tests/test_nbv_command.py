@@ -27,6 +27,7 @@ from mgs.run import nbv
 from mgs.run.operations import psnr_measure
 from mgs.run.state import State
 from mgs.splat import ListCache, fisher
+from mgs.splat_ply import read_ply
 
 NOT_SHOWN = {"all": {"count": 0}, "held_out": {"count": 0}}
 KINDS = "must be a number for each of colour, scale, rotation, opacity"
@@ -287,6 +288,16 @@ def test_without_masks_alpha_has_no_weight_by_default(dataset, prior, tmp_path):
     write_json(dataset / "transforms.json", made)
     assert weight("bare") == 0
     assert weight("given", train={"alpha_weight": 0.3}) == 0.3
+
+
+@pytest.mark.parametrize("antialiased", [True, False])
+def test_files_of_a_run_know_how_it_draws(dataset, prior, tmp_path, antialiased):
+    option = [] if antialiased else ["--no-antialiased"]
+    short = ["--seed-views", 3, "--budget", 0, "--passes", 1]
+    command("nbv", dataset, "--prior", prior, "--out", tmp_path / "run", *short, *option)
+    assert read_ply(tmp_path / "run/gaussians.ply").antialiased == antialiased
+    state = run_folder.open_run(tmp_path / "run").state
+    assert state.gaussians.antialiased == antialiased
 
 
 def test_a_run_of_a_policy_of_ones_own_can_be_read_without_it(loaded, tmp_path, monkeypatch):

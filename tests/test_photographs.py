@@ -557,7 +557,9 @@ def test_a_fit_with_adaptive_density_is_a_run_as_3dgs(data, tmp_path, capsys, mo
     assert train["rates"]["mean"] == 0.01
     assert train["rates"]["scale"] == 5e-3
     assert train["alpha_weight"] == 0
-    count = len(load_gaussians(tmp_path / "run/gaussians.ply"))
+    model = load_gaussians(tmp_path / "run/gaussians.ply")
+    assert not model.antialiased
+    count = len(model)
     assert 0 < count <= 310
     assert count != 300
     command("eval", tmp_path / "run")

@@ -234,7 +234,8 @@ def run(tmp_path_factory, coarse_priors):
     root = tmp_path_factory.mktemp("refit")
     synthetic.write_dataset(root / "data/test", synthetic.orbit_cameras(3, 48, 36, altitude=2.0))
     data = synthetic.write_dataset(root / "data", synthetic.orbit_cameras(12, 48, 36))
-    given = {"gaussians": 400, "budget": 2, "policy": "uniform", "train": {"passes": 10}}
+    train = {"passes": 10, "antialiased": False}
+    given = {"gaussians": 400, "budget": 2, "policy": "uniform", "train": train}
     run_nbv(data.root, root / "run", **given)
     return root / "run"
 

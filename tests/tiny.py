@@ -179,13 +179,14 @@ def write_prior(out: Path) -> Path:
 def write_run(out: Path, root: Path, prior: Path) -> Path:
     """A run folder of the seeds alone, by the operations of this module."""
     from mgs.prior.build import load_prior
-    from mgs.prior.initial import initial_gaussians
+    from mgs.prior.initial import initial_gaussians, pixel_on
     from mgs.run.inputs import prior_digest
 
     dataset, known = load_dataset(root), load_prior(prior)
     settings = start(out, dataset, prior=prior, budget=2)
+    pixel = pixel_on(known, [frame.camera for frame in dataset.frames])
     parts = operations(
-        prior=prior_digest(known), initial=lambda frames: initial_gaussians(known, frames)[0]
+        prior=prior_digest(known), initial=lambda frames: initial_gaussians(known, frames, pixel)[0]
     )
     recording.run(out, settings.model_copy(update={"budget": 0}), dataset, parts, silent)
     return out
