@@ -61,9 +61,8 @@ class Gaussians:
     - sh: [N,K,3] colour, linear RGB, as K = (d+1)^2 coefficients of spherical harmonics of degree d
       from 0 to 3, in the order and with the signs of 3DGS: rgb = max(0, 0.5 + sum over k of
       Y_k(direction) sh_k), with the direction from the camera.
-    - antialiased: whether a footprint that the low-pass of the image (`EPS2D`) makes larger is
-      fainter in proportion (Yu et al. 2024, Mip-Splatting), as `antialiased` of gsplat; else its
-      opacity stays, as in 3DGS.
+    - antialiased: whether opacity falls as the low-pass of the image (`EPS2D`) makes a footprint
+      larger (Yu et al. 2024, Mip-Splatting; `antialiased` of gsplat); in 3DGS it stays.
 
     `gaussians[10:20]`, `gaussians[mask]` and `gaussians[indices]` are Gaussians again. Two are
     equal if all numbers are, and `antialiased`.

@@ -1,7 +1,7 @@
 """Detectors: small numbers of each step that grow as a run goes wrong, their limits, the warnings.
 
 `mgs nbv` prints a warning when a number first exceeds its limit, and keeps all in steps.jsonl. The
-limits are 1.4 to 4 times the largest value of good runs (docs/stability.md), unless a comment says
+limits are 1.3 to 4 times the largest value of good runs (docs/stability.md), unless a comment says
 otherwise. A fit that diverges ends the run (`mgs.fit.stopping`).
 """
 
