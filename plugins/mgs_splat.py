@@ -10,6 +10,8 @@ Properties:
 - `filename`: a 3DGS PLY, GLB or SPZ.
 - `colour_space`: "linear" or "srgb", in which colours are blended. Default: linear for files of
   mgs, srgb for those of other tools.
+- `antialiased`: boolean, whether Gaussians that are smaller than a pixel are fainter. Default: what
+  the file says, else false.
 - `background`: RGB behind the Gaussians in that space. Default: black.
 - `depth`: boolean, append the expected z-depth in metres as an AOV. Default: false.
 
@@ -23,6 +25,7 @@ differentiated.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -46,7 +49,6 @@ class MgsSplat(mi.CppADIntegrator):
             raise InputError("mgs_splat: `filename` is missing or no string; name a 3DGS PLY")
         path = str(mi.file_resolver().resolve(props["filename"]))
         gaussians, space = gaussians_and_space(path)
-        self.gaussians = as_drjit(gaussians)
         self.colour_space = props.get("colour_space", space)
         if self.colour_space not in ("linear", "srgb"):
             raise InputError(
@@ -55,8 +57,11 @@ class MgsSplat(mi.CppADIntegrator):
         self.background = props.get("background", 0.0)
         as_colour(self.background)
         self.depth = props.get("depth", False)
-        if not isinstance(self.depth, bool):
-            raise InputError(f"mgs_splat: depth {self.depth!r} must be a boolean")
+        antialiased = props.get("antialiased", gaussians.antialiased)
+        for name, value in (("depth", self.depth), ("antialiased", antialiased)):
+            if not isinstance(value, bool):
+                raise InputError(f"mgs_splat: {name} {value!r} must be a boolean")
+        self.gaussians = as_drjit(replace(gaussians, antialiased=antialiased))
         self.cache = ListCache()
 
     def traverse(self, cb: Any) -> None:

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -142,6 +143,16 @@ def test_colours_in_display_space(ply):
     assert load(ply).integrator().colour_space == "linear"
 
 
+def test_antialiasing_is_a_property(ply):
+    """By default as the file says."""
+    assert load(ply).integrator().gaussians.antialiased == read_ply(ply).antialiased
+    images = {kind: np.asarray(mi.render(load(ply, antialiased=kind))) for kind in (True, False)}
+    assert np.abs(images[True] - images[False]).max() > 1e-3
+    for kind, image in images.items():
+        expected = render(replace(read_ply(ply), antialiased=kind), camera()).rgb
+        np.testing.assert_allclose(image, np.asarray(expected), atol=1e-6)
+
+
 def test_traverse_lists_the_parameters(ply):
     params = mi.traverse(load(ply))
     model = gaussians()
@@ -222,6 +233,7 @@ BAD_FILES = [
     ({"filename": "nowhere.ply"}, "nowhere.ply: no such file; give a PLY, GLB or SPZ of Gaussians"),
     ({"filename": __file__}, "export it again"),
     (PLY | {"depth": "false"}, "mgs_splat: depth 'false' must be a boolean"),
+    (PLY | {"antialiased": 1}, "mgs_splat: antialiased 1 must be a boolean"),
     (PLY | {"background": "white"}, f"background white: {NO_COLOUR}"),
     (PLY | {"background": [0.0, float("nan"), 0.0]}, NO_COLOUR),
     (

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -188,6 +189,23 @@ def test_colour_spaces(folder):
         np.testing.assert_allclose(rgb, expected, atol=1e-5)
         np.testing.assert_allclose(channels["A"], alpha, atol=1e-6)
         np.testing.assert_allclose(channels["Z"], depth, rtol=1e-5)
+
+
+@pytest.mark.parametrize("given", [None, True, False])
+@pytest.mark.parametrize("marked", [True, False])
+def test_antialiasing(folder, marked, given):
+    """The file says whether its Gaussians are antialiased; the option overrules."""
+    model = gaussians(1)
+    model = replace(model, log_scales=model.log_scales - 2, antialiased=marked)
+    write_ply(folder / "x.ply", model)
+    run(folder, *({True: ["--antialiased"], False: ["--no-antialiased"]}.get(given, [])))
+    drawn = {
+        kind: srgb_from_linear(np.asarray(render(replace(model, antialiased=kind), CAMERAS[0]).rgb))
+        for kind in (True, False)
+    }
+    assert np.abs(drawn[True] - drawn[False]).max() > 0.05
+    expected = drawn[marked if given is None else given]
+    np.testing.assert_allclose(pixels(folder / "out/a.png"), expected, atol=0.51 / 255)
 
 
 @pytest.mark.parametrize("space", ["linear", "srgb"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -43,6 +44,14 @@ def render(
             "sRGB. auto: what the file says, else srgb."
         ),
     ] = "auto",
+    antialiased: Annotated[
+        bool | None,
+        option(
+            "Whether Gaussians that are smaller than a pixel are fainter. Default: what the file "
+            "says, else not.",
+            "--antialiased/--no-antialiased",
+        ),
+    ] = None,
     background: Annotated[
         tuple[float, float, float],
         option(
@@ -81,6 +90,8 @@ def render(
     ]
     model = read_model(subject)
     gaussians, space = model.gaussians, model.space if colour_space == "auto" else colour_space
+    if antialiased is not None:
+        gaussians = replace(gaussians, antialiased=antialiased)
     runtime.start()
     with folder_locked(out), progress_bar() as bar:
         if not force:
