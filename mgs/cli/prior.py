@@ -228,7 +228,7 @@ def _table(numbers: dict[str, Any]) -> Table:
 
 def _reason(numbers: dict[str, Any]) -> str:
     """Reason for the number of Gaussians, if the cameras decided it."""
-    from mgs.prior.resolution import MOST_GAUSSIANS, PIXELS_PER_SAMPLE
+    from mgs.prior.resolution import MOST_GAUSSIANS
 
     pixel, count = numbers["resolution"]["pixel"], numbers["n"] + numbers["backed"]
     size = f"{1e3 * pixel:.2f} mm" if numbers["unit"] == "m" else f"{pixel:.4g} unit"
@@ -239,7 +239,7 @@ def _reason(numbers: dict[str, Any]) -> str:
         )
     return (
         f"{count:,} Gaussians, since the closest pixel covers {size} of the surface, and samples "
-        f"nearer than {PIXELS_PER_SAMPLE:g} pixels gain too little"
+        f"nearer than {numbers['resolution']['spacing'] / pixel:.3g} pixels gain too little"
     )
 
 

@@ -34,7 +34,12 @@ from mgs.prior.photographs import (
     source_of,
     surface_of,
 )
-from mgs.prior.resolution import MOST_GAUSSIANS, resolution
+from mgs.prior.resolution import (
+    MOST_GAUSSIANS,
+    PIXELS_OF_PHOTOGRAPHS,
+    PIXELS_PER_SAMPLE,
+    resolution,
+)
 from mgs.prior.scattered import scattered
 from mgs.prior.segmentation import SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
@@ -139,7 +144,8 @@ def prior_and_cloud(
     middle = mesh.vertices.mean(0)
     pixels = [np.linalg.norm(camera.position - middle) / camera.K[0, 0] for camera in cameras]
     pixel = cell if chosen == "depth" else float(np.median(pixels))
-    samples, normals, spacing, sampled = _samples(mesh, settings, cameras, pixel)
+    closest = PIXELS_PER_SAMPLE if chosen == "depth" else PIXELS_OF_PHOTOGRAPHS
+    samples, normals, spacing, sampled = _samples(mesh, settings, cameras, pixel, closest)
     upward = up if up is not None and up != "auto" else dataset.up
     numbers = {"from": chosen, "frames": len(dataset.frames), **surface.numbers}
     if segmented is not None and plane is not None:
@@ -198,15 +204,22 @@ def _depth_surface(
 
 
 def _samples(
-    mesh: Mesh, settings: PriorSettings, cameras: Sequence[Camera], pixel: float
+    mesh: Mesh,
+    settings: PriorSettings,
+    cameras: Sequence[Camera],
+    pixel: float = 0.0,
+    closest_pixels: float = PIXELS_PER_SAMPLE,
 ) -> tuple[np.ndarray, np.ndarray, float, dict[str, Any]]:
     """Samples of a surface: points [N,3], unit normals [N,3], spacing in metres, and items of
     prior.json about mesh and samples; square metres, metres.
 
-    cameras: set the spacing if the settings do not. pixel: unit of `settings.density`, metres.
+    cameras: set the spacing if the settings do not, to `closest_pixels` pixels of the closest one.
+    pixel: unit of `settings.density`, metres.
     Raises InputError as `resolution` and `sample_surface`.
     """
-    resolved = resolution(mesh, cameras) if settings.resolved_by_cameras else None
+    resolved = None
+    if settings.resolved_by_cameras:
+        resolved = resolution(mesh, cameras, closest_pixels)
     asked, share = settings.gaussians, settings.backing
     total = asked if isinstance(asked, int) else None
     if resolved and resolved.samples * (1 + share) > MOST_GAUSSIANS:
@@ -253,7 +266,7 @@ def prior_from_mesh(
             f"{path}: a density is relative to the voxels of a cloud, and a mesh has none; "
             "give a number or a spacing"
         )
-    points, normals, spacing, sampled = _samples(mesh, settings, cameras, 0.0)
+    points, normals, spacing, sampled = _samples(mesh, settings, cameras)
     used = {key: getattr(settings, key) for key in ("gaussians", "spacing", "seed", "backing")}
     numbers = {
         "from": "mesh",

@@ -16,10 +16,13 @@ from mgs.data.meshes import Mesh
 from mgs.data.visibility import in_image
 from mgs.errors import InputError
 
-PIXELS_PER_SAMPLE = 1.15
-"""Spacing of the samples over the size of the closest pixel. Finer models are no better, and much
-finer ones are worse: more parameters than pixel values. Judged by `mgs parsimony`
-(docs/parsimony.md)."""
+PIXELS_PER_SAMPLE = 0.9
+"""Spacing of the samples over the size of the closest pixel. Closer samples gain little, and much
+closer ones lose: more parameters than pixel values. Chosen on three rocks (docs/parsimony.md)."""
+
+PIXELS_OF_PHOTOGRAPHS = 1.15
+"""The same for surfaces from photographs, whose Gaussians move in a fit: closer ones take more
+passes (docs/fit.md)."""
 
 MOST_GAUSSIANS = 200_000
 """Most Gaussians that cameras decide: close-ups and high resolution ask for millions, which take
@@ -41,13 +44,14 @@ class Resolution:
         return round(self.area / self.spacing**2)
 
 
-def resolution(mesh: Mesh, cameras: Sequence[Camera]) -> Resolution:
+def resolution(
+    mesh: Mesh, cameras: Sequence[Camera], pixels: float = PIXELS_PER_SAMPLE
+) -> Resolution:
     """Spacing of samples that these cameras can tell apart, for the seen part of the mesh.
 
-    The pixel on a face is z-depth / focal length, whatever the slant; the smallest counts among the
+    pixels: spacing of the samples over the size of the closest pixel. The pixel on a face is z-depth / focal length, whatever the slant; the smallest counts among the
     cameras that have the face in their image and in front, occluded or not. N is the sum over faces
-    of area / (PIXELS_PER_SAMPLE pixel)^2; faces in no image do not count. Raises InputError if none
-    is.
+    of area / (pixels pixel)^2; faces in no image do not count. Raises InputError if none is.
     """
     middles = mesh.vertices[mesh.faces[mesh.seen]].mean(1)
     crosses, areas = mesh.crosses[mesh.seen], mesh.areas[mesh.seen]
@@ -66,4 +70,4 @@ def resolution(mesh: Mesh, cameras: Sequence[Camera]) -> Resolution:
         )
     area = float(areas[known].sum())
     typical = float(np.sqrt(area / (areas[known] / pixel[known] ** 2).sum()))
-    return Resolution(typical, PIXELS_PER_SAMPLE * typical, area)
+    return Resolution(typical, pixels * typical, area)

@@ -47,7 +47,7 @@ class RunPreset:
 PRESETS = {
     "fast": RunPreset(passes=5, warm_passes=3, density=1 / 4),
     "balanced": RunPreset(passes=PASSES, warm_passes=WARM_PASSES, density=1 / 2),
-    "accurate": RunPreset(passes=PASSES, warm_passes=WARM_PASSES, density=3 / 4),
+    "accurate": RunPreset(passes=PASSES, warm_passes=WARM_PASSES, density=5 / 4),
 }
 
 
