@@ -13,7 +13,7 @@ from mgs.data.meshes import Mesh
 from mgs.errors import InputError
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.prior.build import build_prior, prior_from_mesh
-from mgs.prior.resolution import PIXELS_PER_SAMPLE, resolution
+from mgs.prior.resolution import PIXELS_OF_PHOTOGRAPHS, PIXELS_PER_SAMPLE, resolution
 from mgs.prior.settings import PriorSettings
 from mgs.study import case, parsimony
 from mgs.study.case import Size
@@ -84,6 +84,13 @@ def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys):
     assert f"{numbers['n'] + numbers['backed']:,} Gaussians, since the closest pixel covers" in said
     double = build_prior(write_data(tmp_path / "double", (96, 72)), PriorSettings(gaussians="auto"))
     assert len(double.points) / numbers["n"] == pytest.approx(4, rel=0.15)
+
+
+def test_surfaces_from_photographs_have_fewer_samples(data):
+    numbers = build_prior(data.root, source="hull").numbers
+    pixel = numbers["resolution"]["pixel"]
+    assert numbers["spacing"] == pytest.approx(PIXELS_OF_PHOTOGRAPHS * pixel, rel=0.01)
+    assert PIXELS_OF_PHOTOGRAPHS > PIXELS_PER_SAMPLE
 
 
 def test_a_given_mesh_takes_its_number_from_the_pixels_too(data, tmp_path, capsys):
