@@ -134,7 +134,7 @@ def draw_pictures(
 def compared_frames(runs: Sequence[RunFiles], dataset: Dataset) -> list[Frame]:
     """Frames on which the page compares truth and renders: up to COMPARED that the fewest runs were
     trained on, spread evenly, and as many test views, named `test/NAME`. Of measured runs the first
-    is that of median PSNR (`shown_view`)."""
+    is that of `shown_view`."""
     there = dataset.with_images({dataset.frames[i].name for run in runs for i in run.taken})
     pool, tests = least_trained(runs, dataset, there), dataset.test_views()
     frames = () if tests is None else tests.frames

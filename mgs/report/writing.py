@@ -121,14 +121,14 @@ def shown_view(runs: Sequence[RunFiles], dataset: Dataset) -> tuple[Frame, str]:
     """The view that the comparison shows, and the key of metrics.json that lists it, "test_views"
     or "views".
 
-    It is the view of median PSNR (mean over the runs) among the test views if all runs were
-    measured on them, else among those that the fewest runs were trained on. Of frames on demand,
-    only those that all runs have taken have an image. Raises InputError as
-    `Dataset.test_views`, and if there is no such frame.
+    It is the most typical (`_typical_view`) of the test views if all runs were measured on them,
+    else among those that the fewest runs were trained on. Of frames on demand, only those that all
+    runs have taken have an image. Raises InputError as `Dataset.test_views`, and if there is no
+    such frame.
     """
     tests = dataset.test_views()
     if tests is not None and all((run.metrics or {}).get("test_views") for run in runs):
-        return _median_view(runs, tests.frames, "test_views"), "test_views"
+        return _typical_view(runs, tests.frames, "test_views"), "test_views"
     shared = set.intersection(*({dataset.frames[i].name for i in run.taken} for run in runs))
     shown = dataset.with_images(shared)
     if not shown:
@@ -136,17 +136,15 @@ def shown_view(runs: Sequence[RunFiles], dataset: Dataset) -> tuple[Frame, str]:
             f"{dataset.root}: has no test views, and no frame that all runs have taken; "
             "report them one by one"
         )
-    return _median_view(runs, least_trained(runs, dataset, shown), "views"), "views"
+    return _typical_view(runs, least_trained(runs, dataset, shown), "views"), "views"
 
 
-def _median_view(runs: Sequence[RunFiles], frames: Sequence[Frame], views: str) -> Frame:
-    """The frame of median PSNR, mean over the runs, by the key `views` of metrics.json."""
+def _typical_view(runs: Sequence[RunFiles], frames: Sequence[Frame], views: str) -> Frame:
+    """The frame whose PSNRs are closest to the runs' means over the frames, in least squares, by
+    the key `views` of metrics.json."""
     measured = [{v["name"]: v["psnr"] for v in (run.metrics or {}).get(views, [])} for run in runs]
-
-    def mean_psnr(frame: Frame) -> float:
-        return sum(psnr.get(frame.name, 0.0) for psnr in measured)
-
-    return sorted(frames, key=mean_psnr)[len(frames) // 2]
+    psnr = np.array([[of.get(frame.name, 0.0) for frame in frames] for of in measured])
+    return frames[int(np.argmin(((psnr - psnr.mean(1, keepdims=True)) ** 2).sum(0)))]
 
 
 def _caption(run: RunFiles, views: str, name: str) -> str:
