@@ -297,7 +297,7 @@ DETECTORS: dict[str, Detector] = {
         ),
     ),
     "coverage": Detector(
-        0.2,
+        0.3,
         lambda v, limit: (
             f"only {percent(1 - v)} of the prior's Gaussians are observed "
             f"(limit {percent(1 - limit)}), so the others are known from the prior alone; "

@@ -148,7 +148,9 @@ def factors(size: ChartSize) -> dict[str, list[Point]]:
         "number of Gaussians": [replace(fit, density=d) for d in size.densities],
         "passes": [replace(fit, passes=p) for p in size.passes],
         "images": [replace(fit, images=n) for n in size.image_counts],
-        "both": [replace(fit, density=d, passes=p) for d in size.densities for p in size.passes],
+        "number and passes of a fit": [
+            replace(fit, density=d, passes=p) for d in size.densities for p in size.passes
+        ],
         "policy": [replace(run, policy=name) for name in ("d-optimal", *size.policies)],
         "estimator": [replace(run, estimator=e) for e in ("hutchinson", "loss-gradient")],
         "number and passes": [
