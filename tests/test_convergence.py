@@ -74,13 +74,14 @@ def test_converged_is_said_at_the_minimum_alone(case):
     """With a prior so strong that the objective is almost quadratic, the minimum is found; a step
     away from it, it is not."""
     settings, prior, frames, *_ = case
+    cameras = [frame.camera for frame in frames]
     strong = settings.model_copy(update={"lam": 50.0})
     found = fitted(case, 300, dict.fromkeys(groups(0), 50.0), 1e-3)
-    at_minimum = remaining_decrease(found, strong, prior, frames)
+    at_minimum = remaining_decrease(found, strong, prior, frames, cameras)
     assert at_minimum["converged"]
     assert at_minimum["predicted_decrease"] < CONVERGED_SHARE
     found.sh = found.sh + np.float32(0.5)
-    away = remaining_decrease(found, strong, prior, frames)
+    away = remaining_decrease(found, strong, prior, frames, cameras)
     assert not away["converged"]
     left = away["phi"] * (1 - away["predicted_decrease"])
     assert left == pytest.approx(at_minimum["phi"], rel=0.1)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mgs.camera import Camera, opencv_from_opengl, opengl_from_opencv
-from mgs.data.frames import SURVEY_FOLDER, Frame, as_captured
+from mgs.data.frames import SURVEY_FOLDER, Frame, as_asked, as_captured
 from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.errors import InputError
 from mgs.files import THERE, check_new_folder, read_json, write_json
@@ -69,6 +69,11 @@ class Dataset:
     def on_demand(self) -> bool:
         """Whether images of some frames exist only after a run has taken them."""
         return any(frame.on_demand for frame in self.frames)
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Cameras of all frames as asked for: a live capture does not change them."""
+        return [as_asked(frame).camera for frame in self.frames]
 
     def with_images(self, taken: Collection[str]) -> tuple[Frame, ...]:
         """All frames, except on-demand ones whose names are not in `taken`."""

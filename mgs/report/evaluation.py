@@ -280,8 +280,7 @@ def _fit(run: Run, progress: Progress) -> dict[str, Any]:
     """Entry "fit" of metrics.json. Raises InputError if the prior is gone or is not the run's."""
     from mgs.report.convergence import remaining_decrease
 
-    cameras = [frame.camera for frame in run.dataset.frames]
-    given = run.state.gaussians, run.settings, run.prior, run.taken, cameras
+    given = run.state.gaussians, run.settings, run.prior, run.taken, run.dataset.cameras
     return {"fit": remaining_decrease(*given, progress)}
 
 

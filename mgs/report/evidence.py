@@ -108,7 +108,7 @@ def last_images(
     settings: NbvSettings, prior: Prior, frames: Sequence[Frame], cameras: Sequence[Camera]
 ) -> Images:
     """Input of the last fit of a run. frames: those taken, in their order, so the seeds first.
-    cameras: of all frames of the dataset. Raises InputError if a frame cannot be read."""
+    cameras: `Dataset.cameras`. Raises InputError if a frame cannot be read."""
     gains = exposure_of(prior)(frames) if settings.exposure else np.ones((len(frames), 3))
     with_alpha = settings.train.alpha_weight > 0
     pixel = pixel_on(prior, cameras)

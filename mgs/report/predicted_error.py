@@ -228,7 +228,7 @@ def calibrate_run(
         return Pixels.joined(parts)
 
     folds, prior = [], opened.prior
-    pixel = pixel_on(prior, [frame.camera for frame in opened.dataset.frames])
+    pixel = pixel_on(prior, opened.dataset.cameras)
     for fold in range(FOLDS):
         kept = [frame for i, frame in enumerate(frames) if i % FOLDS != fold]
         folds.append(measured(_without(kept, prior, settings, pixel), frames[fold::FOLDS]))

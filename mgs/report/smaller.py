@@ -116,8 +116,7 @@ def refit_run(
     own, settings, prior = opened.state.gaussians, opened.settings, opened.prior
     digest = inputs.prior_digest(prior)
     inputs.check_unchanged(opened.folder, opened.state.inputs, digest, settings, opened.dataset)
-    cameras = [frame.camera for frame in opened.dataset.frames]
-    images = last_images(settings, prior, opened.taken, cameras)
+    images = last_images(settings, prior, opened.taken, opened.dataset.cameras)
     found = lean_fit(images, settings, learn, sh, loss, say=say)
     say("comparing")
     views, psnr = compare_models([own, found.whole, found.gaussians], opened)

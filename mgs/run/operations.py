@@ -40,7 +40,7 @@ def operations_of(
     lam = lam_by_kind(settings.regularisation(columns), columns)
     exposure = exposure_of(prior) if settings.exposure else None
     colours = kept_colours(prior)
-    pixel = pixel_on(prior, [frame.camera for frame in dataset.frames])
+    pixel = pixel_on(prior, dataset.cameras)
 
     def initial(frames: Sequence[Frame]) -> Gaussians:
         gains = exposure(frames) if exposure else None

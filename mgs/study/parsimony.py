@@ -197,8 +197,7 @@ def fit_lean_and_judge(
     positions = np.array([frame.camera.position for frame in data.frames])
     order = views_in_order(positions, known.points.mean(0), views, seeds)
     frames = [data.frames[i] for i in order]
-    cameras = [frame.camera for frame in data.frames]
-    images, began = last_images(settings, known, frames, cameras), time.perf_counter()
+    images, began = last_images(settings, known, frames, data.cameras), time.perf_counter()
     found = lean_fit(images, settings)
     seconds = time.perf_counter() - began
     return _quality(found.gaussians, root / dataset) | {
