@@ -106,7 +106,8 @@ class Gaussians:
 
     @property
     def recorded(self) -> tuple[int, ...]:
-        """What a recording holds as constants (`mgs.splat.recording.frozen`)."""
+        """Constants of a recorded kernel: the shape of sh, and `antialiased` as 0 or 1 (see
+        `mgs.splat.recording.frozen`)."""
         return (*self.sh.shape, int(self.antialiased))
 
     @property

@@ -224,6 +224,9 @@ def test_the_pose_flown_counts_and_a_resumed_run_is_the_same(flight, data, whole
         moved = frame.camera.position - asked[frame.name].position
         np.testing.assert_allclose(moved, 0.05 * (frame.name in flight.taken), atol=1e-12)
         assert frame.name not in flight.taken or frame.camera.K[0, 0] == 16.5
+    for camera, before in zip(load_dataset(flight.dataset).cameras, asked.values(), strict=True):
+        np.testing.assert_array_equal(camera.position, before.position)
+        np.testing.assert_array_equal(camera.K, before.K)
     record = flight.dataset / "captured/kf_0000.json"
     record.write_text(record.read_text().replace("16.5", "16.6"))
     with pytest.raises(InputError, match=r"kf_0000\.json has changed since"):

@@ -235,7 +235,7 @@ def test_test_views_are_compared_and_their_metrics_shown(runs, tmp_path):
         view["view"]: view["sides"] for view in data["compared"] if view["view"].startswith("test/")
     }
     assert sorted(tests) == ["test/kf_0000", "test/kf_0001", "test/kf_0002"]
-    assert data["compared"][0]["view"] == "test/kf_0000"
+    assert data["compared"][0]["view"] == "test/kf_0001", "the one that was measured"
     assert tests["test/kf_0001"][1]["label"] == "d-optimal, 12.35 dB"
     assert tests["test/kf_0000"][1]["label"] == "d-optimal"
     assert "PSNR, test views (dB) 12.35" in parsed.text

@@ -28,7 +28,7 @@ DEFAULTS = {
     "means": " Default: free from photographs or with adaptive density, else frozen.",
     "sh": " Default: 3 with adaptive density, 1 with free means from photographs, else 0.",
     "loss": " Default: squared with frozen means, l1-dssim with free ones from photographs.",
-    "antialiased": " Default with adaptive density: not.",
+    "antialiased": " Default with adaptive density: --no-antialiased.",
     "density": " The defaults of adaptive are all those of 3DGS.",
 }
 """Help of the settings that `mgs.run.nbv.start_fit` decides by the prior."""

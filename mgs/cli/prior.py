@@ -239,7 +239,7 @@ def _reason(numbers: dict[str, Any]) -> str:
         )
     return (
         f"{count:,} Gaussians, since the closest pixel covers {size} of the surface, and samples "
-        f"nearer than {numbers['resolution']['spacing'] / pixel:.3g} pixels gain too little"
+        f"lie {numbers['resolution']['spacing'] / pixel:.3g} pixels apart"
     )
 
 

@@ -70,8 +70,8 @@ class TrainSettings(BaseModel):
     rates: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = RATES
     """Learning rate by kind of parameter, 0: not learned; `mean`, in metres, only if means move."""
     antialiased: bool = True
-    """Make Gaussians that are smaller than a pixel fainter, so that views from any distance agree
-    (default), or not, as in 3DGS and in the paper."""
+    """Make Gaussians that are smaller than a pixel fainter, so that near and far views agree
+    (default). 3DGS and the paper do not."""
     alpha_weight: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 0.0
     """Weight of alpha as a fourth channel in the loss, (sigma_rgb / sigma_alpha)^2; 0: not used."""
     decay: Positive = 0.1

@@ -213,9 +213,9 @@ def _samples(
     """Samples of a surface: points [N,3], unit normals [N,3], spacing in metres, and items of
     prior.json about mesh and samples; square metres, metres.
 
-    cameras: set the spacing if the settings do not, to `closest_pixels` pixels of the closest one.
-    pixel: unit of `settings.density`, metres.
-    Raises InputError as `resolution` and `sample_surface`.
+    cameras: the closest one sets the spacing, to `closest_pixels` of its pixels, if the settings do
+    not. pixel: unit of `settings.density`, metres. Raises InputError as `resolution` and
+    `sample_surface`.
     """
     resolved = None
     if settings.resolved_by_cameras:

@@ -40,8 +40,8 @@ antialiased: EPS2D widens every footprint by about half a pixel, which would dra
 large. Chosen constants (docs/fit.md)."""
 
 CLOSEST = 10
-"""Percentile of the pixels' sizes that counts as that of the closest cameras, as one camera may be
-wrong."""
+"""Percentile of the cameras' pixel sizes that is taken for the closest; the smallest may be of a
+wrong camera."""
 
 THICKNESS = 0.1
 """Standard deviation of a Gaussian across the surface, over the spacing."""

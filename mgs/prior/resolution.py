@@ -18,11 +18,12 @@ from mgs.errors import InputError
 
 PIXELS_PER_SAMPLE = 0.9
 """Spacing of the samples over the size of the closest pixel. Closer samples gain little, and much
-closer ones lose: more parameters than pixel values. Chosen on three rocks (docs/parsimony.md)."""
+closer ones lose: the model then has more parameters than the images have values
+(docs/parsimony.md)."""
 
 PIXELS_OF_PHOTOGRAPHS = 1.15
-"""The same for surfaces from photographs, whose Gaussians move in a fit: closer ones take more
-passes (docs/fit.md)."""
+"""Spacing for surfaces from photographs. There `mgs fit` moves the Gaussians, and more of them need
+more passes (docs/fit.md)."""
 
 MOST_GAUSSIANS = 200_000
 """Most Gaussians that cameras decide: close-ups and high resolution ask for millions, which take

@@ -140,11 +140,14 @@ def shown_view(runs: Sequence[RunFiles], dataset: Dataset) -> tuple[Frame, str]:
 
 
 def _typical_view(runs: Sequence[RunFiles], frames: Sequence[Frame], views: str) -> Frame:
-    """The frame whose PSNRs are closest to the runs' means over the frames, in least squares, by
-    the key `views` of metrics.json."""
+    """The frame whose PSNRs are closest to the runs' means, in least squares, of those that all
+    runs were measured on by the key `views` of metrics.json; the first if there is none."""
     measured = [{v["name"]: v["psnr"] for v in (run.metrics or {}).get(views, [])} for run in runs]
-    psnr = np.array([[of.get(frame.name, 0.0) for frame in frames] for of in measured])
-    return frames[int(np.argmin(((psnr - psnr.mean(1, keepdims=True)) ** 2).sum(0)))]
+    known = [frame for frame in frames if all(frame.name in of for of in measured)]
+    if not known:
+        return frames[0]
+    psnr = np.array([[of[frame.name] for frame in known] for of in measured])
+    return known[int(np.argmin(((psnr - psnr.mean(1, keepdims=True)) ** 2).sum(0)))]
 
 
 def _caption(run: RunFiles, views: str, name: str) -> str:

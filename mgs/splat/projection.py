@@ -44,7 +44,7 @@ class Splats:
 
     mean_x, mean_y: centre, pixels from the image's corner.
     shear (no unit), white_x, white_y (1/px): the whitening, see the module.
-    log2_opacity: base-2 logarithm of the opacity, and of its compensation.
+    log2_opacity: base-2 logarithm of the opacity, times its compensation if antialiased.
     depth: z-depth of the centre, metres.
     red, green, blue: colour seen from the camera, linear RGB, at least 0.
     visible: mask of centres in front of the near plane. The fields above mean nothing elsewhere.
