@@ -207,8 +207,8 @@ def coverage_figure(path: str | Path, coverage: Curves) -> None:
     seeds and after each step.
     """
     percent = {label: (x, 100 * np.asarray(y, float)) for label, (x, y) in coverage.items()}
-    panel = (percent, "images", "surface seen (%)")
-    title = "Surface that at least one image sees"
+    panel = (percent, "images", "Gaussians observed (%)")
+    title = "Gaussians whose colour the images determine"
     _curves_figure(path, [panel], 4.8, title, lambda axes: axes[0].set_ylim(top=100))
 
 
