@@ -77,11 +77,12 @@ def video(
         option("File to write: .mp4 (needs imageio-ffmpeg), .gif or .png. Default: RUN/video.mp4."),
     ] = None,
     path: Annotated[
-        Literal["turntable", "spiral", "cameras"],
+        Literal["turntable", "spiral", "cameras"] | None,
         option(
-            "Camera path: a circle, two turns that rise and fall, or through the dataset's cameras."
+            "Camera path: a circle (default), two turns that rise and fall, or through the "
+            "dataset's cameras."
         ),
-    ] = "turntable",
+    ] = None,
     beside: Annotated[
         Literal["truth", "uncertainty"] | None,
         option(
@@ -99,7 +100,9 @@ def video(
             "Length, seconds. Default: 8, or 1 per view with --story or --beside truth.", min=0.1
         ),
     ] = None,
-    fps: Annotated[int, option("Frames per second along a path.", min=1, max=60)] = 25,
+    fps: Annotated[
+        int | None, option("Frames per second along a path. Default: 25.", min=1, max=60)
+    ] = None,
     width: Annotated[
         int | None, option("Width of a picture in pixels. Default: the cameras' own.", min=16)
     ] = None,
@@ -111,6 +114,13 @@ def video(
     from mgs.report.video import check_film, path_frames, write_film
     from mgs.run.folder import open_run
 
+    one_by_one = story or beside == "truth"
+    unused: dict[str, object] = {"--path": path, "--fps": fps} if one_by_one else {}
+    unused |= {"--beside": beside, "--width": width} if story else {}
+    if given := [name for name, value in unused.items() if value is not None]:
+        why = "--story" if story else "--beside truth"
+        raise InputError(f"{given[0]}: is not used with {why}; leave out one of them")
+    fps = fps or 25
     targets = _targets(runs, [run / "video.mp4" for run in runs], out, force)
     check_film(targets[0][1])
     runtime.start()
@@ -123,8 +133,7 @@ def video(
             else:
                 count = views if beside == "truth" else max(1, round((seconds or 8.0) * fps))
                 wide = width or opened.dataset.frames[0].camera.width
-                frames = path_frames(opened, path, beside, count, wide)
-            one_by_one = story or beside == "truth"
+                frames = path_frames(opened, path or "turntable", beside, count, wide)
             each = (seconds or float(count)) / count if one_by_one else 1 / fps
             lengths = [each] * (count - 1) + [3 * each if story else each]
             write_film(target, frames, lengths, partial(bar.whole, "frames"))

@@ -12,13 +12,12 @@ from typing import Any
 from mgs.camera import Camera
 from mgs.data.frames import Frame
 from mgs.errors import InputError
-from mgs.fit.objective import newton_decrease, objective
+from mgs.fit.objective import newton_decrease
 from mgs.gaussians import Gaussians
-from mgs.policy.criteria import lam_by_kind
 from mgs.prior.build import Prior
-from mgs.report.evidence import last_images
+from mgs.report.evidence import last_images, objective_of
 from mgs.run.settings import NbvSettings
-from mgs.splat import as_drjit, groups
+from mgs.splat import as_drjit
 
 CG_ITERATIONS = 20
 """Iterations of conjugate gradients."""
@@ -50,12 +49,7 @@ def remaining_decrease(
             "--convergence: is for a fixed number of Gaussians and squared differences; "
             "leave it out, or fit with --density fixed --loss squared"
         )
-    images = last_images(settings, prior, frames, cameras)
-    kinds = groups(settings.sh, train.means)
-    by_kind = lam_by_kind(settings.regularisation(kinds), kinds)
-    start = images.start(range(len(images))).with_degree(settings.sh)
-    given = images.cameras, images.targets, start, by_kind
-    goal = objective(gaussians, *given, None, train.means, images.normals, train.alpha_weight)
+    goal = objective_of(last_images(settings, prior, frames, cameras), gaussians, settings)
     model = as_drjit(gaussians)
     phi = goal.phi(model)
     share = newton_decrease(goal, model, CG_ITERATIONS, progress)[-1] / max(phi, 1e-30)

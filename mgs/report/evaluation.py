@@ -350,10 +350,14 @@ def evaluate(
     - dataset: of Gaussians or a PLY. Default for a PLY in a run folder: the run's.
     - trained: names of the frames that the model was trained on; in a run folder, the run's.
 
-    Raises InputError as `evaluate_run`, `read_ply` and `load_dataset`, and if a model comes without
-    a dataset.
+    Raises InputError as `evaluate_run`, `read_ply` and `load_dataset`, if a model comes without a
+    dataset, and if dataset or trained are given for a run.
     """
     if isinstance(subject, Run) or (not isinstance(subject, Gaussians) and Path(subject).is_dir()):
+        if dataset is not None or trained:
+            raise InputError(
+                f"{subject}: is a run, with its own dataset; leave out dataset and trained"
+            )
         return evaluate_run(subject, progress=progress, **options)
     renderer: Renderer = render_view
     path = None

@@ -29,7 +29,7 @@ from mgs.data.frames import Frame
 from mgs.data.up import upright
 from mgs.errors import InputError
 from mgs.fit.fitting import fit
-from mgs.fit.objective import Vector, objective
+from mgs.fit.objective import Objective, Vector, objective
 from mgs.fit.stopping import StopReason
 from mgs.gaussians import Gaussians
 from mgs.memory import Deferred
@@ -207,6 +207,8 @@ def lean_fit(
        learned only where they are `paying` (loss: dB, as there). Colour of degree 0 is learned by
        all Gaussians that some image shows. Kinds whose rate is 0 are never learned.
 
+    Worth is always that in squared differences, also where the fits have another loss.
+
     say(stage): called as a stage starts. Raises InputError as `fitted`.
     """
     cache, views = ListCache(), range(len(images))
@@ -265,23 +267,29 @@ def _squared_error(model: Gaussians, camera: Camera, target: np.ndarray, cache: 
 
 def _worth(model: Gaussians, images: Images, settings: NbvSettings, cache: ListCache) -> Worth:
     """Worth of the parameters of a model that was fitted to all images."""
+    goal, degree = objective_of(images, model, settings, cache), model.sh_degree
+    fields, columns = as_drjit(model), kinds(degree, settings.train.means)
+    away = _flat([part for part, _ in goal.offsets(fields)], len(model))
+    precision, lam = _flat(goal.diagonal(fields), len(model)), regularisation(settings, degree)
+    return worth(away, precision, lam, settings.pixel_noise, columns, goal.phi(fields))
+
+
+def objective_of(
+    images: Images, model: Gaussians, settings: NbvSettings, cache: ListCache | None = None
+) -> Objective:
+    """Objective of a fit to all images with the settings of a run, in squared differences."""
     degree, train = model.sh_degree, settings.train
-    lam = regularisation(settings, degree)
-    goal = objective(
+    return objective(
         model,
         images.cameras,
         images.targets,
         images.start(range(len(images))).with_degree(degree),
-        lam_by_kind(lam, groups(degree, train.means)),
+        lam_by_kind(regularisation(settings, degree), groups(degree, train.means)),
         cache,
         train.means,
         images.normals,
         train.alpha_weight,
     )
-    fields, columns = as_drjit(model), kinds(degree, train.means)
-    away = _flat([part for part, _ in goal.offsets(fields)], len(model))
-    precision = _flat(goal.diagonal(fields), len(model))
-    return worth(away, precision, lam, settings.pixel_noise, columns, goal.phi(fields))
 
 
 def _flat(vector: Vector, n: int) -> NDArray[np.float64]:
@@ -297,7 +305,7 @@ def fitted(
     cache: ListCache,
     kept: Mapping[str, Mask] | None = None,
 ) -> Gaussians:
-    """Fit some views from the start; return the Gaussians.
+    """Fit some views (indices) from the start; return the Gaussians.
 
     kept: as `LeanModel.learned`; None: all is learned. Raises InputError as `mgs.fit.fitting.fit`,
     and if the fit diverges.
@@ -316,8 +324,8 @@ def fitted(
     )
     if found.stop_reason == StopReason.DIVERGED:
         raise InputError(
-            f"refit: a fit diverged, its loss rose to {found.losses[-1]:.3g}; "
-            "lower `train.rates` of the run"
+            f"a new fit to the views of the run diverged: its loss rose to {found.losses[-1]:.3g}; "
+            "lower its `train.rates`"
         )
     return found.gaussians
 

@@ -201,9 +201,9 @@ def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
 
 
 def coverage_figure(path: str | Path, coverage: Curves) -> None:
-    """Draw surface coverage after each step (the paper's Fig. 3).
+    """Draw coverage after each step (the paper's Fig. 3).
 
-    coverage: label -> (number of training images, share of the surface observed, 0 to 1), after the
+    coverage: label -> (number of training images, share of Gaussians observed, 0 to 1), after the
     seeds and after each step.
     """
     percent = {label: (x, 100 * np.asarray(y, float)) for label, (x, y) in coverage.items()}

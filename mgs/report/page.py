@@ -241,7 +241,7 @@ def _plots(shown: Sequence[Shown]) -> list[dict[str, Any]]:
             f"information gain ({GAIN_UNIT})",
             True,
         ),
-        ("Surface coverage (Fig. 3)", covered, "coverage (%)", False),
+        ("Gaussians observed (coverage, Fig. 3)", covered, "coverage (%)", False),
         ("Coverage that each view added (Fig. 3)", added, "percentage points", True),
         ("Variance left, over that of the prior", left, "mean over all parameters", True),
     ]

@@ -122,7 +122,7 @@ def step_facts(step: Mapping[str, Any]) -> list[tuple[str, str]]:
     facts = [("images", str(step["images"]))]
     if step.get("information_gain") is not None:
         facts.append(("information gain", f"{step['information_gain']:.4g} {GAIN_UNIT}"))
-    facts.append(("surface coverage", f"{100 * step['coverage']:.2f} %"))
+    facts.append(("Gaussians observed", f"{100 * step['coverage']:.2f} %"))
     return facts + [(METRIC_NAMES[key], table_cell(key, v)) for key, v in measured(step).items()]
 
 

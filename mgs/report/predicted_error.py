@@ -24,19 +24,15 @@ from numpy.typing import NDArray
 
 from mgs.camera import Camera
 from mgs.colour import SH_C0
-from mgs.data.dataset import target_of
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import write_json
-from mgs.fit.fitting import fit
 from mgs.gaussians import Gaussians, learned, sh_from_rgb
 from mgs.images import write_exr
 from mgs.memory import padded
-from mgs.policy.criteria import lam_by_kind
-from mgs.prior.build import Prior
-from mgs.prior.initial import initial_gaussians, pixel_on
 from mgs.provenance import versions
 from mgs.report.calibration import NORMAL, Calibration, fit_calibration, judged
+from mgs.report.evidence import Images, fitted, last_images
 from mgs.report.figures import uncertainty_figure
 from mgs.run.folder import Run, open_run
 from mgs.run.settings import NbvSettings
@@ -159,26 +155,16 @@ def predictor(
     return Predictor(gaussians, variance, residual_variance(gaussians, frames))
 
 
-def _without(
-    frames: Sequence[Frame], prior: Prior, settings: NbvSettings, pixel: float
+def _fitted_to(
+    images: Images, views: Sequence[int], frames: Sequence[Frame], settings: NbvSettings
 ) -> Predictor:
-    """`Predictor` of a model that is fitted to some frames of the run. pixel: `pixel_on` all."""
-    how = pixel, None, None, settings.train.antialiased
-    start = initial_gaussians(prior, frames, *how)[0].with_degree(settings.sh)
+    """`Predictor` of a model that is fitted to some views of the run (indices in images and
+    frames)."""
     cache = ListCache()
-    columns = groups(start.sh_degree)
-    cameras = [frame.camera for frame in frames]
-    model = fit(
-        start,
-        cameras,
-        [target_of(frame, settings.train.alpha_weight > 0) for frame in frames],
-        settings.train,
-        cache=cache,
-        start=start,
-        lam=lam_by_kind(settings.regularisation(columns), columns),
-    ).gaussians
-    information = np.stack([fisher(model, camera, cache=cache) for camera in cameras])
-    return predictor(model, information.sum(axis=0, dtype=np.float64), frames, settings)
+    model = fitted(images, views, settings, settings.sh, cache)
+    information = np.stack([fisher(model, images.cameras[i], cache=cache) for i in views])
+    H = information.sum(axis=0, dtype=np.float64)
+    return predictor(model, H, [frames[i] for i in views], settings)
 
 
 @dataclass(frozen=True)
@@ -227,11 +213,12 @@ def calibrate_run(
             progress(done, total)
         return Pixels.joined(parts)
 
-    folds, prior = [], opened.prior
-    pixel = pixel_on(prior, opened.dataset.cameras)
+    folds = []
+    images = last_images(settings, opened.prior, frames, opened.dataset.cameras)
     for fold in range(FOLDS):
-        kept = [frame for i, frame in enumerate(frames) if i % FOLDS != fold]
-        folds.append(measured(_without(kept, prior, settings, pixel), frames[fold::FOLDS]))
+        kept = [i for i in range(len(frames)) if i % FOLDS != fold]
+        found = _fitted_to(images, kept, frames, settings)
+        folds.append(measured(found, frames[fold::FOLDS]))
     own = Pixels.joined(folds)
     final = predictor(opened.state.gaussians, opened.state.H, frames, settings)
     sets = {"folds": own} | {name: measured(final, views) for name, views in unseen.items()}

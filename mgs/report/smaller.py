@@ -97,8 +97,8 @@ def refit_run(
     was learned; otherwise the file holds the prior's value. The models are compared on the test
     views of the dataset, or without them on the held-out views. say(stage): called as a stage
     starts. Raises InputError as `open_run` and `lean_fit`, for an unknown learn or sh or if both
-    leave nothing to choose, for a loss that is not from 0 to LARGEST_LOSS, and if the prior or the
-    images are not those of the run.
+    leave nothing to choose, for a loss that is not from 0 to LARGEST_LOSS, for a run whose density
+    is not fixed, and if the prior or the images are not those of the run.
     """
     from mgs.report.evidence import last_images, lean_fit
 
@@ -112,6 +112,11 @@ def refit_run(
             "refit: --learn all --sh 0 leaves nothing to choose; leave out one of them"
         )
     opened = open_run(run)
+    if opened.settings.train.density != "fixed":
+        raise InputError(
+            f"{opened.folder}: its fit changed the Gaussians of the prior; "
+            "refit needs a run with --density fixed"
+        )
     path = check_writable(opened.folder / REFITTED)
     own, settings, prior = opened.state.gaussians, opened.settings, opened.prior
     digest = inputs.prior_digest(prior)

@@ -20,8 +20,8 @@ from mgs.report.runs import up_of
 from mgs.report.video import UNKNOWN, Film
 from mgs.run.folder import Run
 from mgs.run.loop import learn
-from mgs.run.nbv import problem_of
-from mgs.run.problem import Progress
+from mgs.run.operations import operations_of
+from mgs.run.problem import Problem, Progress
 from mgs.run.state import Fitted
 
 SIZE = (8.4, 3.1)
@@ -30,9 +30,8 @@ SIZE = (8.4, 3.1)
 DPI = 110
 
 
-def models(run: Run, progress: Progress) -> Iterator[Fitted]:
+def models(run: Run, problem: Problem) -> Iterator[Fitted]:
     """Fit the run's views again, one more each time; yield every model."""
-    problem = problem_of(run, progress, run.settings.policy)
     taken, seeds = run.state.taken, run.settings.seeds
     before: Fitted | None = None
     for count in range(1, len(taken) + 1):
@@ -48,10 +47,13 @@ def story_frames(run: Run, progress: Progress) -> Film:
     among the test views, or else the views never taken, or else all. Raises InputError as `models`,
     and if an image cannot be read.
     """
-    lam = problem_of(run, policy=run.settings.policy).lam
+    # Nothing is chosen, so a policy of the user's own is neither needed nor loaded.
+    settings = run.settings.model_copy(update={"policy": "uniform"})
+    operations = operations_of(run.dataset, run.prior, settings)
+    problem = Problem(run.dataset, settings, operations, progress)
     shown: Frame | None = None
-    for model in models(run, progress):
-        unknown = {"uncertainty": criteria.uncertainty(model.H, lam)}
+    for model in models(run, problem):
+        unknown = {"uncertainty": criteria.uncertainty(model.H, problem.lam)}
         shown = shown or _shown_view(run, model, unknown)
         maps = view_maps(model.gaussians, shown.camera, unknown)
         yield _drawn(run, model, maps, shown)

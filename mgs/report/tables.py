@@ -37,8 +37,8 @@ COLUMNS = {
 def comparison_rows(compared: Comparison) -> list[dict[str, Any]]:
     """Numbers of each run, a row each.
 
-    - policy: the run's label; images: number of training images; coverage: of the surface, per
-      cent.
+    - policy: the run's label; images: number of training images; coverage: Gaussians observed,
+      per cent.
     - path: length of the straight lines from view to view, first seed first; unit: of that length,
       metres where it is "m".
     - test.NAME (if the dataset has test views), all.NAME, held_out.NAME: means in metrics.json,

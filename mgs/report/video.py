@@ -120,7 +120,7 @@ def _resized(image: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _side_by_side(*pictures: np.ndarray) -> np.ndarray:
-    """Pictures [H,W,3] in [0,1] beside each other, uint8, with even numbers of pixels."""
+    """Pictures [H,W,3] in [0,1] beside each other, uint8, of even height, as encoders need."""
     gap = np.ones((pictures[0].shape[0], GAP, 3), np.float32)
     parts = [part for picture in pictures for part in (gap, picture)][1:]
     frame = np.concatenate(parts, axis=1)
