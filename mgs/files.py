@@ -22,7 +22,7 @@ from tempfile import TemporaryFile
 from typing import Any, TextIO
 
 from mgs.errors import InputError
-from mgs.memory import check_room
+from mgs.memory import check_room, decoding
 
 
 @contextmanager
@@ -95,6 +95,23 @@ def reading(path: Path, what: str = "file") -> Iterator[None]:
         raise InputError(
             f"{path}: cannot be read ({error.strerror or error}); give a file that can be read"
         ) from None
+
+
+@contextmanager
+def parsing(path: Path, what: str, cure: str) -> Iterator[None]:
+    """Context manager: turns errors of a damaged file into an InputError, and bounds the memory
+    (`mgs.memory.decoding`).
+
+    what: kind of file. cure: end of the line. All errors count, since libraries raise many types.
+    """
+    try:
+        with decoding(path):
+            yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: not a readable {what} ({reason}); {cure}") from None
 
 
 def copy_file(source: Path, path: Path) -> None:

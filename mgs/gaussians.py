@@ -131,13 +131,14 @@ class Gaussians:
         """Opacities [N] in [0,1]. Those of very large logits are rounded to exactly 0 or 1."""
         return expit(self.logit_opacities.astype(np.float64)).astype(np.float32)
 
-    def check(self) -> Gaussians:
+    def check(self, where: object = "gaussians") -> Gaussians:
         """Check shapes and values (NumPy fields only), and return self.
 
         Raises InputError as `check_shapes`, and if a number is not finite or a colour coefficient
-        exceeds SH_MAX. The message names the parameter and the first such Gaussian.
+        exceeds SH_MAX. The message begins with `where`, and names the parameter and the first such
+        Gaussian.
         """
-        self.check_shapes()
+        self.check_shapes(where)
         for name in ARRAYS:
             values = np.asarray(getattr(self, name))
             bad = ~np.isfinite(values) if name != "sh" else ~(np.abs(values) <= SH_MAX)
@@ -146,29 +147,29 @@ class Gaussians:
                 finite = np.isfinite(values[first])
                 what = f"is beyond {SH_MAX:,.0f}" if finite else "is NaN or infinite"
                 raise InputError(
-                    f"gaussians: {name} {what}, first at Gaussian {first[0]}; remove or repair it"
+                    f"{where}: {name} {what}, first at Gaussian {first[0]}; remove or repair it"
                 )
         return self
 
-    def check_shapes(self) -> None:
+    def check_shapes(self, where: object = "gaussians") -> None:
         """Raise InputError if the shapes (NumPy or Dr.Jit) are not those of N Gaussians, or N
         exceeds MAX_GAUSSIANS."""
         n = len(self)
         if n > MAX_GAUSSIANS:
             raise InputError(
-                f"gaussians: {n:,} are more than {MAX_GAUSSIANS:,}, the most that kernels index; "
-                "take fewer"
+                f"{where}: {n:,} Gaussians are more than {MAX_GAUSSIANS:,}, the most that kernels "
+                "index; take fewer"
             )
         coefficients = {(d + 1) ** 2 for d in range(MAX_SH_DEGREE + 1)}
         shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,)}
         for name, shape in shapes.items():
             if tuple(getattr(self, name).shape) != shape:
                 raise InputError(
-                    f"gaussians: {name} has shape {getattr(self, name).shape}, expected {shape}"
+                    f"{where}: {name} has shape {getattr(self, name).shape}, expected {shape}"
                 )
         sh = tuple(self.sh.shape)
         if len(sh) != 3 or sh != (n, sh[1], 3) or sh[1] not in coefficients:
-            raise InputError(f"gaussians: sh has shape {sh}, expected ({n}, 1|4|9|16, 3)")
+            raise InputError(f"{where}: sh has shape {sh}, expected ({n}, 1|4|9|16, 3)")
 
 
 def sh_from_rgb(rgb: np.ndarray) -> np.ndarray:

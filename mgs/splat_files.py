@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from mgs.errors import InputError
-from mgs.files import atomic_path, reading
+from mgs.files import atomic_path, parsing, reading
 from mgs.gaussians import Gaussians
-from mgs.memory import decoding
 from mgs.splat_gltf import MAGIC, read_glb, write_glb
 from mgs.splat_ply import ply_colour_space, read_ply, write_compressed_ply, write_ply
 
@@ -129,27 +128,20 @@ def _read_spz(path: Path) -> Gaussians:
     Raises InputError if it is damaged.
     """
     codec = _spz_codec(path)
-    try:
-        with reading(path), decoding(path):
-            found = codec.read_spz(str(path))
-            parts = [found["sh0"][:, None, :]]
-            if found["shN"] is not None and found["shN"].size:
-                parts.append(found["shN"])
-            y_up = Gaussians(
-                means=found["means"],
-                log_scales=found["scales"],
-                quats=found["quats"],
-                logit_opacities=found["opacities"],
-                sh=np.concatenate(parts, axis=1),
-                antialiased=False,
-            ).check()
-            return _flip_y_up(y_up)
-    except (RuntimeError, ValueError) as error:
-        reason = str(error).removesuffix(f": {path}")
-        raise InputError(f"{path}: not a readable SPZ ({reason}); export it again") from None
-    except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+    with reading(path), parsing(path, "SPZ", "export it again"):
+        found = codec.read_spz(str(path))
+        parts = [found["sh0"][:, None, :]]
+        if found["shN"] is not None and found["shN"].size:
+            parts.append(found["shN"])
+        y_up = Gaussians(
+            means=found["means"],
+            log_scales=found["scales"],
+            quats=found["quats"],
+            logit_opacities=found["opacities"],
+            sh=np.concatenate(parts, axis=1),
+            antialiased=False,
+        ).check(path)
+    return _flip_y_up(y_up)
 
 
 def _write_spz(path: Path, gaussians: Gaussians) -> None:

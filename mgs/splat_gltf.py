@@ -17,9 +17,8 @@ from scipy.special import logit
 
 from mgs.colour import SH_C0
 from mgs.errors import InputError
-from mgs.files import atomic_path, reading
+from mgs.files import atomic_path, parsing, reading
 from mgs.gaussians import Gaussians
-from mgs.memory import decoding
 
 MAGIC = b"glTF"
 EXTENSION = "KHR_gaussian_splatting"
@@ -109,16 +108,9 @@ def read_glb(path: str | Path) -> tuple[Gaussians, str]:
     file is missing or damaged, holds no Gaussians, or only compressed ones.
     """
     path = Path(path)
-    try:
-        with reading(path, "file; give a GLB"), decoding(path):
-            content, body = _chunks(path.read_bytes())
-            return _gaussians(content, body)
-    except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
-    except (LookupError, ValueError, TypeError, struct.error, RecursionError, AttributeError) as e:
-        reason = " ".join(str(e).split())[:100]
-        raise InputError(f"{path}: not a readable GLB ({reason}); export it again") from None
+    with reading(path, "file; give a GLB"), parsing(path, "GLB", "export it again"):
+        content, body = _chunks(path.read_bytes())
+        return _gaussians(path, content, body)
 
 
 def _chunks(data: bytes) -> tuple[Any, bytes]:
@@ -134,19 +126,19 @@ def _chunks(data: bytes) -> tuple[Any, bytes]:
     return json.loads(chunks[JSON]), chunks.get(BINARY, b"")
 
 
-def _gaussians(content: Any, body: bytes) -> tuple[Gaussians, str]:
+def _gaussians(path: Path, content: Any, body: bytes) -> tuple[Gaussians, str]:
     """Gaussians and their colour space, from the chunks of a GLB."""
     primitives = [p for mesh in content.get("meshes", []) for p in mesh["primitives"]]
     found = next((p for p in primitives if EXTENSION in p.get("extensions", {})), None)
     if found is None:
-        raise InputError(f"no Gaussians in it (no {EXTENSION}); export it as a splat PLY")
+        raise InputError(f"{path}: no Gaussians in it (no {EXTENSION}); export it as a splat PLY")
     extension = found["extensions"][EXTENSION]
     if extension.get("extensions"):
         kind = next(iter(extension["extensions"]))
-        raise InputError(f"its Gaussians are compressed ({kind}); export it uncompressed")
+        raise InputError(f"{path}: its Gaussians are compressed ({kind}); export it uncompressed")
 
     def values(name: str) -> np.ndarray:
-        return _accessor(content, found["attributes"][name], body)
+        return _accessor(path, content, found["attributes"][name], body)
 
     coefficients = sum(name.startswith(f"{EXTENSION}:SH_") for name in found["attributes"])
     opacities = values(f"{EXTENSION}:OPACITY")[:, 0].astype(np.float64)
@@ -161,15 +153,17 @@ def _gaussians(content: Any, body: bytes) -> tuple[Gaussians, str]:
         antialiased=found.get("extras", {}).get("antialiased") is True,
     )
     linear = extension.get("colorSpace") == SPACES["linear"]
-    return gaussians.check(), "linear" if linear else "srgb"
+    return gaussians.check(path), "linear" if linear else "srgb"
 
 
-def _accessor(content: Any, index: int, body: bytes) -> np.ndarray:
+def _accessor(path: Path, content: Any, index: int, body: bytes) -> np.ndarray:
     """Values of an accessor, float32 [N,size]. NumPy raises TypeError or ValueError if they do not
     lie within the binary chunk."""
     accessor = content["accessors"][index]
     if "sparse" in accessor:
-        raise InputError("has sparse accessors, which are not supported; export it without")
+        raise InputError(
+            f"{path}: has sparse accessors, which are not supported; export it without"
+        )
     view = content["bufferViews"][accessor["bufferView"]]
     kind, size = np.dtype(COMPONENTS[accessor["componentType"]]), SIZES[accessor["type"]]
     start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)

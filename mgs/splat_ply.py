@@ -14,15 +14,14 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 from scipy.special import logit
 
 from mgs.colour import SH_C0
 from mgs.errors import InputError
-from mgs.files import atomic_path, reading
+from mgs.files import atomic_path, parsing, reading
 from mgs.gaussians import Gaussians
-from mgs.memory import decoding
 
 LINEAR_COMMENT = "mgs: colours are linear RGB"
 """Comment in the header of the files that mgs writes; the layout has no field for the colour space.
@@ -110,7 +109,11 @@ def read_ply(path: str | Path) -> Gaussians:
     file is missing, is not a PLY, lacks a property, or holds values that `Gaussians.check` refuses.
     """
     path = Path(path)
-    ply = _parse(path)
+    with (
+        reading(path, "file; give a 3DGS PLY"),
+        parsing(path, "3DGS PLY", "export it again"),
+    ):
+        ply = _parse_any_comment(path)
     if "vertex" not in ply:
         raise InputError(
             f"{path}: not a 3DGS PLY, it has no vertices; export it with a splatting tool"
@@ -122,21 +125,7 @@ def read_ply(path: str | Path) -> Gaussians:
         columns = {name: vertices[name] for name in vertices.dtype.names}
     antialiased = ANTIALIASED_COMMENT in ply.comments
     gaussians = replace(_from_columns(path, columns, len(vertices)), antialiased=antialiased)
-    try:
-        return gaussians.check()
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-
-
-def _parse(path: Path) -> PlyData:
-    """Elements of a PLY file. Raises InputError if it cannot be read or is damaged."""
-    try:
-        with reading(path, "file; give a 3DGS PLY"), decoding(path):
-            return _parse_any_comment(path)
-    except InputError:
-        raise
-    except (PlyParseError, ValueError, OverflowError) as error:
-        raise InputError(f"{path}: not a readable 3DGS PLY ({error}); export it again") from None
+    return gaussians.check(path)
 
 
 def _parse_any_comment(path: Path) -> PlyData:

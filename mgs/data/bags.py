@@ -17,7 +17,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.data.tracks import Spacing, Track, rigid
 from mgs.errors import InputError
-from mgs.files import atomic_path
+from mgs.files import atomic_path, parsing
 from mgs.images import read_values, write_png
 
 KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -61,14 +61,11 @@ def opened(path: Path) -> Iterator[Any]:
             f"{path}: is a ROS bag, and rosbags, which reads it, is not installed; "
             "`pip install mgs[ros]`"
         ) from None
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            yield reader
-    except (InputError, KeyboardInterrupt):
-        raise
-    except Exception as error:  # rosbags raises many types for damaged bags
-        reason = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}: not a readable ROS bag ({reason}); record it again") from None
+    with (
+        parsing(path, "ROS bag", "record it again"),
+        AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader,
+    ):
+        yield reader
 
 
 def messages(reader: Any, *kinds: str, topic: str | None = None) -> Iterator[tuple[str, Any]]:

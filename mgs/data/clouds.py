@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 
 from mgs.camera import Camera
 from mgs.data.visibility import in_image
 from mgs.errors import InputError
-from mgs.files import atomic_path, reading
-from mgs.memory import decoding
+from mgs.files import atomic_path, parsing, reading
 
 COLUMNS = ("x", "y", "z", "nx", "ny", "nz", "track", "error")
 
@@ -68,21 +67,14 @@ def read_cloud(path: str | Path) -> SparseCloud:
     path = Path(path)
     with reading(path, "point cloud; give a PLY file"), path.open("rb") as file:
         file.read(1)
-    try:
-        with decoding(path):
-            data = PlyData.read(str(path))["vertex"].data
+    with parsing(path, "cloud", "give a PLY file with x y z, or import again"):
+        data = PlyData.read(str(path))["vertex"].data
         names = [name for name in COLUMNS if name in (data.dtype.names or ())]
         values = {name: np.asarray(data[name], np.float64) for name in names}
         points = np.stack([values[name] for name in "xyz"], 1)
         views = None
         if {"nx", "ny", "nz"} <= set(names):
             views = np.stack([values[name] for name in ("nx", "ny", "nz")], 1)
-    except InputError:
-        raise
-    except (PlyParseError, KeyError, ValueError, TypeError, OverflowError) as error:
-        raise InputError(
-            f"{path}: not a readable cloud ({error}); give a PLY file with x y z, or import again"
-        ) from None
     first = np.sort(np.unique(points, axis=0, return_index=True)[1])
     points = points[first]
     views, track, error_px = (

@@ -12,8 +12,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud
 from mgs.errors import InputError
-from mgs.files import reading
-from mgs.memory import decoding
+from mgs.files import parsing, reading
 
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 """Coefficients of OpenCV's rational distortion model, in its order."""
@@ -103,17 +102,9 @@ def read_model(model: Path) -> tuple[list[tuple[str, Camera, np.ndarray]], Spars
     for file in RECORDS:
         if (model / file).is_file() and not _is_whole(model / file):
             raise InputError(f"{model / file}: is damaged or cut off; export the model again")
-    try:
-        with decoding(model):
-            reconstruction = pycolmap.Reconstruction(model)
-            return _images(model, reconstruction), _cloud(reconstruction)
-    except InputError:
-        raise
-    except Exception as error:  # pycolmap raises many types for damaged models
-        reason = " ".join(str(error).split())[:120]
-        raise InputError(
-            f"{model}: not a readable COLMAP model ({reason}); export it again"
-        ) from None
+    with parsing(model, "COLMAP model", "export it again"):
+        reconstruction = pycolmap.Reconstruction(model)
+        return _images(model, reconstruction), _cloud(reconstruction)
 
 
 def _images(model: Path, reconstruction: Any) -> list[tuple[str, Camera, np.ndarray]]:

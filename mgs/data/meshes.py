@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mgs.errors import InputError
-from mgs.files import reading
+from mgs.files import parsing, reading
 from mgs.images import check_pixels, unlimited_headers
 from mgs.memory import decoding
 from mgs.rotation import WORLD_FROM_GLTF
@@ -99,16 +99,8 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
         file.read(1)
     if path.suffix.lower() not in MESHES:
         raise InputError(f"{path}: not a readable mesh; give one of {', '.join(MESHES)}")
-    try:
-        with decoding(path), unlimited_headers():
-            mesh = _load(path)
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # trimesh raises many types for damaged or unknown files
-        reason = " ".join(str(error).split())[:120]
-        raise InputError(
-            f"{path}: not a readable mesh ({reason}); export it again as GLB, OBJ or PLY"
-        ) from None
+    with parsing(path, "mesh", "export it again as GLB, OBJ or PLY"), unlimited_headers():
+        mesh = _load(path)
     if not isinstance(mesh, trimesh.Trimesh):
         raise InputError(f"{path}: has no faces; give a triangle mesh, not a point cloud")
     _check(path, mesh.vertices, mesh.faces)

@@ -10,7 +10,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.errors import InputError
-from mgs.files import reading
+from mgs.files import parsing, reading
 
 
 def is_metashape(path: Path) -> bool:
@@ -27,9 +27,10 @@ def read_metashape(path: Path, images: Path) -> tuple[list[dict[str, Any]], str 
     """
     with reading(path):
         data = path.read_bytes()
-    try:
+    with parsing(path, "XML of Metashape's cameras", "export it again"):
         chunk = ElementTree.fromstring(data).find("chunk")
-        assert chunk is not None
+        if chunk is None:
+            raise ValueError("no chunk")
         lenses = {lens.get("id"): lens for lens in chunk.iterfind("sensors/sensor")}
         scale = chunk.find("transform/scale")
         factor = 1.0 if scale is None else float(scale.text or "")
@@ -38,13 +39,6 @@ def read_metashape(path: Path, images: Path) -> tuple[list[dict[str, Any]], str 
             for camera in chunk.iterfind("cameras//camera")
             if camera.find("transform") is not None
         ]
-    except InputError:
-        raise
-    except (ElementTree.ParseError, AssertionError, LookupError, ValueError, TypeError) as error:
-        reason = str(error) or "no chunk"
-        raise InputError(
-            f"{path}: is no XML of Metashape's cameras ({reason}); export it again"
-        ) from None
     names = [shot["name"] for shot in shots]
     for k, shot in enumerate(shots):
         shot["timestamp"] = 0.5 * k

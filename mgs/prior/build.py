@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
+from plyfile import PlyData
 
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud, write_cloud
@@ -23,8 +23,7 @@ from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
 from mgs.data.up import PLUS_Z, Up, unit_up, upright
 from mgs.data.visibility import in_mask, visible
 from mgs.errors import InputError
-from mgs.files import atomic_path, new_folder, read_json, write_json
-from mgs.memory import decoding
+from mgs.files import atomic_path, new_folder, parsing, read_json, write_json
 from mgs.notebook import cloud, html
 from mgs.prior.hull import MOST_PIXELS
 from mgs.prior.photographs import (
@@ -336,17 +335,12 @@ def load_prior(folder: str | Path) -> Prior:
     path = folder / "points.ply"
     if not path.is_file():
         raise InputError(f"{path}: no such file; make the prior again with `mgs prior`")
-    try:
-        with decoding(path):
-            data = PlyData.read(str(path))["vertex"].data
+    with parsing(folder, "prior", "make it again with `mgs prior`"):
+        data = PlyData.read(str(path))["vertex"].data
         names = ("x", "y", "z", "nx", "ny", "nz")
         columns = np.stack([np.asarray(data[name], np.float64) for name in names], 1)
         spacing, tolerance = float(numbers["spacing"]), float(numbers["depth_tolerance"])
         backed, up = int(numbers["backed"]), unit_up(numbers["up"])
-    except (PlyParseError, KeyError, ValueError, TypeError, OverflowError) as error:
-        raise InputError(
-            f"{folder}: not a readable prior ({error}); make it again with `mgs prior`"
-        ) from None
     if not np.isfinite(columns).all() or len(columns) < 2:
         raise InputError(
             f"{path}: has NaN values, or fewer than two points; "

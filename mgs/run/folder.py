@@ -41,7 +41,7 @@ from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame
 from mgs.data.up import upright
 from mgs.errors import InputError, Notice
-from mgs.files import atomic_path, read_json, reading, write_json
+from mgs.files import atomic_path, parsing, read_json, reading, write_json
 from mgs.gaussians import ARRAYS, Gaussians
 from mgs.notebook import cloud, html, thumbnails
 from mgs.policy.from_file import label
@@ -254,12 +254,13 @@ def read_checkpoint(out: Path) -> State | None:
     if not path.is_file():
         return None
     kinds = {"json": "U", "H": "f", "surface": "f"} | dict.fromkeys(ARRAYS, "f")
-    try:
-        with reading(path), zipfile.ZipFile(path) as file:
-            arrays = {name: _member(file, name, kind) for name, kind in kinds.items()}
+    cure = "delete it to start again from the seeds"
+    with reading(path), parsing(path, "checkpoint", cure), zipfile.ZipFile(path) as file:
+        arrays = {name: _member(file, name, kind) for name, kind in kinds.items()}
         record = json.loads(str(arrays.pop("json")[()]))
         H, surface = arrays.pop("H"), arrays.pop("surface")
-        gaussians = Gaussians(**arrays, antialiased=record.pop("antialiased") is True).check()
+        gaussians = Gaussians(**arrays, antialiased=record.pop("antialiased") is True)
+        gaussians.check(f"{path}: not a readable checkpoint")
         state = State(gaussians, H, surface, **record)
         for number, line in enumerate(state.steps, 1):
             check_line(number, line)
@@ -267,22 +268,6 @@ def read_checkpoint(out: Path) -> State | None:
             raise ValueError("its frames are not those of its steps")
         if H.ndim != 2 or surface.ndim != 2 or len(H) != len(state.gaussians):
             raise ValueError(f"H has shape {H.shape} of {len(state.gaussians)} Gaussians")
-    except (
-        zipfile.BadZipFile,
-        LookupError,
-        ValueError,
-        TypeError,
-        OSError,
-        EOFError,
-        InputError,
-        RuntimeError,
-        RecursionError,
-        SyntaxError,
-    ) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise InputError(
-            f"{path}: not a readable checkpoint ({reason}); delete it to start again from the seeds"
-        ) from None
     frames = read_config(out).get("frames")
     check_frames(path, state.taken, len(frames) if isinstance(frames, list) else 0)
     return state
