@@ -63,9 +63,11 @@ class Gaussians:
       Y_k(direction) sh_k), with the direction from the camera.
     - antialiased: whether opacity falls as the low-pass of the image (`EPS2D`) makes a footprint
       larger (Yu et al. 2024, Mip-Splatting; `antialiased` of gsplat); in 3DGS it stays.
+    - linear: whether colours are linear RGB. Files of most other tools have sRGB, which is blended
+      as it is.
 
     `gaussians[10:20]`, `gaussians[mask]` and `gaussians[indices]` are Gaussians again. Two are
-    equal if all numbers are, and `antialiased`.
+    equal if all numbers are, and both marks.
     """
 
     means: Any
@@ -74,6 +76,7 @@ class Gaussians:
     logit_opacities: Any
     sh: Any
     antialiased: bool = True
+    linear: bool = True
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -98,7 +101,8 @@ class Gaussians:
         if not isinstance(other, Gaussians):
             return NotImplemented
         pairs = ((getattr(self, name), getattr(other, name)) for name in ARRAYS)
-        return self.antialiased == other.antialiased and all(
+        marks = (self.antialiased, self.linear) == (other.antialiased, other.linear)
+        return marks and all(
             np.array_equal(np.asarray(mine), np.asarray(theirs)) for mine, theirs in pairs
         )
 

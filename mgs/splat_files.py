@@ -15,7 +15,7 @@ from mgs.errors import InputError
 from mgs.files import atomic_path, parsing, reading
 from mgs.gaussians import Gaussians
 from mgs.splat_gltf import MAGIC, read_glb, write_glb
-from mgs.splat_ply import ply_colour_space, read_ply, write_compressed_ply, write_ply
+from mgs.splat_ply import read_ply, write_compressed_ply, write_ply
 
 FORMATS = {"ply": ".ply", "compressed-ply": ".compressed.ply", "glb": ".glb", "spz": ".spz"}
 """Formats that are written, with the endings of their files."""
@@ -48,22 +48,16 @@ OTHERS = {
 def load_gaussians(path: str | Path) -> Gaussians:
     """Read Gaussians from a PLY in the layout of 3DGS, a compressed PLY, a GLB, or an SPZ.
 
-    Colours are unchanged: see `gaussians_and_space`. Raises InputError if the file is missing,
-    damaged or of another format, or if a package that it needs is missing.
+    Colours are unchanged. Raises InputError if the file is missing, damaged or of another format,
+    or if a package that it needs is missing.
     """
-    return gaussians_and_space(path)[0]
-
-
-def gaussians_and_space(path: str | Path) -> tuple[Gaussians, str]:
-    """Gaussians of a file, and the space in which their colours are blended, "linear" or "srgb": as
-    the file says, or else srgb. Raises InputError as `load_gaussians`."""
     path = Path(path)
     kind = _kind(path)
     if kind == "glb":
         return read_glb(path)
     if kind == "spz":
-        return _read_spz(path), "srgb"
-    return read_ply(path), ply_colour_space(path)
+        return _read_spz(path)
+    return read_ply(path)
 
 
 def _kind(path: Path) -> str:
@@ -83,23 +77,20 @@ def _kind(path: Path) -> str:
     return "ply"
 
 
-def write_gaussians(
-    path: str | Path, gaussians: Gaussians, kind: str, space: str, to_y_up: np.ndarray
-) -> None:
+def write_gaussians(path: str | Path, gaussians: Gaussians, kind: str, to_y_up: np.ndarray) -> None:
     """Write Gaussians (NumPy fields) in a format of FORMATS; the file appears complete.
 
-    space: "linear" or "srgb", in which the colours are blended; compressed PLY and SPZ cannot say
-    it. to_y_up: for a GLB (`write_glb`). Raises InputError as `mgs.files.atomic_path`, and if a
-    package is missing.
+    Compressed PLY and SPZ cannot say that colours are linear. to_y_up: for a GLB (`write_glb`).
+    Raises InputError as `mgs.files.atomic_path`, and if a package is missing.
     """
     if kind == "glb":
-        write_glb(path, gaussians, space, to_y_up)
+        write_glb(path, gaussians, to_y_up)
     elif kind == "spz":
         _write_spz(Path(path), gaussians)
     elif kind == "compressed-ply":
         write_compressed_ply(path, gaussians)
     else:
-        write_ply(path, gaussians, linear=space == "linear")
+        write_ply(path, gaussians)
 
 
 def _spz_codec(path: Path) -> Any:
@@ -140,6 +131,7 @@ def _read_spz(path: Path) -> Gaussians:
             logit_opacities=found["opacities"],
             sh=np.concatenate(parts, axis=1),
             antialiased=False,
+            linear=False,
         ).check(path)
     return _flip_y_up(y_up)
 

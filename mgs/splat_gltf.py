@@ -22,8 +22,8 @@ from mgs.gaussians import Gaussians
 
 MAGIC = b"glTF"
 EXTENSION = "KHR_gaussian_splatting"
-SPACES = {"linear": "lin_rec709_display", "srgb": "srgb_rec709_display"}
-"""Space of blended colours -> `colorSpace` of the extension."""
+SPACES = {True: "lin_rec709_display", False: "srgb_rec709_display"}
+"""`Gaussians.linear` -> `colorSpace` of the extension."""
 
 JSON, BINARY = 0x4E4F534A, 0x004E4942
 """Types of the two chunks of a GLB."""
@@ -43,11 +43,11 @@ def _sh_names(coefficients: int) -> list[str]:
     return [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{n}" for d in degrees for n in range(2 * d + 1)]
 
 
-def write_glb(path: str | Path, gaussians: Gaussians, space: str, to_y_up: np.ndarray) -> None:
+def write_glb(path: str | Path, gaussians: Gaussians, to_y_up: np.ndarray) -> None:
     """Write Gaussians (NumPy fields) as a GLB; the file appears complete.
 
-    space: "linear" or "srgb", in which the colours are blended. to_y_up: rotation [3,3] from the
-    model's world to glTF's, in which +Y is up; it becomes the transform of the file's only node.
+    to_y_up: rotation [3,3] from the model's world to glTF's, in which +Y is up; it becomes the
+    transform of the file's only node.
     Raises InputError as `mgs.files.atomic_path`.
     """
     g, scales = gaussians, np.exp(gaussians.log_scales)
@@ -76,7 +76,7 @@ def write_glb(path: str | Path, gaussians: Gaussians, space: str, to_y_up: np.nd
     primitive = {
         "attributes": {name: index for index, name in enumerate(attributes)},
         "mode": 0,
-        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": SPACES[space]}},
+        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": SPACES[g.linear]}},
         "extras": {"antialiased": g.antialiased},
     }
     matrix = np.eye(4)
@@ -100,9 +100,8 @@ def write_glb(path: str | Path, gaussians: Gaussians, space: str, to_y_up: np.nd
         temporary.write_bytes(header + chunks + body)
 
 
-def read_glb(path: str | Path) -> tuple[Gaussians, str]:
-    """Read the first primitive of Gaussians of a GLB, and the space of its colours, "linear" or
-    "srgb".
+def read_glb(path: str | Path) -> Gaussians:
+    """Read the first primitive of Gaussians of a GLB.
 
     Positions are those of the primitive: transforms of nodes are ignored. Raises InputError if the
     file is missing or damaged, holds no Gaussians, or only compressed ones.
@@ -126,8 +125,8 @@ def _chunks(data: bytes) -> tuple[Any, bytes]:
     return json.loads(chunks[JSON]), chunks.get(BINARY, b"")
 
 
-def _gaussians(path: Path, content: Any, body: bytes) -> tuple[Gaussians, str]:
-    """Gaussians and their colour space, from the chunks of a GLB."""
+def _gaussians(path: Path, content: Any, body: bytes) -> Gaussians:
+    """Gaussians from the chunks of a GLB."""
     primitives = [p for mesh in content.get("meshes", []) for p in mesh["primitives"]]
     found = next((p for p in primitives if EXTENSION in p.get("extensions", {})), None)
     if found is None:
@@ -144,16 +143,15 @@ def _gaussians(path: Path, content: Any, body: bytes) -> tuple[Gaussians, str]:
     opacities = values(f"{EXTENSION}:OPACITY")[:, 0].astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):  # bad scales are refused by `check`
         log_scales = np.log(values(f"{EXTENSION}:SCALE"))
-    gaussians = Gaussians(
+    return Gaussians(
         means=values("POSITION"),
         log_scales=log_scales,
         quats=np.roll(values(f"{EXTENSION}:ROTATION"), 1, axis=1),
         logit_opacities=logit(np.clip(opacities, CLEAREST, 1 - CLEAREST)).astype(np.float32),
         sh=np.stack([values(name) for name in _sh_names(coefficients)], axis=1),
         antialiased=found.get("extras", {}).get("antialiased") is True,
-    )
-    linear = extension.get("colorSpace") == SPACES["linear"]
-    return gaussians.check(path), "linear" if linear else "srgb"
+        linear=extension.get("colorSpace") == SPACES[True],
+    ).check(path)
 
 
 def _accessor(path: Path, content: Any, index: int, body: bytes) -> np.ndarray:

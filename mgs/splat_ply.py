@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 
@@ -57,14 +56,13 @@ def write_ply(
     path: str | Path,
     gaussians: Gaussians,
     marks: Mapping[str, np.ndarray] | None = None,
-    linear: bool = True,
 ) -> None:
     """Write Gaussians (NumPy fields) as a binary PLY in the layout of 3DGS; the file appears
     complete.
 
     It opens in any splat viewer. Viewers that expect sRGB show linear RGB too dark. marks: {name:
     [N] bool}, extra properties of the vertices, bytes of 0 or 1, which `read_ply` and viewers
-    ignore. linear: the colours are linear RGB, which a comment records. Raises InputError as
+    ignore. Comments record that Gaussians are linear or antialiased. Raises InputError as
     `mgs.files.atomic_path`.
     """
     g, n = gaussians, len(gaussians)
@@ -80,33 +78,18 @@ def write_ply(
         vertices[name] = columns[:, i]
     for name, mask in marks.items():
         vertices[name] = mask
-    comments = [LINEAR_COMMENT] * linear + [ANTIALIASED_COMMENT] * gaussians.antialiased
+    comments = [LINEAR_COMMENT] * g.linear + [ANTIALIASED_COMMENT] * gaussians.antialiased
     ply = PlyData([PlyElement.describe(vertices, "vertex")], comments=comments)
     with atomic_path(path) as temporary:
         ply.write(str(temporary))
 
 
-def ply_colour_space(path: str | Path) -> str:
-    """Space in which the colours of a PLY are blended: "linear" for files of mgs (by
-    LINEAR_COMMENT), else "srgb".
-
-    Raises OSError if the file cannot be read.
-    """
-    with Path(path).open("rb") as file:
-        for line in file:
-            if line.strip() == f"comment {LINEAR_COMMENT}".encode():
-                return "linear"
-            if line.strip() == b"end_header":
-                break
-    return "srgb"
-
-
 def read_ply(path: str | Path) -> Gaussians:
     """Read a PLY in the layout of 3DGS (binary or ASCII, SH degree 0 to 3), or a compressed one.
 
-    Properties are found by name, in any order; others are ignored. Colours are unchanged: see
-    `ply_colour_space`. Only files of mgs say that they are antialiased. Raises InputError if the
-    file is missing, is not a PLY, lacks a property, or holds values that `Gaussians.check` refuses.
+    Properties are found by name, in any order; others are ignored. Only files of mgs say that they are linear
+    or antialiased. Raises InputError if the file is missing, is not a PLY, lacks a property, or
+    holds values that `Gaussians.check` refuses.
     """
     path = Path(path)
     with (
@@ -123,9 +106,8 @@ def read_ply(path: str | Path) -> Gaussians:
         columns = _decompress(path, ply)
     else:
         columns = {name: vertices[name] for name in vertices.dtype.names}
-    antialiased = ANTIALIASED_COMMENT in ply.comments
-    gaussians = replace(_from_columns(path, columns, len(vertices)), antialiased=antialiased)
-    return gaussians.check(path)
+    marks = [comment in ply.comments for comment in (ANTIALIASED_COMMENT, LINEAR_COMMENT)]
+    return _from_columns(path, columns, len(vertices), *marks).check(path)
 
 
 def _parse_any_comment(path: Path) -> PlyData:
@@ -140,7 +122,9 @@ def _parse_any_comment(path: Path) -> PlyData:
         return PlyData.read(copy.name)
 
 
-def _from_columns(path: Path, columns: Mapping[str, np.ndarray], n: int) -> Gaussians:
+def _from_columns(
+    path: Path, columns: Mapping[str, np.ndarray], n: int, antialiased: bool, linear: bool
+) -> Gaussians:
     """Gaussians from properties of the 3DGS layout, [n] each. Raises InputError."""
     rest = sum(re.fullmatch("f_rest_[0-9]+", name) is not None for name in columns)
     coefficients = 1 + rest // 3
@@ -174,6 +158,8 @@ def _from_columns(path: Path, columns: Mapping[str, np.ndarray], n: int) -> Gaus
         quats=stack("rot_0", "rot_1", "rot_2", "rot_3"),
         logit_opacities=stack("opacity").ravel(),
         sh=np.ascontiguousarray(sh),
+        antialiased=antialiased,
+        linear=linear,
     )
 
 

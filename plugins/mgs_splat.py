@@ -36,7 +36,7 @@ from mgs.gaussians import ARRAYS
 from mgs.splat import ListCache, as_drjit, render
 from mgs.splat.mitsuba_sensor import camera_from_sensor
 from mgs.splat.rendering import as_colour
-from mgs.splat_files import gaussians_and_space
+from mgs.splat_files import load_gaussians
 
 
 class MgsSplat(mi.CppADIntegrator):
@@ -48,8 +48,8 @@ class MgsSplat(mi.CppADIntegrator):
         if not isinstance(props.get("filename"), str):
             raise InputError("mgs_splat: `filename` is missing or no string; name a 3DGS PLY")
         path = str(mi.file_resolver().resolve(props["filename"]))
-        gaussians, space = gaussians_and_space(path)
-        self.colour_space = props.get("colour_space", space)
+        gaussians = load_gaussians(path)
+        self.colour_space = props.get("colour_space", "linear" if gaussians.linear else "srgb")
         if self.colour_space not in ("linear", "srgb"):
             raise InputError(
                 f"mgs_splat: colour_space {self.colour_space!r} is unknown; choose linear or srgb"

@@ -88,8 +88,9 @@ def render(
     views = [
         (name, camera.resized(width) if width else camera) for name, camera in load_cameras(cameras)
     ]
-    model = read_model(subject)
-    gaussians, space = model.gaussians, model.space if colour_space == "auto" else colour_space
+    gaussians = read_model(subject).gaussians
+    if colour_space != "auto":
+        gaussians = replace(gaussians, linear=colour_space == "linear")
     if antialiased is not None:
         gaussians = replace(gaussians, antialiased=antialiased)
     runtime.start()
@@ -97,8 +98,8 @@ def render(
         if not force:
             check_new_folder(out)
         progress = partial(bar, "rendering")
-        draw_views(out, gaussians, views, space, background, exr, progress)
-    colours = "linear RGB" if space == "linear" else "sRGB"
+        draw_views(out, gaussians, views, background, exr, progress)
+    colours = "linear RGB" if gaussians.linear else "sRGB"
     what = f"{len(gaussians):,} Gaussians (SH degree {gaussians.sh_degree}, colours in {colours})"
     typer.echo(f"wrote {len(views)} views of {what} to {out}")
 

@@ -49,14 +49,14 @@ def export(
     ]
     for model, path in _targets(models, defaults, out, force):
         found = read_model(model)
-        if found.space == "srgb" and colour_space == "linear":
+        if not found.gaussians.linear and colour_space == "linear":
             raise InputError(
                 f"{model}: its colours are sRGB already; leave out --colour-space linear"
             )
-        shown = in_srgb(found) if colour_space == "srgb" else found
-        write_gaussians(path, shown.gaussians, to, shown.space, to_y_up(shown.up))
+        shown = in_srgb(found.gaussians) if colour_space == "srgb" else found.gaussians
+        write_gaussians(path, shown, to, to_y_up(found.up))
         megabytes = path.stat().st_size / 1e6
-        typer.echo(f"wrote {len(shown.gaussians):,} Gaussians to {path} ({megabytes:.1f} MB)")
+        typer.echo(f"wrote {len(shown):,} Gaussians to {path} ({megabytes:.1f} MB)")
 
 
 def _targets(

@@ -36,7 +36,7 @@ from mgs.provenance import versions
 from mgs.report.runs import read_metrics
 from mgs.run.folder import Run, holds_run, open_run
 from mgs.run.inputs import array_digest, camera_digest, frame_digests
-from mgs.splat_ply import ply_colour_space, read_ply
+from mgs.splat_ply import read_ply
 
 Renderer = Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray, np.ndarray]]
 """(gaussians, camera) -> linear RGB [H,W,3], alpha [H,W], expected z-depth [H,W] in metres."""
@@ -63,7 +63,9 @@ def render_view(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.nd
     from mgs.splat import render
 
     image = render(gaussians, camera)
-    return np.asarray(image.rgb), np.asarray(image.alpha), np.asarray(image.depth)
+    rgb = np.asarray(image.rgb)
+    linear = rgb if gaussians.linear else linear_from_srgb(np.clip(rgb, 0, 1))
+    return linear, np.asarray(image.alpha), np.asarray(image.depth)
 
 
 def evaluate_model(
@@ -359,13 +361,12 @@ def evaluate(
                 f"{subject}: is a run, with its own dataset; leave out dataset and trained"
             )
         return evaluate_run(subject, progress=progress, **options)
-    renderer: Renderer = render_view
     path = None
     if not isinstance(subject, Gaussians):
         path = Path(subject)
         if not path.exists():
             raise InputError(f"{path}: no such run folder or PLY file")
-        subject, renderer = read_ply(path), _renderer(ply_colour_space(path))
+        subject = read_ply(path)
         if dataset is None and holds_run(path.parent):
             run = open_run(path.parent)
             dataset, trained = run.dataset, [frame.name for frame in run.taken]
@@ -378,21 +379,8 @@ def evaluate(
         views.with_images(names),
         names,
         test_frames=tests.frames if tests else (),
-        renderer=renderer,
         progress=progress,
     )
     if path is not None:
         write_json(path.with_suffix(".metrics.json"), metrics)
     return metrics
-
-
-def _renderer(space: str) -> Renderer:
-    """Renderer of a model whose colours are blended in this space."""
-    if space == "linear":
-        return render_view
-
-    def render(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        rgb, alpha, depth = render_view(gaussians, camera)
-        return linear_from_srgb(np.clip(rgb, 0, 1)), alpha, depth
-
-    return render

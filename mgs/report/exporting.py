@@ -13,7 +13,7 @@ from mgs.gaussians import Gaussians
 from mgs.report.runs import up_of
 from mgs.run.folder import open_run
 from mgs.splat.reference import sh_basis
-from mgs.splat_files import gaussians_and_space
+from mgs.splat_files import load_gaussians
 
 DIRECTIONS = 64
 """Directions to which the coefficients of a converted colour are fitted."""
@@ -24,10 +24,9 @@ PART = 1 << 16
 
 @dataclass(frozen=True)
 class Model:
-    """Gaussians, the space of their colours ("linear" or "srgb"), and the world's up."""
+    """Gaussians, and the world's up."""
 
     gaussians: Gaussians
-    space: str
     up: Up = PLUS_Z
 
 
@@ -36,20 +35,19 @@ def read_model(source: str | Path) -> Model:
     InputError as `open_run`, `Run.state` and `load_gaussians`."""
     source = Path(source)
     if not source.is_dir():
-        return Model(*gaussians_and_space(source))
+        return Model(load_gaussians(source))
     run = open_run(source)
-    return Model(run.state.gaussians, "linear", up_of(run.settings.prior, run.dataset))
+    return Model(run.state.gaussians, up_of(run.settings.prior, run.dataset))
 
 
-def in_srgb(model: Model) -> Model:
+def in_srgb(g: Gaussians) -> Gaussians:
     """Convert linear colours to sRGB, which most viewers blend as it is; the rest is unchanged.
 
     The colour of each Gaussian is exact at SH degree 0. At higher degrees its coefficients are a
     least-squares fit over DIRECTIONS. Blending differs in any case: mixtures are a little darker.
     """
-    if model.space == "srgb":
-        return model
-    g = model.gaussians
+    if not g.linear:
+        return g
     k = np.arange(DIRECTIONS) + 0.5
     z, turn = 1 - 2 * k / DIRECTIONS, np.pi * (1 + 5**0.5) * k
     across = np.sqrt(1 - z * z)
@@ -61,7 +59,7 @@ def in_srgb(model: Model) -> Model:
         part = slice(first, first + PART)
         colours = srgb_from_linear(0.5 + np.einsum("dk,nkc->ndc", basis, g.sh[part]))
         sh[part] = np.einsum("kd,ndc->nkc", inverse, colours - 0.5)
-    return replace(model, gaussians=replace(g, sh=sh), space="srgb")
+    return replace(g, sh=sh, linear=False)
 
 
 def to_y_up(up: Up) -> np.ndarray:

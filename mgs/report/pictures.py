@@ -17,7 +17,6 @@ def draw_views(
     out: Path,
     gaussians: Gaussians,
     views: Sequence[tuple[str, Camera]],
-    space: str,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     exr: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -25,15 +24,14 @@ def draw_views(
     """Draw a model through every camera; write one PNG for each into the folder `out`.
 
     views: (path of the view's image, camera); a picture takes the name of the image (`file_names`).
-    space: "linear" or "srgb", in which the model's colours are blended
-    (`mgs.splat_ply.ply_colour_space`). background: sRGB in [0,1]. exr: write an OpenEXR file too,
-    with linear R G B over the background, opacity A and expected z-depth Z in metres, 0 where
-    nothing is drawn. progress: called as progress(views done, all). Raises InputError as
-    `mgs.splat.render`, and if a file cannot be written.
+    background: sRGB in [0,1]. exr: write an OpenEXR file too, with linear R G B over the
+    background, opacity A and expected z-depth Z in metres, 0 where nothing is drawn. progress:
+    called as progress(views done, all). Raises InputError as `mgs.splat.render`, and if a file
+    cannot be written.
     """
     from mgs.splat import as_drjit, render
 
-    model, linear = as_drjit(gaussians), space == "linear"
+    model, linear = as_drjit(gaussians), gaussians.linear
     behind = linear_from_srgb(background) if linear else np.asarray(background, np.float32)
     names = file_names([path for path, _ in views])
     for done, (name, (_, camera)) in enumerate(zip(names, views, strict=True)):

@@ -256,7 +256,7 @@ def read_checkpoint(out: Path) -> State | None:
     kinds = {"json": "U", "H": "f", "surface": "f"} | dict.fromkeys(ARRAYS, "f")
     cure = "delete it to start again from the seeds"
     with reading(path), parsing(path, "checkpoint", cure), zipfile.ZipFile(path) as file:
-        arrays = {name: _member(file, name, kind) for name, kind in kinds.items()}
+        arrays: dict[str, Any] = {n: _member(file, n, kind) for n, kind in kinds.items()}
         record = json.loads(str(arrays.pop("json")[()]))
         H, surface = arrays.pop("H"), arrays.pop("surface")
         gaussians = Gaussians(**arrays, antialiased=record.pop("antialiased") is True)

@@ -42,7 +42,7 @@ def gaussian_colours(subject: Subject, layer: str) -> np.ndarray:
     """Colours of the Gaussians in a layer, sRGB uint8 [N,3]; grey for depth."""
     g = _model(subject)
     if layer == "colour":
-        return _eight_bits(_display(subject, g.rgb))
+        return _eight_bits(_display(g, g.rgb))
     if layer in subject.scalars:
         return painted(subject.scalars[layer], *scale(subject, layer), PANELS[layer][1])
     return np.full((len(g), 3), 255 if layer == "alpha" else 128, np.uint8)
@@ -64,7 +64,7 @@ def kernel_image(
     depth = np.where(seen, maps["Z"], FAR).astype(np.float32)
     if layer == "colour":
         rgb = np.stack([maps[channel] for channel in "RGB"], axis=-1)
-        return _eight_bits(_display(subject, rgb)), depth, (0.0, 1.0)
+        return _eight_bits(_display(_model(subject), rgb)), depth, (0.0, 1.0)
     if layer == "alpha":
         grey = _eight_bits(np.clip(maps["A"], 0, 1))
         return np.stack([grey] * 3, axis=-1), depth, (0.0, 1.0)
@@ -113,6 +113,6 @@ def _eight_bits(values: np.ndarray) -> np.ndarray:
     return np.round(values * 255).astype(np.uint8)
 
 
-def _display(subject: Subject, rgb: np.ndarray) -> np.ndarray:
-    """Colours of the model as sRGB in [0,1]."""
-    return srgb_from_linear(rgb) if subject.space == "linear" else np.clip(rgb, 0, 1)
+def _display(g: Gaussians, rgb: np.ndarray) -> np.ndarray:
+    """Colours of a model as sRGB in [0,1]."""
+    return srgb_from_linear(rgb) if g.linear else np.clip(rgb, 0, 1)
