@@ -241,17 +241,6 @@ def clear_folder(path: Path, ours: Ours) -> None:
             _clear(path)
 
 
-def new_folder(path: str | Path) -> Path:
-    """Make an output folder and its parents, or use an empty one. Raises InputError as
-    `check_new_folder`."""
-    path = check_new_folder(path)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise not_writable(path, error) from None
-    return path
-
-
 @contextmanager
 def atomic_folder(path: str | Path, ours: Ours | None = None) -> Iterator[Path]:
     """Context manager: a temporary folder beside `path`, renamed to it after the block.

@@ -87,9 +87,9 @@ def write_ply(
 def read_ply(path: str | Path) -> Gaussians:
     """Read a PLY in the layout of 3DGS (binary or ASCII, SH degree 0 to 3), or a compressed one.
 
-    Properties are found by name, in any order; others are ignored. Only files of mgs say that they are linear
-    or antialiased. Raises InputError if the file is missing, is not a PLY, lacks a property, or
-    holds values that `Gaussians.check` refuses.
+    Properties are found by name, in any order; others are ignored. Only files of mgs say that
+    they are linear or antialiased. Raises InputError if the file is missing, is not a PLY, lacks a
+    property, or holds values that `Gaussians.check` refuses.
     """
     path = Path(path)
     with (

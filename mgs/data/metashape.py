@@ -39,11 +39,8 @@ def read_metashape(path: Path, images: Path) -> tuple[list[dict[str, Any]], str 
             for camera in chunk.iterfind("cameras//camera")
             if camera.find("transform") is not None
         ]
-    names = [shot["name"] for shot in shots]
     for k, shot in enumerate(shots):
         shot["timestamp"] = 0.5 * k
-        if names.count(shot["name"]) > 1:
-            raise InputError(f"{path}: two cameras are named {shot['name']}; rename one")
     return shots, None if scale is None else "m"
 
 

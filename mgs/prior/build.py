@@ -23,11 +23,10 @@ from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
 from mgs.data.up import PLUS_Z, Up, unit_up, upright
 from mgs.data.visibility import in_mask, visible
 from mgs.errors import InputError
-from mgs.files import atomic_path, new_folder, parsing, read_json, write_json
+from mgs.files import atomic_path, check_new_folder, parsing, read_json, write_json
 from mgs.notebook import cloud, html
 from mgs.prior.hull import MOST_PIXELS
 from mgs.prior.photographs import (
-    Surface,
     check_masks,
     check_photographs,
     source_of,
@@ -42,7 +41,7 @@ from mgs.prior.resolution import (
 from mgs.prior.scattered import scattered
 from mgs.prior.segmentation import SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
-from mgs.prior.surface import poisson_mesh, sample_surface, spread_first
+from mgs.prior.surface import Surface, poisson_mesh, sample_surface, spread_first
 from mgs.prior.truth import error_to_truth
 from mgs.seeds import derive_seed
 
@@ -122,6 +121,9 @@ def prior_and_cloud(
     mesh; NoSurface, which holds the cloud, if points give no surface.
     """
     chosen = source_of(dataset, source, points)
+    if chosen != "depth":
+        check_photographs(dataset.frames)
+        check_masks(dataset.frames)
     if chosen == "random":
         return _random_prior(
             dataset, settings, dataset.up if up is None or up == "auto" else up
@@ -168,9 +170,7 @@ def prior_and_cloud(
 
 
 def _random_prior(dataset: Dataset, settings: PriorSettings, up: Up) -> Prior:
-    """The prior of the source "random". Raises InputError as `check_photographs`, `scattered`."""
-    check_photographs(dataset.frames)
-    check_masks(dataset.frames)
+    """The prior of the source "random". Raises InputError as `scattered`."""
     mesh, points, normals, spacing, numbers = scattered(dataset, settings)
     about = {"from": "random", "frames": len(dataset.frames), "up": list(up), "unit": dataset.unit}
     tolerance = float(numbers["depth_tolerance"])
@@ -199,7 +199,7 @@ def _depth_surface(
         "cluster_size": len(points),
         "poisson_depth": depth,
     }
-    return Surface(mesh, cloud.voxel, segmented, numbers)
+    return Surface(mesh, cloud.voxel, numbers, segmented)
 
 
 def _samples(
@@ -312,7 +312,7 @@ def save_prior(out: str | Path, prior: Prior) -> Path:
     """
     import trimesh
 
-    out = new_folder(out)
+    out = check_new_folder(out)
     with atomic_path(out / "mesh.ply") as temporary:
         trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces, process=False).export(temporary)
     write_cloud(out / "points.ply", SparseCloud(prior.points, prior.normals))

@@ -19,6 +19,7 @@ from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh
 from mgs.data.visibility import in_image
 from mgs.errors import InputError
+from mgs.prior.surface import Surface
 from mgs.survey.fusion import nearest_point
 
 COARSE, REFINEMENTS = 48, 2
@@ -46,20 +47,11 @@ FEW = 0.1
 """Share of the frames that see a point of the object and may carve it by mistake."""
 
 
-@dataclass(frozen=True)
-class Hull:
-    """A visual hull. mesh: closed surface, world; cell: finest grid cell, units of the world;
-    numbers: items of prior.json, with mean and least share of a mask that the hull fills."""
-
-    mesh: Mesh
-    cell: float
-    numbers: dict[str, float]
-
-
 def visual_hull(
     frames: Sequence[Frame], on_stage: Callable[[str], None] = lambda stage: None
-) -> Hull:
-    """Visual hull of the masks of frames, smoothed by at most half a cell.
+) -> Surface:
+    """Visual hull of the masks of frames, smoothed by at most half a cell; its numbers have the
+    mean and least share of a mask that it fills.
 
     Raises InputError if all masks are empty or full, if they share no point of space, or if the
     hull fills too little of them, because poses and masks do not fit; the message names frames.
@@ -90,7 +82,7 @@ def visual_hull(
     mesh = Mesh(vertices, faces.astype(np.int64), np.ones(len(faces), bool))
     filled = _checked_agreement(frames, views, mesh, points)
     share = {"hull_fills_masks": np.nanmean(filled), "hull_fills_least": np.nanmin(filled)}
-    return Hull(mesh, cell, {"hull_cell": cell} | {key: float(share[key]) for key in share})
+    return Surface(mesh, cell, {"hull_cell": cell} | {key: float(share[key]) for key in share})
 
 
 @dataclass(frozen=True)

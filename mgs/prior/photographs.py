@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,11 +14,11 @@ from mgs.data.frames import Frame
 from mgs.data.meshes import Mesh
 from mgs.data.visibility import has_masks, in_image
 from mgs.errors import InputError
-from mgs.prior.hull import Hull, visual_hull
+from mgs.prior.hull import visual_hull
 from mgs.prior.points import segment_points, spacing_of
 from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud
 from mgs.prior.settings import PriorSettings
-from mgs.prior.surface import closed_poisson, intersection, poisson_mesh
+from mgs.prior.surface import Surface, closed_poisson, intersection, poisson_mesh
 from mgs.survey.fusion import focus, voxel_means
 
 SOURCES = ("depth", "mesh", "points", "hull", "random")
@@ -49,17 +47,6 @@ and are not sampled. With a hull or a ground plane there is no need."""
 
 ONE_SIDED = 0.5
 """Least length of the mean normal of points seen from one side."""
-
-
-@dataclass(frozen=True)
-class Surface:
-    """A surface and its origin. mesh: closed, world. cell: resolution, units of the world.
-    segmented: the cloud, if any. numbers: items of prior.json."""
-
-    mesh: Mesh
-    cell: float
-    segmented: SegmentedCloud | None
-    numbers: dict[str, Any]
 
 
 def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = None) -> str:
@@ -128,15 +115,11 @@ def surface_of(
     own.
 
     With masks, the hull bounds the surface of the points and closes it. Raises InputError as
-    `check_photographs`, `check_masks`, `visual_hull`, `read_cloud` and `segment_points`, and
-    NoSurface if the surface cannot be closed.
+    `visual_hull`, `read_cloud` and `segment_points`, and NoSurface if the surface cannot be closed.
     """
-    check_photographs(dataset.frames)
-    check_masks(dataset.frames)
     if source == "hull":
         settings.refuse_shaping("a hull is carved from masks")
-        carved = visual_hull(dataset.frames, on_stage)
-        return Surface(carved.mesh, carved.cell, None, dict(carved.numbers))
+        return visual_hull(dataset.frames, on_stage)
     cloud = read_cloud(points or dataset.root / CLOUD)
     segmented = segment_points(cloud, dataset, settings, on_stage)
     hull = visual_hull(dataset.frames, on_stage) if has_masks(dataset.frames) else None
@@ -159,11 +142,11 @@ def surface_of(
         "poisson_depth": depth,
     }
     numbers |= {} if hull is None else hull.numbers
-    return Surface(mesh, spacing, segmented, numbers)
+    return Surface(mesh, spacing, numbers, segmented)
 
 
 def _closed(
-    segmented: SegmentedCloud, hull: Hull | None, spacing: float, settings: PriorSettings
+    segmented: SegmentedCloud, hull: Surface | None, spacing: float, settings: PriorSettings
 ) -> tuple[Mesh, int]:
     """Closed mesh of the object's points, and the octree depth: bounded by the hull, or cut at the
     ground, or closed behind points seen from one side, with far faces marked as not seen."""

@@ -4,7 +4,7 @@ noise)."""
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from typing import Any
 
@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from mgs.data.meshes import Mesh
 from mgs.errors import InputError
-from mgs.prior.segmentation import Plane
+from mgs.prior.segmentation import Plane, SegmentedCloud
 
 POISSON_SCALE = 2.0
 """Edge of the cube of the Poisson reconstruction, over the extent of the points. Below the open
@@ -34,6 +34,17 @@ OVERSAMPLING = 5
 
 SAMPLE_BYTES = 3400
 """Memory per sample, bytes, mostly for pairs of candidates (measured)."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A surface and its origin. mesh: closed, world. cell: resolution, units of the world.
+    numbers: items of prior.json. segmented: the cloud, if any."""
+
+    mesh: Mesh
+    cell: float
+    numbers: dict[str, Any]
+    segmented: SegmentedCloud | None = None
 
 
 def poisson_mesh(
