@@ -127,7 +127,7 @@ def compare(
 
     truth: [H,W,4], linear RGB premultiplied by alpha, and alpha. rendered: [H,W,3] linear RGB.
     mask: [H,W] bool, the rock. weight: [H,W], 0 where the truth is unknown
-    (`mgs.data.dataset.Frame.target`). Raises InputError as `psnr` and `ssim`.
+    (`mgs.data.frames.Frame.target`). Raises InputError as `psnr` and `ssim`.
     """
     a, b, known = srgb_from_linear(truth[..., :3]), srgb_from_linear(rendered), weight > 0
     whole = None if known.all() else known

@@ -161,8 +161,8 @@ def read_source(
     a folder with a COLMAP model in itself, sparse/ or sparse/0/; or one of RECORDINGS. images: the
     image folder of COLMAP or Metashape, by default SOURCE/images; of a bag the topic. split: train,
     val or test. keyframes: `Spacing` of a recording. unpack: folder for the images of a bag, by
-    default SOURCE.unpacked. Raises InputError if no format is
-    recognised, no image exists, a frame is listed twice, or a camera model is not supported.
+    default SOURCE.unpacked. Raises InputError if no format is recognised, no image exists, a frame
+    is listed twice, or a camera model is not supported.
     """
     source = Path(source)
     source.exists()  # an OSError of the source itself is not one of a file that it names

@@ -74,6 +74,11 @@ class PriorSettings:
             )
         if self.density is not None and not 0 < self.density < np.inf:
             raise InputError(f"prior: density {self.density} must be positive; correct it")
+        if self.poisson_depth is not None and not 3 <= self.poisson_depth <= 12:
+            raise InputError(
+                f"prior: Poisson depth {self.poisson_depth} is not within 3 to 12; "
+                "correct --poisson-depth"
+            )
         if not 0 <= self.noise < np.inf:
             raise InputError(
                 f"prior: noise {self.noise} m must be 0 or more; correct --prior-noise"

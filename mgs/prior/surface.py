@@ -56,8 +56,8 @@ def poisson_mesh(
     points, normals: [M,3], metres and unit vectors; voxel: distance between neighbours, metres;
     depth: of the octree, None for finest cells of at most 1.5 voxels. The reconstruction closes the
     underside with a bulge that no data supports; the cut replaces it by a flat base, not seen.
-    Raises InputError if the depth is not within 3 to 12, or there is no closed surface above the
-    ground. Sources: Kazhdan and Hoppe 2013, by pymeshlab; the cut by manifold3d.
+    Raises InputError if there is no closed surface above the ground. Sources: Kazhdan and Hoppe
+    2013, by pymeshlab; the cut by manifold3d.
     """
     solid, depth = _closed_solid(points, normals, voxel, depth, plane)
     pieces = solid.trim_by_plane(plane.normal, plane.offset).decompose()
@@ -117,16 +117,12 @@ def _closed_solid(
     """Poisson surface as a solid of manifold3d, and the octree depth.
 
     Under an open cloud the surface may leave the cube. Then a larger cube is tried, and last the
-    points are mirrored in the ground plane too; cells keep their size. Raises InputError if the
-    depth is not within 3 to 12, or no try gives a closed surface.
+    points are mirrored in the ground plane too; cells keep their size. Raises InputError if no try
+    gives a closed surface.
     """
     import manifold3d
     import pymeshlab
 
-    if depth is not None and not 3 <= depth <= 12:
-        raise InputError(
-            f"prior: Poisson depth {depth} is not within 3 to 12; correct --poisson-depth"
-        )
     if depth is None:
         cells = POISSON_SCALE * float(np.ptp(points, axis=0).max()) / (POISSON_CELL * voxel)
         depth = int(np.clip(np.ceil(np.log2(cells)), *POISSON_DEPTHS))

@@ -58,7 +58,7 @@ class Guides(mi.SamplingIntegrator):
     """Integrator of the denoiser's guides: channels of a `RockLayer` whose inner integrator gives
     black, albedo and shading normal.
 
-    The same numbers as with Mitsuba's `aov` integrator inside, with half the rays.
+    The same numbers, to rounding, as with Mitsuba's `aov` integrator inside, with half the rays.
     """
 
     def __init__(self, rock: Any) -> None:
