@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import inspect
 import sys
 import traceback
@@ -92,20 +91,6 @@ def file_of(name: str) -> Path:
     return Path(name.rpartition(":")[0])
 
 
-def check(name: str) -> None:
-    """Raise InputError if the file is missing, has a syntax error, or defines no such function.
-
-    The file is parsed but not executed, so an error of its execution is raised by `load` only.
-    """
-    path, function = file_of(name), name.rpartition(":")[2]
-    try:
-        tree = ast.parse(_source(name))
-    except (SyntaxError, ValueError) as error:
-        raise InputError(f"--policy {name}: {_failed(path, error)}") from error
-    if not {function, "*"} & set(_names_bound(tree)):
-        raise _no_function(name)
-
-
 def load(name: str) -> Policy:
     """The policy FILE.py:FUNCTION. A file is executed once per process, unless it changes.
 
@@ -115,25 +100,23 @@ def load(name: str) -> Policy:
     Raises InputError if the file is missing or fails, has no such function, or the function has an
     unknown parameter.
     """
-    path, source = file_of(name), _source(name)
-    try:
-        module = _executed(path, source)
-    except Exception as error:
-        raise InputError(f"--policy {name}: {_failed(path, error)}") from error
-    function = getattr(module, name.rpartition(":")[2], None)
-    if not callable(function):
-        raise _no_function(name)
-    return by_parameter_name(name, function, path)
-
-
-def _source(name: str) -> bytes:
     path = file_of(name)
     if not path.is_file():
         raise InputError(
             f"--policy {name}: no such file {path}; correct the path "
             "(for a run, `policy` in its config.json)"
         )
-    return path.read_bytes()
+    try:
+        module = _executed(path, path.read_bytes())
+    except Exception as error:
+        raise InputError(f"--policy {name}: {_failed(path, error)}") from error
+    wanted = name.rpartition(":")[2]
+    function = getattr(module, wanted, None)
+    if not callable(function):
+        raise InputError(
+            f"--policy {name}: {path} has no function {wanted}; give the name of one that it has"
+        )
+    return by_parameter_name(name, function, path)
 
 
 @cache
@@ -142,26 +125,6 @@ def _executed(path: Path, source: bytes) -> ModuleType:
     sys.modules[module.__name__] = module  # dataclasses look up their annotations there
     exec(compile(source, str(path), "exec"), module.__dict__)
     return module
-
-
-def _names_bound(tree: ast.AST) -> list[str]:
-    """Names that a file defines, assigns or imports; "*" for an import of everything."""
-    names = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            names.append(node.name)
-        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            names.append(node.id)
-        elif isinstance(node, ast.alias):
-            names.append(node.asname or node.name)
-    return names
-
-
-def _no_function(name: str) -> InputError:
-    path, _, function = name.rpartition(":")
-    return InputError(
-        f"--policy {name}: {path} has no function {function}; give the name of one that it has"
-    )
 
 
 def by_parameter_name(name: str, function: Callable[..., Any], path: Path | None = None) -> Policy:

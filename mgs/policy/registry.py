@@ -162,11 +162,10 @@ def needs_model(name: str) -> bool:
 
 
 def check_policy(name: str) -> None:
-    """Raise InputError if there is no such policy. A user's file is parsed, not executed
-    (`mgs.policy.from_file.check`)."""
-    if from_file.in_file(name):
-        from_file.check(name)
-    elif not from_file.is_function(name) and name not in policy_names():
+    """Raise InputError for a name that is in no table, and is not that of a user's own policy. A
+    user's file is not read: `policy_named` does so."""
+    own = from_file.in_file(name) or from_file.is_function(name)
+    if not own and name not in policy_names():
         raise InputError(
             f"--policy {name}: unknown; choose one of {', '.join(policy_names())}, "
             "or add your own (docs/howto/policy.md)"
