@@ -199,15 +199,16 @@ def _print_warning(message: Any, category: type, filename: str, line: int, *_: A
 
 def _hint(arguments: Sequence[str]) -> str:
     """End of the line of an interrupted command: the way to continue, if there is one."""
-    command, *options = arguments or [""]
+    command, *given = arguments or [""]
+    options = [part for x in given for part in (x.split("=", 1) if x.startswith("--") else [x])]
     if command in RESUMABLE:
         but = " without --force" if "--force" in options else ""
         return f"; run the same command again{but} to continue"
     runs = [after for option, after in pairwise(options) if option in ("--out", "--resume")]
     if command not in ("nbv", "fit") or not runs or not (Path(runs[-1]) / "config.json").is_file():
         return ""
-    live = [pair for pair in pairwise([*options, ""]) if pair[0].startswith("--capture-")]
-    again = [x for pair in live for x in (pair[:1] if "=" in pair[0] else pair)]
+    live = [pair for pair in pairwise(options) if pair[0].startswith("--capture-")]
+    again = [part for pair in live for part in pair]
     return f"; continue with: mgs nbv {shlex.join(['--resume', runs[-1], *again])}"
 
 

@@ -227,9 +227,10 @@ def _commit(
 def _set_aside(out: Path) -> None:
     """Rename a refused answer, so that another can come in its place."""
     names = {path.name.partition(f"{out.stem}.refused-")[2] for path in out.parent.iterdir()}
-    number = 1 + max((int(name.split(".")[0]) for name in names if name[:1].isdigit()), default=0)
+    numbers = [number for name in names if (number := name.split(".")[0]).isdecimal()]
+    last = max(map(int, numbers), default=0)
     for end, path in answers(out).items():
-        path.rename(out.with_name(f"{out.stem}.refused-{number}{end}"))
+        path.rename(out.with_name(f"{out.stem}.refused-{last + 1}{end}"))
 
 
 def check_photograph(frame: Frame) -> None:

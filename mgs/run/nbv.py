@@ -116,6 +116,10 @@ def start_run(
     out = Path(out)
     if (dataset is None) == (capture is None):
         raise InputError("nbv: give either a DATASET or --capture SCENE")
+    if capture is not None and live is not None:
+        raise InputError(
+            "nbv: --capture renders images, and --capture-command or -folder awaits them; give one"
+        )
     if holds_run(out) and not force:
         raise InputError(f"{out}: a run {THERE}; `mgs nbv --resume {out}` continues it")
     given = dataset if isinstance(dataset, Dataset) else None
