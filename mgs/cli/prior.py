@@ -175,12 +175,11 @@ def _built(
 
 def _random(numbers: dict[str, Any]) -> str:
     """Line about a random start."""
-    unit = "m" if numbers["unit"] == "m" else "units"
     given = numbers["triangulated"]
     return (
         (f"{given:,} points that came with the cameras, and " if given else "")
         + f"{numbers['n'] - given:,} random points in and around a ball of radius "
-        f"{numbers['radius']:.3g} {unit}"
+        f"{numbers['radius']:.3g} {numbers['unit']}"
     )
 
 

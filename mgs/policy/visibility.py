@@ -26,13 +26,20 @@ FEW = 500
 class Visibility:
     """Visibility of the Gaussians on a surface from the cameras of a run and from a dome.
 
-    Each view is measured at its first use.
+    Each view is measured at its first use, and each result kept.
 
-    cameras: of the run.
-    exact(camera): exact information about the Gaussians before any training [N,P].
-    points: their means [N,3], metres. centre: middle of the rock [3]. lam: lambda of colours.
-    turn: rotation [3,3] from the cameras' world to that of points and centre, which has +Z up.
-    progress(done, total): called for each camera in `pool`.
+    Arguments:
+    - cameras: of the run.
+    - exact(camera): exact information about the Gaussians before any training [N,P].
+    - points: their means [N,3], metres. centre: middle of the rock [3]. lam: lambda of colours.
+    - turn: rotation [3,3] from the cameras' world to that of points and centre, which has +Z up.
+    - progress(done, total): called for each camera in `pool`.
+
+    Attributes:
+    - positions: camera centres [V,3], metres, with +Z up.
+    - seen(frame): squared blending weights in one view [N]. information(frame): `exact` of it.
+    - pool(), dome(): `Views` of all cameras of the run, and of a dome around the rock.
+    - planned(...), path(...): views to take next, as a set (`_planned`) and in order (`_path`).
     """
 
     def __init__(
@@ -51,8 +58,7 @@ class Visibility:
         self.positions = np.array([camera.position for camera in cameras]) @ self.turn.T
         self.seen, self.pool, self.dome = cache(self._seen), cache(self._pool), cache(self._dome)
         self.planned, self.path = cache(self._planned), cache(self._path)
-        # (frame) -> `exact` of its camera: a copy, because the kernel returns part of a larger
-        # array.
+        # A copy, because the kernel returns part of a larger array.
         self.information = kept_within(
             IMAGE_BYTES, lambda frame: np.array(exact(cameras[frame])), lambda F: F.nbytes
         )

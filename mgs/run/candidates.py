@@ -43,7 +43,7 @@ Named = tuple[str, Camera]
 class Site:
     """The object, and the camera that looks at it.
 
-    mesh, centre [3], up: of the prior. like: camera whose intrinsics candidates have by default.
+    like: camera whose intrinsics candidates have by default.
     """
 
     prior: Prior

@@ -34,9 +34,9 @@ def select_views(
 ) -> Iterator[Learned | Choice]:
     """Run the loop from the seeds, or from a state; yield the state after every fit.
 
-    chooser: function to use in place of `choose`. The loop ends when the budget is spent, or by
-    `stop_uncertainty` or `stop_gain`. After `stop_gain` the last item is the choice that was
-    refused. Raises InputError as `choose` and `learn`.
+    chooser: function to use in place of `choose`. The loop ends when the budget is spent, when no
+    pose is in reach, or by `stop_uncertainty` or `stop_gain`. After `stop_gain` the last item is
+    the choice that was refused. Raises InputError as `choose` and `learn`.
     """
     if state is None:
         problem.make_seeds()

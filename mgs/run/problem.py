@@ -99,8 +99,8 @@ class Problem:
     - skipped: number of views taken before the flight.
     - seeds: seed views; by default spread over the directions of the poses allowed.
 
-    Values that depend on images are computed at their first use. Raises InputError if there are
-    too few seeds, or their flight exceeds the limits.
+    Values that depend on images are computed at their first use. Raises InputError if fewer poses
+    are allowed than seeds are needed, and as `policy_named`.
     """
 
     def __init__(
