@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mgs import runtime
+from mgs.cli.nbv import PANELS, with_settings_as_options
 from mgs.cli.options import Force, argument, option, parse_gaussians
 from mgs.cli.progress import progress_bar
 from mgs.errors import InputError
@@ -76,28 +77,6 @@ def suggest(
             "Default: half that of the images with --dome, --ring or --grid, else 0."
         ),
     ] = None,
-    no_fly: Annotated[
-        float | None,
-        option(
-            "Radius in metres of an upright cylinder around the object that the flight must not "
-            "enter."
-        ),
-    ] = None,
-    clearance: Annotated[
-        float | None, option("Lowest height of a pose above the object's lowest point, metres.")
-    ] = None,
-    flight_length: Annotated[
-        float | None, option("Longest flight in metres; --views is then an upper limit.")
-    ] = None,
-    flight_time: Annotated[float | None, option("Longest flight in seconds.")] = None,
-    speed: Annotated[
-        float | None, option("Speed between pictures, metres per second. Default: 2.")
-    ] = None,
-    hover: Annotated[float | None, option("Seconds that a picture takes. Default: 3.")] = None,
-    policy: Annotated[
-        str | None,
-        option("Policy that scores candidates. Default: that of the run, or of `mgs nbv`."),
-    ] = None,
     prior: Annotated[
         Path | None, option("Folder of `mgs prior`. Default: DATASET/prior, or one built now.")
     ] = None,
@@ -106,6 +85,7 @@ def suggest(
     ] = None,
     preset: Annotated[str | None, option("As in `mgs nbv`: fast, balanced or accurate.")] = None,
     force: Force = False,
+    **options: Any,
 ) -> None:
     """Rank candidate poses by what a picture from each would add; plan the next flight.
 
@@ -124,16 +104,7 @@ def suggest(
         check_new_file(path, force)
     if plan and place is None:
         raise InputError("suggest: --plan needs --origin LAT,LON,ALT, the place of the world's 0")
-    settings = {
-        "no_fly": no_fly,
-        "clearance": clearance,
-        "flight_length": flight_length,
-        "flight_time": flight_time,
-        "speed": speed,
-        "hover": hover,
-        "policy": policy,
-    }
-    settings = {key: value for key, value in settings.items() if value is not None}
+    settings = {name: value for name, value in options.items() if value is not None}
     band = _elevations(elevations)
     ours = Ours(FILES, [path for path in (source, poses, prior) if path]) if force else None
     if out is not None:
@@ -141,7 +112,8 @@ def suggest(
     runtime.start()
     with TemporaryDirectory() as scratch, progress_bar("reading", console) as progress:
         fit = {"prior": prior, "gaussians": parse_gaussians(gaussians), "preset": preset}
-        run = _run(source, Path(scratch) / "run", fit | {"policy": policy}, progress)
+        fit |= {"policy": options["policy"]}
+        run = _run(source, Path(scratch) / "run", fit, progress)
         if plan and run.dataset.unit != "m":
             raise InputError(
                 f"{source}: its lengths have no unit, and a flight plan has metres; import the "
@@ -175,6 +147,16 @@ def suggest(
     _print(console, found, views, run, crossed)
     for written in [*([out] if out else []), *(plan or ())]:
         console.print(f"wrote {written}", soft_wrap=True)
+
+
+with_settings_as_options(
+    suggest,
+    {"Flight": PANELS["Flight"], "Choosing": ("policy",)},
+    {
+        "flight_length": " --views is then an upper limit.",
+        "policy": " Default: that of the run, or of `mgs nbv`.",
+    },
+)
 
 
 def _elevations(text: str | None) -> tuple[float, float] | None:

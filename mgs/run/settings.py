@@ -67,7 +67,7 @@ class NbvSettings(BaseModel):
     travel: Scale | None = None
     """Distance that costs as much as an image; scores are divided by 1 + distance / METRES."""
     flight_length: Scale | None = None
-    """Longest flight in metres, including the seed views and the return. Default: no limit."""
+    """Longest flight in metres, from the first image and back to it. Default: no limit."""
     flight_time: Scale | None = None
     """Longest flight in seconds, at --speed, with --hover at each picture. Default: no limit."""
     speed: Scale = 2.0
