@@ -7,7 +7,7 @@ large as before.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -128,11 +128,7 @@ def suggest(
     order = rated(problem, problem.context(state, free, fisher))
     described = _described(problem, state, flyable, weights)
     ranking = [
-        replace(
-            described(frame),
-            score=score,
-            information_gain=criteria.d_optimal(fisher(frame), state.H, problem.lam),
-        )
+        described(frame, score, criteria.d_optimal(fisher(frame), state.H, problem.lam))
         for frame, score in order
     ]
     plan, frames = _plan(problem, state, fisher, described)
@@ -191,33 +187,34 @@ def _weights(problem: Problem, fisher: Any, taken: int) -> dict[int, NDArray[np.
 
 def _described(
     problem: Problem, state: Fitted, poses: Sequence[Named], weights: dict[int, Any]
-) -> Any:
-    """A function frame -> `View` without score and gain."""
+) -> Callable[..., View]:
+    """A function (frame, score, information gain, place in the plan or 0) -> `View`."""
     unseen = ~criteria.observed(state.surface, problem.prior_lam)
     left = criteria.uncertainty(state.H, problem.lam)[: problem.on_surface]
     taken = len(state.taken)
     here = problem.positions[taken - 1]
 
-    def view(frame: int) -> View:
+    def view(frame: int, score: float, gain: float, planned: int = 0) -> View:
         seen, (name, camera) = weights[frame], poses[frame - taken]
         x, y, z = offset = problem.positions[frame] - problem.centre
         return View(
             name,
             camera,
-            score=0.0,
-            information_gain=0.0,
+            score=score,
+            information_gain=gain,
             unseen=float(seen[unseen].sum() / seen.sum()),
             unknown=float((seen * left).sum() / seen.sum()),
             distance=float(np.linalg.norm(problem.positions[frame] - here)),
             azimuth=float(np.degrees(np.arctan2(y, x)) % 360),
             elevation=float(np.degrees(np.arcsin(z / np.linalg.norm(offset)))),
+            planned=planned,
         )
 
     return view
 
 
 def _plan(
-    problem: Problem, state: Fitted, fisher: Any, described: Any
+    problem: Problem, state: Fitted, fisher: Any, described: Callable[..., View]
 ) -> tuple[list[View], list[int]]:
     """Views of the plan in flying order, and their frames."""
     chooser: Chooser = choose
@@ -234,23 +231,14 @@ def _plan(
     frames = [choice.frame for choice in choices]
     if not problem.settings.flies:
         frames = tour.flying_order(problem.flight.legs, 0, frames, 0)
-    of = {choice.frame: (k, choice) for k, choice in enumerate(choices, 1)}
-    plan = []
-    for frame in frames:
-        number, choice = of[frame]
-        numbers = {"score": choice.score, "information_gain": choice.information_gain}
-        plan.append(replace(described(frame), planned=number, **numbers))  # type: ignore[arg-type]
-    return plan, frames
+    chosen = {c.frame: (c.score, c.information_gain, k) for k, c in enumerate(choices, 1)}
+    return [described(frame, *chosen[frame]) for frame in frames], frames
 
 
 def _following(stops: Sequence[tuple[int, float]]) -> Chooser:
     """A chooser that takes these stops in turn."""
     left = iter(stops)
-
-    def choose_next(problem: Problem, state: Fitted, fisher: Any = None) -> tuple[int, float]:
-        return next(left)
-
-    return choose_next
+    return lambda problem, state, fisher: next(left)
 
 
 def _problem(
