@@ -20,7 +20,7 @@ from mgs.metrics import colour_corrected, psnr
 from mgs.policy.criteria import lam_by_kind
 from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of
-from mgs.prior.initial import Colours, colours_of, initial_gaussians, initial_normals, pixel_on
+from mgs.prior.initial import colours_of, initial_gaussians, initial_normals, pixel_on
 from mgs.run.inputs import prior_digest
 from mgs.run.live import Live, live_capture
 from mgs.run.problem import Operations
@@ -39,7 +39,9 @@ def operations_of(
     columns, normals = groups(settings.sh, means), initial_normals(prior)
     lam = lam_by_kind(settings.regularisation(columns), columns)
     exposure = exposure_of(prior) if settings.exposure else None
-    colours = kept_colours(prior)
+    colours = kept_within(
+        IMAGE_BYTES, colours_of(prior), lambda found: sum(part.nbytes for part in found)
+    )
     pixel = pixel_on(prior, dataset.cameras)
 
     def initial(frames: Sequence[Frame]) -> Gaussians:
@@ -96,22 +98,6 @@ def _capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[[Fra
     from mgs.synth.capture import capture_of  # needs a variant, and only rendered datasets need it
 
     return capture_of(dataset)
-
-
-def kept_colours(prior: Prior) -> Callable[[Frame], Colours]:
-    """`mgs.prior.initial.colours_of` the prior, with results kept within IMAGE_BYTES."""
-    of, frames = colours_of(prior), dict[str, Frame]()
-    kept = kept_within(
-        IMAGE_BYTES,
-        lambda name: of(frames[name]),
-        lambda found: sum(part.nbytes for part in found),
-    )
-
-    def colours(frame: Frame) -> Colours:
-        frames[frame.name] = frame
-        return kept(frame.name)
-
-    return colours
 
 
 def psnr_measure(
