@@ -19,6 +19,9 @@ from mgs.policy.poses import nearest_poses
 if TYPE_CHECKING:
     from mgs.policy.pool_gains import PoolGains
 
+Model = tuple[int, float, bool]
+"""SH degree, tau and over_dome of gains (`mgs.policy.context.Gains`)."""
+
 FEW = 500
 """About the number of Gaussians by which a flight is planned. A chosen constant."""
 
@@ -71,21 +74,15 @@ class Visibility:
         return pool_gains(self.points, self.lam, self.pool, self.dome)
 
     def _planned(
-        self,
-        taken: tuple[int, ...],
-        candidates: tuple[int, ...],
-        count: int,
-        model: tuple[int, float, bool],
+        self, taken: tuple[int, ...], candidates: tuple[int, ...], count: int, model: Model
     ) -> Sequence[int]:
-        """Candidates to take next, as a set of at most `count` (`planned_views`); all where the
-        gains of the pool do not fit into the memory. model: SH degree, tau and over_dome."""
-        from mgs.policy.pool_gains import PoolGains, fits, planned_views
+        """Candidates to take next, as a set of at most `count` (`planned_views`); all where there
+        are no `plan_gains`."""
+        from mgs.policy.pool_gains import planned_views
 
-        degree, tau, over_dome = model
-        if count >= len(candidates) or not fits(self.points, self.pool(), degree):
+        gains = self.plan_gains(model) if count < len(candidates) else None
+        if gains is None:
             return candidates
-        dome = self.dome() if over_dome else None
-        gains = PoolGains(self.points, self.pool(), self.lam, degree, tau, dome)
         gains.take(taken)
         return planned_views(gains, candidates, count)
 
@@ -95,11 +92,10 @@ class Visibility:
         candidates: tuple[int, ...],
         count: int,
         nearest: int,
-        model: tuple[int, float, bool],
+        model: Model,
     ) -> list[int]:
         """At most `count` candidates to take next, in order, each among the `nearest` to the one
-        before (`planned_path`); none where the gains do not fit into the memory. model: SH degree,
-        tau and over_dome."""
+        before (`planned_path`); none where there are no `plan_gains`."""
         from mgs.policy.pool_gains import planned_path
 
         def reach(views: Sequence[int]) -> list[int]:
@@ -107,18 +103,19 @@ class Visibility:
             near = nearest_poses(self.positions[left], self.positions[views[-1]], nearest)
             return [left[k] for k in near]
 
-        gains = self.few_gains(*model)
+        gains = self.plan_gains(model, FEW)
         if gains is None:
             return []
         gains.take(taken)
         return planned_path(gains, reach, count)
 
-    def few_gains(self, degree: int, tau: float, over_dome: bool) -> PoolGains | None:
-        """Gains of all cameras for about FEW of the Gaussians, before any view is taken; None where
-        no camera sees any, or they do not fit into the memory."""
+    def plan_gains(self, model: Model, most: int | None = None) -> PoolGains | None:
+        """Gains of all cameras for about `most` of the Gaussians, by default all, before any view
+        is taken; None where no camera sees any, or they do not fit into the memory."""
         from mgs.policy.pool_gains import PoolGains, fits
 
-        some = slice(None, None, max(len(self.points) // FEW, 1))
+        degree, tau, over_dome = model
+        some = slice(None, None, max(len(self.points) // most, 1) if most else None)
         pool = of_points(self.pool(), some)
         if not fits(self.points[some], pool, degree):
             return None

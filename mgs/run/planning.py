@@ -11,6 +11,7 @@ from mgs.errors import InputError
 from mgs.policy import poses, tour
 from mgs.policy.context import PolicyContext
 from mgs.policy.registry import FLOWN, PLANNED
+from mgs.policy.visibility import FEW
 from mgs.run.problem import Problem
 from mgs.run.state import Fitted
 
@@ -101,7 +102,7 @@ def planned_flight(problem: Problem, taken: Sequence[int]) -> list[int]:
     for start in (taken[: settings.seeds], taken):
         key = tuple(start), tuple(problem.reachable(start))
         if key not in flight.tours:
-            gains = problem.visibility.few_gains(*FLOWN)
+            gains = problem.visibility.plan_gains(FLOWN, FEW)
             if gains is None:
                 return []
             problem.progress("planning the flight", 0, 1)
