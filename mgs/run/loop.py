@@ -118,11 +118,11 @@ def fit_views(
     gains: [V,3] exposures of the views taken, None if they are not estimated.
     """
     problem.progress("fitting", 0, 1)
-    start = problem.start_of(taken)
+    start = problem.start_of(tuple(taken))
     step, model = 0, start
     if before is not None:
         step = len(taken) - problem.settings.seeds
-        model = warm_start(before.gaussians, problem.start_of(before.taken), start)
+        model = warm_start(before.gaussians, problem.start_of(tuple(before.taken)), start)
     cameras = [problem.cameras[i] for i in taken]
     given = problem.targets(taken, gains)
     train, on_pass = problem.settings.train_at(step), partial(problem.progress, "fitting")

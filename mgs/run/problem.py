@@ -130,7 +130,7 @@ class Problem:
         self.image = kept_within(
             IMAGE_BYTES, lambda i: target_of(self.frames[i], with_alpha), lambda image: image.nbytes
         )
-        self._start_of = lru_cache(maxsize=3)(self.coloured)
+        self.start_of = lru_cache(maxsize=3)(self._start_of)
 
     def with_settings(self, **changes: Any) -> Problem:
         """The same problem with other settings that neither change `lam` nor the seeds, such as
@@ -195,12 +195,8 @@ class Problem:
         look = self._exact_on_surface
         return Visibility(self.cameras, look, self.points, self.centre, lam, self.turn, progress)
 
-    def start_of(self, taken: Sequence[int]) -> Gaussians:
+    def _start_of(self, taken: tuple[int, ...]) -> Gaussians:
         """The Gaussians before training, in the colours of all views taken."""
-        return self._start_of(tuple(taken))
-
-    def coloured(self, taken: tuple[int, ...]) -> Gaussians:
-        """`start_of`, computed anew."""
         sh = self.operations.initial([self.frames[i] for i in taken]).sh
         return replace(self.start, sh=sh)
 
