@@ -58,16 +58,16 @@ def frozen(
             function, state_fn=lambda *a, **k: repr(sizes(*a, **k)), limit=64, warn_after=1 << 30
         )
 
+        @one_at_a_time
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
-            with _one_at_a_time:
-                collecting = gc.isenabled()
-                gc.disable()
-                try:
-                    return recorded(*args, **kwargs)
-                finally:
-                    if collecting:
-                        gc.enable()
+            collecting = gc.isenabled()
+            gc.disable()
+            try:
+                return recorded(*args, **kwargs)
+            finally:
+                if collecting:
+                    gc.enable()
 
         return call
 
