@@ -71,7 +71,7 @@ def run_end(
 
     views: chosen so far. uncertainty: mean variance that is left, over that of the prior.
     refused: `name` and `information_gain` of the next view, where it is known. metres: length of
-    the flight, where no pose is left in its reach. predicted: `mgs.run.prediction`, dB.
+    the flight, where no pose is left in its reach. predicted: `mgs.run.checks.predicted_psnr`, dB.
     """
     if views >= settings.budget:
         return {"reason": str(RunEnd.BUDGET), "views": views}

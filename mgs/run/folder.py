@@ -16,7 +16,7 @@ A step is one chosen view; of a batch only the last step has a fit. A line of `s
 - `residual`: rms difference of the new images to the model before, linear RGB.
 - `exposure`: gains (red, green, blue) by frame name, with the setting `exposure`.
 - `prediction`: predicted masked PSNR of the views not taken, dB, and what it is computed from
-  (`mgs.run.prediction`); if the policy plans all views or `stop_psnr` is set.
+  (`mgs.run.checks.predicted_psnr`); if the policy plans all views or `stop_psnr` is set.
 - `indicators`, `warnings`: of `mgs.run.detectors`. `seconds`: by stage.
 - `test_psnr`, `test_psnr_mask`, dB, where it was evaluated; without test views `psnr`, `psnr_mask`
   over all views, and `held_out_...`.
