@@ -21,6 +21,7 @@ from mgs.report.evaluation import evaluate_model
 from mgs.report.page_facts import measured, read_shown
 from mgs.report.runs import read_run
 from mgs.run import folder as run_folder
+from mgs.run.checks import predicted_psnr
 from mgs.run.detectors import (
     DETECTORS,
     Before,
@@ -34,7 +35,6 @@ from mgs.run.detectors import (
 )
 from mgs.run.ending import why_ended
 from mgs.run.nbv import run_nbv, start_run
-from mgs.run.prediction import predicted_psnr
 from mgs.splat import as_drjit, render
 
 FITS = Before(outline=0.001, offset=0.01)
