@@ -24,5 +24,5 @@ def test_a_refused_picture_gets_the_next_number_whatever_lies_beside_it(tmp_path
 
 
 def test_a_scene_and_live_capture_exclude_each_other(tmp_path):
-    with pytest.raises(InputError, match="renders images, and .* awaits them"):
+    with pytest.raises(InputError, match=r"renders images, and .* awaits them"):
         mgs.run_nbv(None, tmp_path / "run", capture="boulder", live=lambda pose, out: None)
