@@ -100,7 +100,7 @@ class Problem:
     - seeds: seed views; by default spread over the directions of the poses allowed.
 
     Values that depend on images are computed at their first use. Raises InputError if fewer poses
-    are allowed than seeds are needed, and as `policy_named`.
+    are allowed than seeds are needed, and as `policy_named` and `NbvSettings.regularisation`.
     """
 
     def __init__(
