@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +15,7 @@ from mgs.files import atomic_path
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-STYLE = {
+STYLE: dict[str, Any] = {
     "font.family": "serif",
     "font.serif": ["STIXGeneral", "DejaVu Serif"],
     "mathtext.fontset": "stix",
@@ -30,6 +32,9 @@ STYLE = {
     "lines.markersize": 4,
 }
 """Settings for `matplotlib.rc_context`."""
+
+NO_GRID = STYLE | {"axes.grid": False}
+"""STYLE for images and maps."""
 
 DPI = 200
 """Pixels per inch of a figure."""
@@ -63,6 +68,22 @@ def save_figure(figure: Figure, path: str | Path) -> None:
         )
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format=kind)
+
+
+@contextmanager
+def drawing(
+    path: str | Path, width: float, height: float, style: dict[str, Any] = STYLE, dpi: int = DPI
+) -> Iterator[Figure]:
+    """Context with an empty figure, which is written to `path` when the block ends without error.
+
+    width, height: inches. style: settings while it is drawn. Raises as `save_figure`.
+    """
+    import matplotlib
+
+    with matplotlib.rc_context(style):
+        figure = new_figure(width, height, dpi)
+        yield figure
+        save_figure(figure, path)
 
 
 def crop(mask: np.ndarray, margin: float = 0.06) -> tuple[slice, slice]:

@@ -12,13 +12,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mgs.data.meshes import Mesh, face_crosses
-from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.plotting import STYLE, drawing
 from mgs.prior.build import Prior
 from mgs.prior.segmentation import SegmentedCloud
 
 BLUE, TAN = [0.15, 0.35, 0.75], [0.85, 0.76, 0.6]
 
-FRAMED = {"axes.spines.top": True, "axes.spines.right": True}
+FRAMED = STYLE | {"axes.spines.top": True, "axes.spines.right": True}
 
 MAX_DOTS = 60_000
 """Most points drawn in a panel; with more, it looks the same."""
@@ -67,8 +67,6 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
     segmented: the cloud of the mesh; None if the mesh was given, without panels of the cloud.
     Raises InputError if it cannot be written.
     """
-    import matplotlib
-
     plane = None if segmented is None else segmented.plane
     up, body = np.array(prior.up), prior.mesh.vertices
     reach = 0.5 * float(np.linalg.norm(np.ptp(body, axis=0)))
@@ -84,8 +82,7 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
     metres = prior.numbers.get("unit", "m") == "m"
     spacing = f"{1e3 * prior.spacing:.2f} mm" if metres else f"{prior.spacing:.3g} units"
     area = f"{prior.mesh.areas.sum():.2f} {'m' if metres else 'unit'}²"
-    with matplotlib.rc_context(STYLE | FRAMED):
-        figure = new_figure(17 if segmented is not None else 7, 4.2, dpi=100)
+    with drawing(path, 17 if segmented is not None else 7, 4.2, FRAMED, dpi=100) as figure:
         axes = figure.subplots(1, 5 if segmented is not None else 2)
         if segmented is not None:
             _cloud_panels(axes[:3], view, segmented, up)
@@ -94,7 +91,6 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
         view.dots(axes[-1], prior.points[towards], shade, 1, dot)
         samples = f"samples: N = {len(prior.points):,} = area / spacing²"
         axes[-1].set_title(f"{samples}\nspacing {spacing}")
-        save_figure(figure, path)
 
 
 def draw_refused(path: str | Path, points: np.ndarray, kept: np.ndarray, up: np.ndarray) -> None:
@@ -103,22 +99,18 @@ def draw_refused(path: str | Path, points: np.ndarray, kept: np.ndarray, up: np.
     kept: [P] bool, taken for the object, blue. up: [3] unit. Raises InputError if it cannot be
     written.
     """
-    import matplotlib
-
     object_points = points[kept] if kept.any() else points
     middle = np.median(object_points, axis=0)
     reach = 1.5 * float(np.quantile(np.linalg.norm(object_points - middle, axis=1), 0.95))
     tint = np.where(kept[:, None], BLUE, TAN)
     oblique = _oblique(up)
     above = np.stack([oblique[0], np.cross(up, oblique[0]), up])
-    with matplotlib.rc_context(STYLE | FRAMED):
-        figure = new_figure(7, 4.2, dpi=100)
+    with drawing(path, 7, 4.2, FRAMED, dpi=100) as figure:
         views = {"from the side": oblique, "from above": above}
         taken = f"{int(kept.sum()):,} taken for the object (blue)"
         for axis, (name, axes) in zip(figure.subplots(1, 2), views.items(), strict=True):
             _View(axes, middle, reach).dots(axis, points, tint, 2, 1.5)
             axis.set_title(f"{name}: {len(points):,} points,\n{taken}")
-        save_figure(figure, path)
 
 
 def _cloud_panels(axes, view: _View, segmented: SegmentedCloud, up: np.ndarray) -> None:

@@ -150,14 +150,13 @@ def write_preview(
     """
     import matplotlib
 
-    from mgs.plotting import STYLE, crop, literal, new_figure, save_figure
+    from mgs.plotting import NO_GRID, crop, drawing, literal
 
     rgb = np.stack([maps[channel] for channel in "RGB"], axis=-1)
     visible = maps["A"] >= VISIBLE
     window = crop(visible)
     height, width = visible[window].shape
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure = new_figure(8.4, 3 * (2.3 * height / width + 0.35) + 0.4, dpi=130)
+    with drawing(path, 8.4, 3 * (2.3 * height / width + 0.35) + 0.4, NO_GRID, dpi=130) as figure:
         figure.suptitle("What the images taken determine")
         axes = figure.subplots(3, 3).flat
         axes[0].imshow(srgb_from_linear(rgb)[window], interpolation="nearest")
@@ -172,7 +171,6 @@ def write_preview(
             figure.colorbar(shown, ax=axis, shrink=0.85, aspect=16, pad=0.02, ticks=ticks)
         for axis in axes:
             axis.set_axis_off()
-        save_figure(figure, path)
 
 
 def _norm(channel: str, values: np.ma.MaskedArray) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 
 from mgs.colour import srgb_from_linear
 from mgs.data.up import PLUS_Z, Up, upright
-from mgs.plotting import STYLE, crop, literal, new_figure, save_figure
+from mgs.plotting import NO_GRID, crop, drawing, literal
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.calibration import BINS
 
@@ -104,12 +104,10 @@ def orbit_figure(
     label -> indices into positions: (seeds, chosen views in their order). up, unit: of the world
     (`mgs.data.dataset.Dataset`); it is drawn turned so that +Z is up.
     """
-    import matplotlib
-
     columns = min(ACROSS, len(choices))
     lines = -(-len(choices) // columns)
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure = new_figure(2.7 * columns, 2.75 * lines + (0.6 if columns > 1 else 1.1))
+    height = 2.75 * lines + (0.6 if columns > 1 else 1.1)
+    with drawing(path, 2.7 * columns, height, NO_GRID) as figure:
         axes = figure.subplots(lines, columns, squeeze=False).ravel()
         for axis, (label, (seeds, chosen)) in zip(axes, choices.items(), strict=False):
             draw_cameras(axis, positions, surface, seeds, chosen, up)
@@ -123,7 +121,6 @@ def orbit_figure(
         figure.legend(handles=handles, loc="outside lower center", ncols=3 if columns > 1 else 1)
         several = "the views that each policy chose" if len(choices) > 1 else "the chosen views"
         figure.suptitle(f"From above: {several}")
-        save_figure(figure, path)
 
 
 def draw_cameras(
@@ -232,11 +229,9 @@ def _curves_figure(
 
     finish: called with the axes before the legend is added.
     """
-    import matplotlib
     from matplotlib.ticker import MaxNLocator
 
-    with matplotlib.rc_context(STYLE):
-        figure = new_figure(width, 3.1)
+    with drawing(path, width, 3.1) as figure:
         axes = figure.subplots(1, len(panels), squeeze=False)[0]
         for axis, (curves, x, y) in zip(axes, panels, strict=True):
             for (xs, ys), style in zip(curves.values(), line_styles(curves), strict=True):
@@ -246,7 +241,6 @@ def _curves_figure(
         figure.suptitle(title)
         finish(axes)
         _legend_beside(figure)
-        save_figure(figure, path)
 
 
 def _legend_beside(figure: Figure) -> None:
@@ -270,16 +264,13 @@ def comparison_figure(
 
     truth, renders: linear RGB [H,W,3]; captions: label -> text below it (PSNR, SSIM).
     """
-    import matplotlib
-
     window = crop(truth.max(axis=2) > 0)
     shown = srgb_from_linear(truth)[window]
     images = {label: srgb_from_linear(image)[window] for label, image in renders.items()}
     differences = {label: np.abs(image - shown).mean(axis=2) for label, image in images.items()}
     limit = max(float(np.quantile(d, 0.995)) for d in differences.values()) or 1.0
     columns, aspect = 1 + len(images), shown.shape[0] / shown.shape[1]
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure = new_figure(2.7 * columns, 2.7 * aspect * 2 + 1.2, dpi=150)
+    with drawing(path, 2.7 * columns, 2.7 * aspect * 2 + 1.2, NO_GRID, dpi=150) as figure:
         figure.suptitle("One view: truth, renders, errors")
         axes = figure.subplots(2, columns)
         axes[0, 0].imshow(shown, interpolation="nearest")
@@ -298,7 +289,6 @@ def comparison_figure(
         bar = figure.colorbar(map_, ax=list(axes[1, 1:]), **layout)
         meaning = "mean absolute difference of the sRGB channels, in [0, 1]"
         bar.set_label(meaning if columns > 2 else _in_lines(meaning))
-        save_figure(figure, path)
 
 
 def _in_lines(text: str) -> str:
@@ -316,13 +306,12 @@ def uncertainty_figure(
     probability integral transform, for every prediction in `rows`
     (`mgs.report.calibration.judged`), over test views or else held-out views.
     """
-    import matplotlib
+    from matplotlib.patches import Patch
 
     judged_on = "test" if any(row["views"] == "test" for row in rows) else "held out"
     shown = [row for row in rows if row["views"] == judged_on]
     coloured = list(zip(shown, PREDICTION_COLOURS, strict=False))
-    with matplotlib.rc_context(STYLE):
-        figure = new_figure(8.4, 6.7)
+    with drawing(path, 8.4, 6.7) as figure:
         figure.suptitle("Predicted errors of unseen views beside the true ones")
         above, below = figure.subfigures(2, 1, height_ratios=(1.15, 1))
         _draw_maps(above, maps)
@@ -330,12 +319,8 @@ def uncertainty_figure(
         _draw_ause(area, coloured)
         _draw_held(held, coloured)
         _draw_pit(pit, coloured)
-        handles = [
-            matplotlib.patches.Patch(color=colour, label=row["prediction"])
-            for row, colour in coloured
-        ]
+        handles = [Patch(color=colour, label=row["prediction"]) for row, colour in coloured]
         below.legend(handles=handles, loc="outside lower center", ncols=len(handles))
-        save_figure(figure, path)
 
 
 def _draw_maps(figure: Any, maps: Sequence[tuple[str, Any, Any, Any]]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
 from mgs.metrics import psnr
-from mgs.plotting import STYLE, crop, new_figure
+from mgs.plotting import NO_GRID, crop, new_figure
 from mgs.policy import criteria
 from mgs.report.diagnostics import VISIBLE, view_maps
 from mgs.report.figures import NEWEST, draw_cameras
@@ -87,7 +87,7 @@ def _drawn(run: Run, model: Fitted, maps: dict[str, np.ndarray], shown: Frame) -
     count, seeds = len(model.taken), run.settings.seeds
     why = f"one of {seeds} to begin with" if count <= seeds else f"chosen by {run.label}"
     title = f"image {count} of {len(run.state.taken)}: {why}"
-    with matplotlib.rc_context(STYLE | {"axes.grid": False, "font.size": 11}):
+    with matplotlib.rc_context(NO_GRID | {"font.size": 11}):
         figure = new_figure(*SIZE, dpi=DPI)
         orbit, render, map_ = figure.subplots(1, 3, width_ratios=(1, 1, 1))
         figure.suptitle(title, fontsize=14, color=NEWEST)

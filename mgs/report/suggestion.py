@@ -75,12 +75,11 @@ def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
     how uncertain it is. Raises InputError if the figure cannot be written."""
     import matplotlib
 
-    from mgs.plotting import STYLE, crop, new_figure, save_figure
+    from mgs.plotting import NO_GRID, crop, drawing
 
     views = found.plan[:MOST_PICTURES]
     scalars = {"uncertainty": run_scalars(run)["uncertainty"]}
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure = new_figure(4.0 + 1.7 * len(views), 4.2, dpi=120)
+    with drawing(path, 4.0 + 1.7 * len(views), 4.2, NO_GRID, dpi=120) as figure:
         grid = figure.add_gridspec(2, 1 + len(views), width_ratios=[3.6, *[1.7] * len(views)])
         _from_above(figure.add_subplot(grid[:, 0]), run, found)
         for k, view in enumerate(views, 1):
@@ -101,7 +100,6 @@ def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
                 axis.set_anchor("N")
         figure.colorbar(shown, ax=below, shrink=0.8, aspect=16, label="variance left")
         figure.legend(loc="outside lower left", ncols=3)
-        save_figure(figure, path)
 
 
 def _from_above(axis: Any, run: Run, found: Suggestion) -> None:

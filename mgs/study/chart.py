@@ -20,7 +20,7 @@ import numpy as np
 from mgs.data.dataset import load_dataset
 from mgs.errors import flag
 from mgs.fit.settings import COLOURS_ALONE, PASSES, WARM_PASSES
-from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.plotting import drawing
 from mgs.run.nbv import run_nbv
 from mgs.run.settings import PRESETS
 from mgs.run.state import State
@@ -329,17 +329,13 @@ def draw(path: Path, kinds: Mapping[str, Sequence[Row]]) -> None:
 
     Raises InputError if the file cannot be written.
     """
-    import matplotlib
-
     names = list(dict.fromkeys(_factor(row) for rows in kinds.values() for row in rows))
     looks = dict(zip(names, group_styles(names), strict=True))
-    with matplotlib.rc_context(STYLE):
-        figure = new_figure(0.6 + 4.2 * len(kinds), 4.6)
+    with drawing(path, 0.6 + 4.2 * len(kinds), 4.6) as figure:
         panels = figure.subplots(1, len(kinds), squeeze=False)[0]
         for axes, (kind, rows) in zip(panels, kinds.items(), strict=True):
             _draw_kind(axes, rows, looks)
             axes.set_title(TITLES[kind])
-        save_figure(figure, path)
 
 
 def _factor(row: Row) -> str:

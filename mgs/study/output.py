@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mgs.files import atomic_path, write_csv, write_json
-from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.plotting import NO_GRID, STYLE, drawing
 from mgs.provenance import versions
 from mgs.report.figures import POLICY_STYLE
 from mgs.report.tables import markdown
@@ -95,8 +95,6 @@ def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row], title:
 
     Panels with the same groups share a legend, also where some have only the first of them.
     """
-    import matplotlib
-
     drawn = [(panel, chosen) for panel in panels if (chosen := _rows_of(panel, rows))]
     columns = min(COLUMNS, len(drawn))
     lines = [drawn[k : k + columns] for k in range(0, len(drawn), columns)]
@@ -107,8 +105,7 @@ def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row], title:
     most = max(range(len(groups)), key=lambda k: len(groups[k]))
     alike = all(one == groups[most][: len(one)] != [None] for one in groups)
     shared = len(drawn) > 1 and alike
-    with matplotlib.rc_context(STYLE | {"legend.fontsize": 8}):
-        figure = new_figure(sum(widths), sum(heights))
+    with drawing(path, sum(widths), sum(heights), STYLE | {"legend.fontsize": 8}) as figure:
         axes = figure.subplots(len(lines), columns, squeeze=False, gridspec_kw=ratios).ravel()
         for axis, (panel, chosen) in zip(axes, drawn, strict=False):
             (_draw_lines if _numeric(panel, chosen) else _draw_names)(axis, panel, chosen)
@@ -125,7 +122,6 @@ def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row], title:
             handles, labels = axes[most].get_legend_handles_labels()
             side = "lower" if title else "upper"
             figure.legend(handles, labels, loc=f"outside {side} center", ncols=2 * columns)
-        save_figure(figure, path)
 
 
 def draw_matrix(path: Path, panel: Panel, rows: Sequence[Row]) -> None:
@@ -134,8 +130,6 @@ def draw_matrix(path: Path, panel: Panel, rows: Sequence[Row]) -> None:
     Blue is above 0, orange below. A number is bold where its interval (columns y_low, y_high) is on
     one side of 0. Raises InputError if the file cannot be written.
     """
-    import matplotlib
-
     across = list(dict.fromkeys(row[panel.x] for row in rows))
     cells = {(row[panel.by or ""], row[panel.x]): row for row in rows}
     groups = list(dict.fromkeys(row[panel.by or ""] for row in rows))
@@ -147,8 +141,7 @@ def draw_matrix(path: Path, panel: Panel, rows: Sequence[Row]) -> None:
     groups.sort(key=lambda group: -np.nanmean([value(group, x) for x in across]))
     numbers = np.array([[value(group, x) for x in across] for group in groups])
     limit = float(np.nanmax(np.abs(numbers))) or 1.0
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        figure = new_figure(1.6 + 0.95 * len(across), 0.9 + 0.3 * len(groups))
+    with drawing(path, 1.6 + 0.95 * len(across), 0.9 + 0.3 * len(groups), NO_GRID) as figure:
         axes = figure.subplots()
         scale = {"cmap": "PuOr", "vmin": -1.6 * limit, "vmax": 1.6 * limit, "aspect": "auto"}
         axes.imshow(numbers, **scale)
@@ -163,7 +156,6 @@ def draw_matrix(path: Path, panel: Panel, rows: Sequence[Row]) -> None:
         axes.tick_params(length=0)
         axes.spines[:].set_visible(False)
         axes.set_title(panel.title)
-        save_figure(figure, path)
 
 
 def _rows_of(panel: Panel, rows: Sequence[Row]) -> list[Row]:

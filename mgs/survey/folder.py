@@ -13,7 +13,7 @@ from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, write_transform
 from mgs.data.frames import Frame
 from mgs.files import copy_file, write_json
 from mgs.images import write_exr
-from mgs.plotting import STYLE, new_figure, save_figure
+from mgs.plotting import drawing
 from mgs.survey.flight import STAGES, Survey, SurveySettings, survey_numbers
 from mgs.survey.fusion import Cloud, fuse_frames
 
@@ -82,14 +82,11 @@ def draw_survey(
     cloud: fused from the survey; numbers: from `survey_numbers`. Raises InputError if it cannot be
     written.
     """
-    import matplotlib
-
     around = survey.truth[:, :3, 3].mean(0)
     reach = float(np.abs(survey.truth[:, :3, 3] - around).max())
     points = cloud.points[np.argsort(cloud.points[:, 2])]
     stride = max(1, len(points) // 120_000)
-    with matplotlib.rc_context(STYLE):
-        figure = new_figure(17, 4.4, dpi=100)
+    with drawing(path, 17, 4.4, dpi=100) as figure:
         axes = figure.subplots(1, 4, gridspec_kw={"width_ratios": [1.1, 1, 1, 1.1]})
         _trajectories(axes[0], survey)
         _errors(axes[1], survey, numbers)
@@ -99,7 +96,6 @@ def draw_survey(
         axes[3].set(xlim=(around[0] - reach, around[0] + reach), xlabel="x, m", aspect="equal")
         axes[3].set(ylim=(around[1] - reach, around[1] + reach), ylabel="y, m")
         axes[3].set_title(f"fused cloud from above: {len(cloud.points):,} points")
-        save_figure(figure, path)
 
 
 def _trajectories(axis, survey: Survey) -> None:
