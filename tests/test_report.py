@@ -93,7 +93,7 @@ def drawn(monkeypatch):
         found[path.name] = figure
         save(figure, path)
 
-    monkeypatch.setattr(figures, "save_figure", keep)
+    monkeypatch.setattr(plotting, "save_figure", keep)
     return found
 
 
@@ -364,7 +364,7 @@ def test_comparison_is_cropped_to_the_rock():
 def drawn_only(monkeypatch):
     """The list of figures that are drawn from now on, and not written."""
     found = []
-    monkeypatch.setattr(figures, "save_figure", lambda figure, path: found.append(figure))
+    monkeypatch.setattr(plotting, "save_figure", lambda figure, path: found.append(figure))
     return found
 
 

@@ -15,7 +15,7 @@ from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.up import PLUS_Z, unit_up, upright
 from mgs.files import write_json
 from mgs.gaussians import Gaussians
-from mgs.report import diagnostics, figures
+from mgs.report import diagnostics
 from mgs.report.page import write_page
 from mgs.report.runs import up_of
 from mgs.report.writing import write_report
@@ -58,8 +58,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Figure]:
     def keep(figure: Figure, path: Path) -> None:
         found[Path(path).name] = figure
 
-    for module in (figures, plotting):
-        monkeypatch.setattr(module, "save_figure", keep)
+    monkeypatch.setattr(plotting, "save_figure", keep)
     return found
 
 
