@@ -6,10 +6,10 @@ that of the clean run on the same rock and views.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, shift
@@ -73,11 +73,16 @@ def captured(frame: Frame) -> Captured:
     )
 
 
-ImageFault = Callable[[Captured, float, np.random.Generator], Captured]
-"""Function (frame, size of the fault, generator) that returns a spoiled frame."""
+class Fault(NamedTuple):
+    """Fault of images or of priors.
 
-PriorFault = Callable[[Prior, float, np.random.Generator], Prior]
-"""Function (prior, size of the fault, generator) that returns a spoiled prior."""
+    change: function (frame or prior, size, generator) that returns it spoiled. sizes: from small to
+    large. words: format of a size with its unit.
+    """
+
+    change: Callable[[Any, float, np.random.Generator], Any]
+    sizes: tuple[float, ...]
+    words: str
 
 
 def _colours(frame: Captured, change: Callable[[np.ndarray], np.ndarray]) -> Captured:
@@ -165,17 +170,17 @@ def _masked(frame: Captured, mask: np.ndarray) -> Captured:
     return replace(frame, rock=mask, rgba=rgba)
 
 
-IMAGE_FAULTS: dict[str, tuple[ImageFault, tuple[float, ...]]] = {
-    "pose noise": (pose_noise, (0.25, 1.0, 4.0)),
-    "image noise": (image_noise, (0.02, 0.1, 0.3)),
-    "exposure": (exposure, (0.1, 0.3, 1.0)),
-    "motion blur": (motion_blur, (2.0, 5.0, 12.0)),
-    "defocus": (defocus, (0.5, 1.5, 4.0)),
-    "missing depth": (missing_depth, (0.2, 0.6, 0.95)),
-    "shifted mask": (shifted_mask, (1.0, 4.0, 10.0)),
-    "wrong mask": (wrong_mask, (1.0, 3.0, 8.0)),
+IMAGE_FAULTS: dict[str, Fault] = {
+    "pose noise": Fault(pose_noise, (0.25, 1.0, 4.0), "{:g}° and cm"),
+    "image noise": Fault(image_noise, (0.02, 0.1, 0.3), "{:g} of the range"),
+    "exposure": Fault(exposure, (0.1, 0.3, 1.0), "{:g} stops"),
+    "motion blur": Fault(motion_blur, (2.0, 5.0, 12.0), "{:g} px"),
+    "defocus": Fault(defocus, (0.5, 1.5, 4.0), "{:g} px"),
+    "missing depth": Fault(missing_depth, (0.2, 0.6, 0.95), "{:.0%}"),
+    "shifted mask": Fault(shifted_mask, (1.0, 4.0, 10.0), "{:g} px"),
+    "wrong mask": Fault(wrong_mask, (1.0, 3.0, 8.0), "{:g} px"),
 }
-"""Faults by name, and their sizes from small to large."""
+"""Faults by name."""
 
 
 def noisy_prior(prior: Prior, size: float, rng: np.random.Generator) -> Prior:
@@ -222,15 +227,15 @@ def turned(prior: Prior, size: float, rng: np.random.Generator) -> Prior:
     return replace(prior, points=points, normals=prior.normals @ turn.T)
 
 
-PRIOR_FAULTS: dict[str, tuple[PriorFault, tuple[float, ...]]] = {
-    "noisy prior": (noisy_prior, (0.5, 2.0, 6.0)),
-    "smoothed prior": (smoothed_prior, (2.0, 10.0, 40.0)),
-    "holes": (holes, (0.05, 0.2, 0.5)),
-    "shifted prior": (shifted, (0.02, 0.1, 0.4)),
-    "scaled prior": (scaled, (1.02, 1.1, 1.4)),
-    "turned prior": (turned, (3.0, 15.0, 90.0)),
+PRIOR_FAULTS: dict[str, Fault] = {
+    "noisy prior": Fault(noisy_prior, (0.5, 2.0, 6.0), "{:g} spacings"),
+    "smoothed prior": Fault(smoothed_prior, (2.0, 10.0, 40.0), "{:g} times"),
+    "holes": Fault(holes, (0.05, 0.2, 0.5), "{:.0%} of the surface"),
+    "shifted prior": Fault(shifted, (0.02, 0.1, 0.4), "{:g} m"),
+    "scaled prior": Fault(scaled, (1.02, 1.1, 1.4), "factor {:g}"),
+    "turned prior": Fault(turned, (3.0, 15.0, 90.0), "{:g}°"),
 }
-"""Faults by name, and their sizes from small to large."""
+"""Faults by name."""
 
 ANOTHER = "another rock's prior"
 
@@ -267,30 +272,16 @@ def indicators_of(
 
 
 SIZES_IN_WORDS = {
-    "none": "no fault",
-    "pose noise": "{:g}° and cm",
-    "image noise": "{:g} of the range",
-    "exposure": "{:g} stops",
-    "motion blur": "{:g} px",
-    "defocus": "{:g} px",
-    "missing depth": "{:.0%}",
-    "shifted mask": "{:g} px",
-    "wrong mask": "{:g} px",
-    "noisy prior": "{:g} spacings",
-    "smoothed prior": "{:g} times",
-    "holes": "{:.0%} of the surface",
-    "shifted prior": "{:g} m",
-    "scaled prior": "factor {:g}",
-    "turned prior": "{:g}°",
-    "another rock's prior": "draw {:g}",
+    ANOTHER: "draw {:g}",
+    **{name: fault.words for name, fault in (IMAGE_FAULTS | PRIOR_FAULTS).items()},
 }
-"""Sizes of faults with their units."""
+"""Formats of sizes with their units; of others, a plain number."""
 
 
 def label_of(fault: str, size: float) -> str:
     """Name of a fault and its size, with the unit."""
     if fault == "none":
-        return SIZES_IN_WORDS[fault]
+        return "no fault"
     return f"{fault}, {SIZES_IN_WORDS.get(fault, '{:g}').format(size)}"
 
 
@@ -321,15 +312,15 @@ def faults(
     """
     opened, rows = open_lab(root / dataset, root / prior), []
     lab = opened.changed(frames=tuple(captured(frame) for frame in opened.frames))
-    table: Mapping[str, Any] = IMAGE_FAULTS if kinds == "images" else PRIOR_FAULTS
+    table = IMAGE_FAULTS if kinds == "images" else PRIOR_FAULTS
     for name, turn in turns(repeats):
         run, taken = f"{scene}, {name}", lab.even(VIEWS, turn)
         clean = _row(lab, run, "none", VIEWS, None, taken)
         rows.append(clean)
-        for fault, (function, sizes) in table.items():
+        for fault, (change, sizes, _) in table.items():
             for size in sizes:
                 rng = generator(0, f"stress/{run}/{fault}/{size}")
-                spoiled = _spoiled(lab, taken, kinds, function, size, rng)
+                spoiled = _spoiled(lab, taken, kinds, change, size, rng)
                 rows.append(_row(spoiled, run, fault, size, clean, taken))
         if kinds == "images":
             rows += _fit_faults(lab, run, taken, turn, clean)
@@ -341,12 +332,12 @@ def faults(
 
 
 def _spoiled(
-    lab: Lab, taken: Sequence[int], kinds: str, function: Any, size: float, rng: np.random.Generator
+    lab: Lab, taken: Sequence[int], kinds: str, change: Any, size: float, rng: np.random.Generator
 ) -> Lab:
     """The lab with the fault in the frames that are fitted, or in the prior."""
     if kinds == "prior":
-        return lab.changed(prior=function(lab.prior, size, rng))
-    frames = (function(f, size, rng) if i in taken else f for i, f in enumerate(lab.frames))
+        return lab.changed(prior=change(lab.prior, size, rng))
+    frames = (change(f, size, rng) if i in taken else f for i, f in enumerate(lab.frames))
     return lab.changed(frames=tuple(frames))
 
 
