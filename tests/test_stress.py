@@ -86,7 +86,7 @@ def lab(root):
 def test_a_fault_of_images_is_a_pure_function_that_grows_with_its_size(root, name):
     frame = faults.captured(load_dataset(root / "dataset").frames[0])
     arrays = ("pixels", "rgba", "z", "rock")
-    function, sizes = faults.IMAGE_FAULTS[name]
+    function, sizes, _ = faults.IMAGE_FAULTS[name]
     before = [getattr(frame, one).copy() for one in arrays]
     changes = []
     for size in sizes:
@@ -106,7 +106,7 @@ def test_a_fault_of_images_is_a_pure_function_that_grows_with_its_size(root, nam
 
 @pytest.mark.parametrize("name", faults.PRIOR_FAULTS)
 def test_a_fault_of_the_prior_leaves_the_prior_as_it_was(lab, name):
-    function, sizes = faults.PRIOR_FAULTS[name]
+    function, sizes, _ = faults.PRIOR_FAULTS[name]
     prior = lab.prior
     before, moved = prior.points.copy(), []
     for size in sizes:
@@ -143,8 +143,8 @@ def test_fits_are_measured(root):
 
 
 def test_faults_are_measured_against_the_clean_run(root, monkeypatch):
-    monkeypatch.setattr(faults, "PRIOR_FAULTS", {"shifted prior": (faults.shifted, (0.4,))})
-    monkeypatch.setattr(faults, "IMAGE_FAULTS", {"image noise": (faults.image_noise, (0.3,))})
+    monkeypatch.setattr(faults, "PRIOR_FAULTS", {"shifted prior": (faults.shifted, (0.4,), "")})
+    monkeypatch.setattr(faults, "IMAGE_FAULTS", {"image noise": (faults.image_noise, (0.3,), "")})
     for name in ("SHORT_FITS", "FREE_VIEWS", "ONE_POSE"):
         monkeypatch.setattr(faults, name, getattr(faults, name)[:1])
     rows = faults.faults(root, root, "rock", **FOLDERS, kinds="prior", others=[FOLDERS], repeats=1)
