@@ -101,19 +101,19 @@ def reproduce(
     Every dataset, prior and run is made once and kept in OUT/cells; the results are written to
     OUT/results. Runs whose seconds are reported run one at a time: let nothing else run meanwhile.
     """
-    from mgs.study import reproduce as study
-    from mgs.study.reproduce_results import make
+    from mgs.study.reproduce import SIZES
+    from mgs.study.reproduce_results import make, results_of, rocks_of, with_options
 
-    names = study.results_of(only)
-    size = row_named(study.SIZES, preset, "--scale")
-    size = study.with_options(size, names, policy or [], mesh or [], batch)
-    counts = {name: study.rocks_of(name, size, rocks) for name in names}
+    names = results_of(only)
+    size = row_named(SIZES, preset, "--scale")
+    size = with_options(size, names, policy or [], mesh or [], batch)
+    counts = {name: rocks_of(name, size, rocks) for name in names}
     if scheduler is not None and workers != 1:
         raise InputError(
             "--workers starts workers here, and --scheduler uses those of a scheduler; "
             "give one of them"
         )
-    with _study(out, study.SIZES, preset) as (_, console, report):
+    with _study(out, SIZES, preset) as (_, console, report):
         for name, count in counts.items():
             written = make(out, name, preset, size, count, report, workers, scheduler)
             files = ", ".join(str(path) for path in written)

@@ -1,26 +1,17 @@
-"""`mgs reproduce`: the paper's Table I and what it leaves open, each result with its runs.
-
-A result is a row of RESULTS; its cells are datasets, priors and runs. Cells that several results
-need are done once.
-"""
+"""Sizes of `mgs reproduce`, and the runs of the paper's Table I."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
-from mgs.errors import InputError, flag
+from mgs.errors import flag
 from mgs.policy import from_file as policy_file
-from mgs.policy.registry import policy_named
-from mgs.run.inputs import file_digest, policy_record
-from mgs.study import flights
+from mgs.run.inputs import policy_record
 from mgs.study.case import Case, Size
 from mgs.study.rocks import FRESH, Rock
-from mgs.study.setups import DRAWS, ORACLE, POLICIES, SURVEYED, SetupSize, cells_of
-from mgs.study.statistics import MOST_ROCKS
-from mgs.study.sweep import Cell, names_of
+from mgs.study.setups import DRAWS, POLICIES, SetupSize
+from mgs.study.sweep import Cell
 
 SEEDS = 4
 """Seed views of a run, as in the paper."""
@@ -184,140 +175,6 @@ def table_runs(size: ReproduceSize) -> dict[str, Run]:
     return runs
 
 
-def setup_cells(size: ReproduceSize, count: int) -> list[Cell]:
-    """Every policy in every set-up."""
-    return cells_of(size.setups, size.some_rocks(count), size.policies)
-
-
-def survey_cells(size: ReproduceSize, count: int) -> list[Cell]:
-    """Every policy with poses and priors of a survey."""
-    return cells_of(size.setups, size.some_rocks(count), size.policies, SURVEYED)
-
-
-def oracle_cells(size: ReproduceSize, count: int) -> list[Cell]:
-    """The set-ups, and the oracle in each on the first rocks."""
-    rocks = size.some_rocks(count)
-    return setup_cells(size, count) + cells_of(size.setups, rocks, (ORACLE,))
-
-
-def flight_cells(size: ReproduceSize, count: int) -> list[Cell]:
-    """Flights over the first rocks."""
-    return flights.cells_of(size.flights, size.some_rocks(count))
-
-
-def _runs_cells(runs: Iterable[Run]) -> list[Cell]:
-    return [cell for run in runs for cell in run.cells()]
-
-
-@dataclass(frozen=True)
-class Result:
-    """A result that --only can name.
-
-    cells(size, rocks): the cells that it needs. rocks: attribute of the size with its default
-    number of rocks; None: it has one. optional: only done if asked for. most: most rocks.
-    """
-
-    cells: Callable[[ReproduceSize, int], list[Cell]]
-    rocks: str | None = None
-    optional: bool = False
-    most: int = MOST_ROCKS
-
-    def count(self, size: ReproduceSize) -> int:
-        """Default number of rocks."""
-        return getattr(size, self.rocks) if self.rocks else 1
-
-
-RESULTS = {
-    "table1": Result(lambda size, _: _runs_cells(table_runs(size).values())),
-    "figures": Result(lambda size, _: _runs_cells(figure_runs(size))),
-    "setups": Result(setup_cells, "setup_rocks", most=len(FRESH)),
-    "flights": Result(flight_cells, "setup_rocks", optional=True, most=len(FRESH)),
-    "survey": Result(survey_cells, "setup_rocks", optional=True, most=len(FRESH)),
-    "oracle": Result(oracle_cells, "oracle_rocks", optional=True, most=len(FRESH)),
-}
-"""Every result by name, in the order in which they are made."""
-
-
 def figure_runs(size: ReproduceSize) -> list[Run]:
     """Runs of Table I that the figures show."""
     return [table_runs(size)[policy] for policy in FIGURE_POLICIES]
-
-
-def results_of(only: str | None) -> list[str]:
-    """Names of the results of an option --only; all that are not optional if None."""
-    if only is None:
-        return [name for name, result in RESULTS.items() if not result.optional]
-    return names_of(only, RESULTS)
-
-
-def rocks_of(name: str, size: ReproduceSize, asked: int | None) -> int:
-    """Number of rocks of a result, asked for or default. Raises InputError if out of range."""
-    result = RESULTS[name]
-    if asked is None or result.rocks is None:
-        return result.count(size)
-    most = len(size.meshes) or result.most
-    if not 1 <= asked <= most:
-        raise InputError(f"--rocks {asked}: {name} can have 1 to {most}")
-    return asked
-
-
-NAMESAKE = "there is one of this name already; leave it out, or rename its file"
-
-
-def with_options(
-    size: ReproduceSize,
-    names: Sequence[str],
-    policies: Sequence[str],
-    meshes: Sequence[Path],
-    batch: int,
-) -> ReproduceSize:
-    """Size with the options --policy, --mesh and --batch. names: the results to make.
-
-    Raises InputError if an option is for none of these results, a policy is unknown or already
-    compared, two policies or meshes have the same name, or a mesh cannot be read or is one too
-    many.
-    """
-    labels = list(POLICIES)
-    for policy in policies:
-        _check_used(f"--policy {policy}", names, "setups", "survey", "oracle")
-        if policy in POLICIES:
-            raise InputError(f"--policy {policy}: is compared anyway; leave it out")
-        if policy_file.label(policy) in labels:
-            raise InputError(f"--policy {policy}: {NAMESAKE}")
-        labels.append(policy_file.label(policy))
-        policy_named(policy)
-    size = replace(size, own_policies=tuple(policy_file.absolute(policy) for policy in policies))
-    if batch > 1:
-        _check_used(f"--batch {batch}", names, "table1", "figures")
-        size = replace(size, table=replace(size.table, batch=batch))
-    return _with_meshes(size, names, meshes) if meshes else size
-
-
-def _check_used(option: str, names: Sequence[str], *results: str) -> None:
-    """Raise InputError if an option is for none of the results to make."""
-    if not set(results) & set(names):
-        raise InputError(
-            f"{option}: is for {', '.join(results)}, of which --only names none; "
-            "leave out the option, or name one of these"
-        )
-
-
-def _with_meshes(
-    size: ReproduceSize, names: Sequence[str], meshes: Sequence[Path]
-) -> ReproduceSize:
-    if len(meshes) > MOST_ROCKS:
-        raise InputError(
-            f"--mesh: {len(meshes)} files; differences are tested over {MOST_ROCKS} rocks at most, "
-            "leave some out"
-        )
-    if all(RESULTS[name].rocks is None for name in names):
-        raise InputError(
-            f"--mesh {meshes[0]}: is for results over many rocks, and --only leaves them out"
-        )
-    rocks: list[Rock] = []
-    for k, mesh in enumerate(meshes):
-        if mesh.stem in [rock.scene for rock in rocks]:
-            raise InputError(f"--mesh {mesh}: {NAMESAKE}")
-        rocks.append(Rock(mesh.stem, 0, k, mesh.resolve(), file_digest(mesh)))
-    count = len(rocks)
-    return replace(size, meshes=tuple(rocks), setup_rocks=count, oracle_rocks=count)

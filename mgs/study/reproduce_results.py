@@ -1,22 +1,31 @@
-"""Tables and figures of a reproduction, from the results of its cells."""
+"""Results of `mgs reproduce`: their cells, and the tables and figures made from them.
+
+A result is a row of RESULTS; its cells are datasets, priors and runs. Cells that several results
+need are done once.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from mgs.errors import InputError
 from mgs.files import write_csv
+from mgs.policy import from_file as policy_file
+from mgs.policy.registry import policy_named
 from mgs.report.evaluation import evaluate_run
 from mgs.report.writing import write_report
-from mgs.study import flights, reproduce, setups
+from mgs.run.inputs import file_digest
+from mgs.study import flights, setups
 from mgs.study.output import table, write_table
-from mgs.study.reproduce import ReproduceSize, Run
-from mgs.study.setups import Found
-from mgs.study.sweep import Cell, Report, cell_folder, found, run_cells
+from mgs.study.reproduce import ReproduceSize, Run, figure_runs, table_runs
+from mgs.study.rocks import FRESH, Rock
+from mgs.study.setups import ORACLE, POLICIES, SURVEYED, Found, cells_of
+from mgs.study.statistics import MOST_ROCKS
+from mgs.study.sweep import Cell, Report, cell_folder, found, names_of, run_cells
 from mgs.study.verdict import Row
 
 Rows = list[Row]
@@ -39,16 +48,16 @@ TABLE_COLUMNS = {
 }
 
 
-def known_runs(root: Path, runs: Sequence[Run]) -> dict[str, dict[str, Any]]:
-    """Results of the runs that are done."""
-    results = {run.name: found(root, run.cells()[-1]) for run in runs}
+def _known(root: Path, cells: Iterable[Cell]) -> Found:
+    """Results of the cells that are done."""
+    results = {cell.name: found(root, cell) for cell in cells}
     return {name: result for name, result in results.items() if result is not None}
 
 
 def table_rows(results: Found, size: ReproduceSize) -> Rows:
     """Table I: a row for each run that is done."""
     rows = []
-    for label, run in reproduce.table_runs(size).items():
+    for label, run in table_runs(size).items():
         if run.name not in results:
             continue
         numbers = results[run.name]
@@ -81,10 +90,11 @@ def table_text(rows: Rows, left: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class Work:
-    """Inputs of a result: the study's folder `root`, the results of cells, the size, the number of
-    rocks, and the command."""
+    """Inputs of a result: the study's folder `root`, the cells and the results of those that are
+    done, the size, the number of rocks, and the command."""
 
     root: Path
+    cells: Sequence[Cell]
     results: Found
     size: ReproduceSize
     count: int
@@ -100,13 +110,13 @@ def write_table1(work: Work) -> list[Path]:
     """table1.csv, .json and .md of the runs that are done."""
     rows = table_rows(work.results, work.size)
     done = {row["row"] for row in rows}
-    left = [label for label in reproduce.table_runs(work.size) if label not in done]
+    left = [label for label in table_runs(work.size) if label not in done]
     return write_table(work.out, "table1", rows, table_text(rows, left), work.command, left=left)
 
 
 def write_figures(work: Work) -> list[Path]:
     """Report on some runs of Table I, as `mgs report` draws it."""
-    needed = reproduce.figure_runs(work.size)
+    needed = figure_runs(work.size)
     runs = [cell_folder(work.root, run.name) / "run" for run in needed]
     for run in runs:
         evaluate_run(run)  # draws; the metrics are there already
@@ -115,20 +125,17 @@ def write_figures(work: Work) -> list[Path]:
 
 def write_setups(work: Work) -> list[Path]:
     """setups.csv, .json, .md and .png; leads.csv; where it is done, the oracle and foretold.csv."""
-    return _write_setups(work, "setups", reproduce.oracle_cells(work.size, work.count))
+    return _write_setups(work, "setups", _oracle_cells(work.size, work.count))
 
 
 def write_survey(work: Work) -> list[Path]:
     """survey.csv, .json, .md and .png, and survey-leads.csv: as `write_setups`."""
-    return _write_setups(work, "survey", reproduce.survey_cells(work.size, work.count))
+    return _write_setups(work, "survey", work.cells)
 
 
 def _write_setups(work: Work, name: str, cells: Sequence[Cell]) -> list[Path]:
     rocks, prefix = work.size.some_rocks(work.count), "" if name == "setups" else f"{name}-"
-    known = dict(work.results)
-    for cell in cells:
-        if cell.name not in known and (result := found(work.root, cell)) is not None:
-            known[cell.name] = result
+    known = _known(work.root, cells)
     done = [cell for cell in cells if cell.name in known]
     rows, predicted = setups.rows_of(known, done, rocks), setups.foretold_of(known, done, rocks)
     leads = [lead for key in setups.MEASURES for lead in setups.leads_of(rows, setups.LEADER, key)]
@@ -143,26 +150,149 @@ def _write_setups(work: Work, name: str, cells: Sequence[Cell]) -> list[Path]:
     return written
 
 
+def _flight_cells(size: ReproduceSize, count: int) -> list[Cell]:
+    return flights.cells_of(size.flights, size.some_rocks(count))
+
+
 def write_flights(work: Work) -> list[Path]:
     """flights.csv, .json, .md and .png."""
     rocks = work.size.some_rocks(work.count)
-    cells = reproduce.flight_cells(work.size, work.count)
-    rows = flights.rows_of(work.results, cells, rocks)
+    rows = flights.rows_of(work.results, work.cells, rocks)
     flights.draw(work.out / "flights.png", rows)
     text = flights.text_of(rows)
     written = write_table(work.out, "flights", rows, text, work.command, rocks=work.count)
     return [*written, work.out / "flights.png"]
 
 
-WRITERS: dict[str, Callable[[Work], list[Path]]] = {
-    "table1": write_table1,
-    "figures": write_figures,
-    "setups": write_setups,
-    "flights": write_flights,
-    "survey": write_survey,
-    "oracle": write_setups,
+def _runs_cells(runs: Iterable[Run]) -> list[Cell]:
+    return [cell for run in runs for cell in run.cells()]
+
+
+def _setup_cells(size: ReproduceSize, count: int) -> list[Cell]:
+    return cells_of(size.setups, size.some_rocks(count), size.policies)
+
+
+def _survey_cells(size: ReproduceSize, count: int) -> list[Cell]:
+    return cells_of(size.setups, size.some_rocks(count), size.policies, SURVEYED)
+
+
+def _oracle_cells(size: ReproduceSize, count: int) -> list[Cell]:
+    """Set-ups, and the oracle in each on the same rocks."""
+    rocks = size.some_rocks(count)
+    return _setup_cells(size, count) + cells_of(size.setups, rocks, (ORACLE,))
+
+
+@dataclass(frozen=True)
+class Result:
+    """A result that --only can name.
+
+    cells(size, rocks): the cells that it needs. write(work): writes it and returns the files.
+    rocks: attribute of the size with its default number of rocks; None: it has the one of Table I.
+    optional: only done if asked for. policies: it compares those of --policy, too.
+    """
+
+    cells: Callable[[ReproduceSize, int], list[Cell]]
+    write: Callable[[Work], list[Path]]
+    rocks: str | None = None
+    optional: bool = False
+    policies: bool = False
+
+    def count(self, size: ReproduceSize) -> int:
+        """Default number of rocks."""
+        return getattr(size, self.rocks) if self.rocks else 1
+
+
+RESULTS = {
+    "table1": Result(lambda size, _: _runs_cells(table_runs(size).values()), write_table1),
+    "figures": Result(lambda size, _: _runs_cells(figure_runs(size)), write_figures),
+    "setups": Result(_setup_cells, write_setups, "setup_rocks", policies=True),
+    "flights": Result(_flight_cells, write_flights, "setup_rocks", optional=True),
+    "survey": Result(_survey_cells, write_survey, "setup_rocks", optional=True, policies=True),
+    "oracle": Result(_oracle_cells, write_setups, "oracle_rocks", optional=True, policies=True),
 }
-"""Writers of results, which return the files written."""
+"""Every result by name, in the order in which they are made."""
+
+
+def results_of(only: str | None) -> list[str]:
+    """Names of the results of an option --only; all that are not optional if None."""
+    if only is None:
+        return [name for name, result in RESULTS.items() if not result.optional]
+    return names_of(only, RESULTS)
+
+
+def rocks_of(name: str, size: ReproduceSize, asked: int | None) -> int:
+    """Number of rocks of a result, asked for or default. Raises InputError if out of range."""
+    result = RESULTS[name]
+    if asked is None or result.rocks is None:
+        return result.count(size)
+    most = len(size.meshes or FRESH)
+    if not 1 <= asked <= most:
+        raise InputError(f"--rocks {asked}: {name} can have 1 to {most}")
+    return asked
+
+
+NAMESAKE = "there is one of this name already; leave it out, or rename its file"
+
+
+def with_options(
+    size: ReproduceSize,
+    names: Sequence[str],
+    policies: Sequence[str],
+    meshes: Sequence[Path],
+    batch: int,
+) -> ReproduceSize:
+    """Size with the options --policy, --mesh and --batch. names: the results to make.
+
+    Raises InputError if an option is for none of these results, a policy is unknown or already
+    compared, two policies or meshes have the same name, or a mesh cannot be read or is one too
+    many.
+    """
+    comparing = [name for name, result in RESULTS.items() if result.policies]
+    of_table = [name for name, result in RESULTS.items() if result.rocks is None]
+    labels = list(POLICIES)
+    for policy in policies:
+        _check_used(f"--policy {policy}", names, comparing)
+        if policy in POLICIES:
+            raise InputError(f"--policy {policy}: is compared anyway; leave it out")
+        if policy_file.label(policy) in labels:
+            raise InputError(f"--policy {policy}: {NAMESAKE}")
+        labels.append(policy_file.label(policy))
+        policy_named(policy)
+    size = replace(size, own_policies=tuple(policy_file.absolute(policy) for policy in policies))
+    if batch > 1:
+        _check_used(f"--batch {batch}", names, of_table)
+        size = replace(size, table=replace(size.table, batch=batch))
+    return _with_meshes(size, names, meshes) if meshes else size
+
+
+def _check_used(option: str, names: Sequence[str], results: Sequence[str]) -> None:
+    """Raise InputError if an option is for none of the results to make."""
+    if not set(results) & set(names):
+        raise InputError(
+            f"{option}: is for {', '.join(results)}, of which --only names none; "
+            "leave out the option, or name one of these"
+        )
+
+
+def _with_meshes(
+    size: ReproduceSize, names: Sequence[str], meshes: Sequence[Path]
+) -> ReproduceSize:
+    if len(meshes) > MOST_ROCKS:
+        raise InputError(
+            f"--mesh: {len(meshes)} files; differences are tested over {MOST_ROCKS} rocks at most, "
+            "leave some out"
+        )
+    if all(RESULTS[name].rocks is None for name in names):
+        raise InputError(
+            f"--mesh {meshes[0]}: is for results over many rocks, and --only leaves them out"
+        )
+    rocks: list[Rock] = []
+    for k, mesh in enumerate(meshes):
+        if mesh.stem in [rock.scene for rock in rocks]:
+            raise InputError(f"--mesh {mesh}: {NAMESAKE}")
+        rocks.append(Rock(mesh.stem, 0, k, mesh.resolve(), file_digest(mesh)))
+    count = len(rocks)
+    return replace(size, meshes=tuple(rocks), setup_rocks=count, oracle_rocks=count)
 
 
 def make(
@@ -177,26 +307,26 @@ def make(
 ) -> list[Path]:
     """Do the cells of a result over so many rocks and write it into OUT/results; returns the files.
     Table I is written anew before each cell, from the runs that are done."""
-    result = reproduce.RESULTS[name]
+    result = RESULTS[name]
     command = f"mgs reproduce --scale {preset} --only {name}"
     command += f" --rocks {count}" if result.count(size) > 1 else ""
-    if name in ("setups", "survey", "oracle"):
+    if result.policies:
         command += "".join(f" --policy {_from_here(policy)}" for policy in size.own_policies)
     if result.rocks:
         command += "".join(f" --mesh {rock.mesh.name}" for rock in size.meshes if rock.mesh)
     elif size.table.batch > 1:
         command += f" --batch {size.table.batch}"
 
-    runs = list(reproduce.table_runs(size).values())
+    cells = result.cells(size, count)
+    timed = [cell for cell in cells if cell.alone]
 
     def tell(cell: str, done: int, total: int) -> None:
-        if name == "table1" and (so_far := known_runs(out, runs)):
-            write_table1(Work(out, so_far, size, count, command))
+        if name == "table1" and (so_far := _known(out, timed)):
+            write_table1(Work(out, cells, so_far, size, count, command))
         report(f"{name} {cell}", done, total)
 
-    cells = result.cells(size, count)
     results = run_cells(out, cells, tell, workers=workers, scheduler=scheduler)
-    return WRITERS[name](Work(out, results, size, count, command))
+    return result.write(Work(out, cells, results, size, count, command))
 
 
 def _from_here(policy: str) -> str:
