@@ -57,7 +57,7 @@ def test_cells_come_after_those_they_need_and_are_done_once(tmp_path):
 
 def studies():
     """Cells of each study by its name, of every size."""
-    from mgs.study import chart, parsimony, reproduce
+    from mgs.study import chart, parsimony, reproduce, reproduce_results
     from mgs.study.stress import lab, run
 
     for size in chart.SIZES.values():
@@ -68,7 +68,7 @@ def studies():
     for size in lab.SIZES.values():
         yield "stress", [cell for one in run.EXPERIMENTS.values() for cell in one.cells(size)]
     for size in reproduce.SIZES.values():
-        for name, result in reproduce.RESULTS.items():
+        for name, result in reproduce_results.RESULTS.items():
             yield name, list(result.cells(size, result.count(size)))
 
 
