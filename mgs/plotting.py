@@ -86,6 +86,14 @@ def drawing(
         save_figure(figure, path)
 
 
+def painted(values: np.ndarray, colours: str, low: float = 0.0, high: float = 1.0) -> np.ndarray:
+    """Values of any shape -> sRGB uint8 of that shape and 3, by a colour map from low to high."""
+    import matplotlib
+
+    share = np.clip((np.asarray(values, np.float64) - low) / max(high - low, 1e-12), 0, 1)
+    return np.ascontiguousarray(matplotlib.colormaps[colours](share, bytes=True)[..., :3])
+
+
 def crop(mask: np.ndarray, margin: float = 0.06) -> tuple[slice, slice]:
     """Rows and columns of an image that hold its mask [H,W] and a margin; all if the mask is empty.
 

@@ -18,7 +18,7 @@ import numpy as np
 from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
 from mgs.gaussians import Gaussians
-from mgs.plotting import crop
+from mgs.plotting import crop, painted
 from mgs.policy.criteria import regularisation, uncertainty
 from mgs.report.diagnostics import VISIBLE, view_maps
 
@@ -66,7 +66,7 @@ class Album:
     def add_uncertainty(self, name: str, values: np.ndarray, alpha: np.ndarray) -> None:
         """Add a map of values [H,W] in [0,1], grey where the opacity alpha [H,W] is below
         VISIBLE."""
-        colours = _painted(UNCERTAINTY_COLOURS, values)
+        colours = painted(values, UNCERTAINTY_COLOURS)
         colours[alpha < VISIBLE] = GREY
         self.pictures[name] = data_uri(self._small(colours))
 
@@ -78,7 +78,7 @@ class Album:
         limit = max((float(np.quantile(e, 0.995)) for e in self.errors.values()), default=0.0)
         limit = max(round(limit, 3), 1 / 255)
         for name, error in self.errors.items():
-            shown = _painted(ERROR_COLOURS, error.astype(np.float32) / limit)
+            shown = painted(error.astype(np.float32) / limit, ERROR_COLOURS)
             self.pictures[name] = data_uri(shown)
         self.errors.clear()
         return limit
@@ -93,14 +93,6 @@ class Album:
             height = max(1, round(picture.height * self.width / picture.width))
             picture = picture.resize((self.width, height), Image.Resampling.BOX)
         return np.asarray(picture)
-
-
-def _painted(colours: str, values: np.ndarray) -> np.ndarray:
-    """Values [h,w] in [0,1] -> sRGB uint8 [h,w,3] by a colour map."""
-    import matplotlib
-
-    rgba = matplotlib.colormaps[colours](np.clip(values, 0, 1), bytes=True)
-    return np.array(rgba[..., :3])
 
 
 def data_uri(pixels: np.ndarray) -> str:

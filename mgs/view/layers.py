@@ -12,6 +12,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.gaussians import Gaussians
+from mgs.plotting import painted
 from mgs.report.diagnostics import PANELS, VISIBLE, view_maps
 from mgs.rotation import rotmat_from_quat
 from mgs.view.access import plain
@@ -44,7 +45,7 @@ def gaussian_colours(subject: Subject, layer: str) -> np.ndarray:
     if layer == "colour":
         return _eight_bits(_display(g, g.rgb))
     if layer in subject.scalars:
-        return painted(subject.scalars[layer], *scale(subject, layer), PANELS[layer][1])
+        return painted(subject.scalars[layer], PANELS[layer][1], *scale(subject, layer))
     return np.full((len(g), 3), 255 if layer == "alpha" else 128, np.uint8)
 
 
@@ -76,7 +77,7 @@ def kernel_image(
     else:
         low, high = ends = scale(subject, layer)
         values, colours = maps[layer], PANELS[layer][1]
-    return painted(values, low, high, colours) * seen[..., None].astype(np.uint8), depth, ends
+    return painted(values, colours, low, high) * seen[..., None].astype(np.uint8), depth, ends
 
 
 def scale(subject: Subject, layer: str) -> tuple[float, float]:
@@ -99,14 +100,6 @@ def legend(layer: str, ends: tuple[float, float], unit: str) -> str:
         "nothing.",
         "unobserved": "Yellow: no image has seen this part of the surface.",
     }[layer]
-
-
-def painted(values: np.ndarray, low: float, high: float, colours: str) -> np.ndarray:
-    """Values of any shape -> sRGB uint8 of that shape and 3, by a colour map."""
-    import matplotlib
-
-    share = np.clip((np.asarray(values, np.float64) - low) / max(high - low, 1e-12), 0, 1)
-    return np.ascontiguousarray(matplotlib.colormaps[colours](share, bytes=True)[..., :3])
 
 
 def _eight_bits(values: np.ndarray) -> np.ndarray:
