@@ -27,20 +27,27 @@ from mgs.run.folder import Run, open_run
 from mgs.run.nbv import resume_nbv, start_run
 from mgs.study.sweep import CELLS, Cell
 
+MESH_SCENE = "boulder"
+"""Scene whose ground, light and orbits a mesh gets."""
+
 
 @dataclass(frozen=True)
-class Scene:
-    """A rock with its ground, light and orbit.
+class Rock:
+    """A scene file and the seed of its rock, or a mesh file and its hash in MESH_SCENE.
 
-    name: scene file. seed: of the rock. changes: values in place of the file's, by section and key.
-    mesh: file of a rock in place of the procedural one. label: folder name.
+    index: place among the rocks of a study, and seed of its runs.
     """
 
-    name: str
+    scene: str
     seed: int = 0
-    changes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    mesh: str | None = None
-    label: str = ""
+    index: int = 0
+    mesh: Path | None = None
+    digest: str = ""
+
+    @property
+    def name(self) -> str:
+        """Folder name."""
+        return f"{self.scene}-{self.digest[:8] if self.mesh else self.seed}"
 
 
 @dataclass(frozen=True)
@@ -56,18 +63,23 @@ class Size:
 
 @dataclass(frozen=True)
 class Case:
-    """A scene at one size, with the settings of its prior (`PriorSettings`). given: a dataset that
-    exists already, in place of the scene's."""
+    """A rock at one size, with the settings of its prior (`PriorSettings`).
 
-    scene: Scene
+    given: a dataset that exists already, in place of the rock's. changes: values in place of the
+    scene file's, by section and key. label: folder name in place of the rock's.
+    """
+
+    rock: Rock
     size: Size
     settings: Mapping[str, Any] = field(default_factory=dict)
     given: Path | None = None
+    changes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    label: str = ""
 
     @property
     def name(self) -> str:
-        """Name of the scene at its size, for folders."""
-        label = self.scene.label or f"{self.scene.name}-{self.scene.seed}"
+        """Name of the rock at its size, for folders."""
+        label = self.label or self.rock.name
         size = self.size
         return label if self.given else f"{label}/{size.frames}x{size.width}x{size.height}"
 
@@ -92,13 +104,23 @@ class Case:
         """The arguments `dataset` and `prior` of tasks."""
         return {"dataset": self.dataset, "prior": self.prior}
 
+    def on_orbit(self, orbit: Mapping[str, Any]) -> Case:
+        """Case with values of the orbit's section, and a folder named after them."""
+        kind = "-".join([orbit["kind"], *map(str, orbit.get("distances", ()))])
+        return replace(self, changes={"orbit": dict(orbit)}, label=f"{self.rock.name}/{kind}")
+
     def cells(self) -> list[Cell]:
         """Cells that make the dataset and the prior."""
         cells = []
         if not self.given:
-            scene = self.scene
-            arguments = {"scene": scene.name, "seed": scene.seed, "changes": scene.changes}
-            arguments |= {"size": asdict(self.size), "mesh": scene.mesh}
+            rock = self.rock
+            arguments = {
+                "scene": MESH_SCENE if rock.mesh else rock.scene,
+                "seed": rock.seed,
+                "changes": self.changes,
+                "size": asdict(self.size),
+                "mesh": str(rock.mesh) if rock.mesh else None,
+            }
             cells.append(Cell(f"dataset/{self.name}", f"{__name__}:make_dataset", arguments))
         arguments = {"dataset": self.dataset, **self.settings}
         needs = tuple(cell.name for cell in cells)
@@ -111,7 +133,7 @@ class Case:
         first = self.cells()[:-1]
         flown = Cell(f"survey/{label}", task, arguments, tuple(cell.name for cell in first))
         given = Path(CELLS) / flown.name / "survey"
-        case = replace(self, scene=replace(self.scene, label=label), given=given)
+        case = replace(self, label=label, given=given)
         prior = replace(case.cells()[-1], needs=(flown.name,))
         return case, [*first, flown, prior]
 
@@ -131,7 +153,7 @@ def make_dataset(
     changes: dict[str, dict[str, Any]] | None = None,
     mesh: str | None = None,
 ) -> dict[str, Any]:
-    """Render the dataset of a `Scene` and a `Size` into OUT/dataset, as `mgs synth-orbit` does."""
+    """Render the dataset of a `Case` into OUT/dataset, as `mgs synth-orbit` does."""
     from mgs.synth.rendering import RenderPreset, synthesise  # needs a variant of Mitsuba
     from mgs.synth.scene_file import SceneFile, load_scene_file
 

@@ -24,7 +24,7 @@ from mgs.plotting import drawing
 from mgs.run.nbv import run_nbv
 from mgs.run.settings import PRESETS
 from mgs.run.state import State
-from mgs.study.case import Case, Scene, Size, judge, test_views_of
+from mgs.study.case import Case, Rock, Size, judge, test_views_of
 from mgs.study.output import Content, group_styles, logarithmic, table, write_table
 from mgs.study.statistics import pareto_front
 from mgs.study.sweep import Cell, Report, Results, run_cells
@@ -184,8 +184,8 @@ class Data:
     def case(self, density: float) -> Case:
         """Case with a prior of this density."""
         label = self.given.name if self.given else ""
-        scene = Scene(SCENE, label=label)
-        return Case(scene, self.size.images, {"density": density}, self.given)
+        settings = {"density": density}
+        return Case(Rock(SCENE), self.size.images, settings, self.given, label=label)
 
     def cells(self, kind: str, repeats: int) -> list[Cell]:
         """Cells of all points of a kind, and those they need."""

@@ -20,8 +20,8 @@ from mgs.run.loop import fit_views
 from mgs.run.planning import planned_flight, rated
 from mgs.run.problem import Problem
 from mgs.run.state import Fitted
+from mgs.study.case import Rock
 from mgs.study.output import Content, Panel, draw_panels, table
-from mgs.study.rocks import Rock
 from mgs.study.setups import SETUPS, Found, SetupSize, case_of, shared_problem
 from mgs.study.statistics import interval
 from mgs.study.sweep import Cell

@@ -30,7 +30,7 @@ from mgs.run.settings import NbvSettings
 from mgs.run.state import Fitted
 from mgs.splat import groups
 from mgs.splat.pruning import prune
-from mgs.study.case import Case, Scene, Size, judge
+from mgs.study.case import Case, Rock, Size, judge
 from mgs.study.output import Content, Panel, draw_panels, table, write_table
 from mgs.study.sweep import Cell, Report, run_cells
 from mgs.study.verdict import Claim, Row, judged, single, verdict_table
@@ -86,8 +86,8 @@ class ParsimonySize:
     def case(self, scene: str, gaussians: int | str) -> Case:
         """Case of a scene with a prior of so many Gaussians."""
         changes = {"rock": VARIANTS[scene]} if scene in VARIANTS else {}
-        rock = Scene("boulder" if changes else scene, 0, changes, label=scene)
-        return Case(rock, self.images, {"gaussians": gaussians, "seed": 0})
+        rock, settings = Rock("boulder" if changes else scene), {"gaussians": gaussians, "seed": 0}
+        return Case(rock, self.images, settings, changes=changes, label=scene)
 
 
 SIZES = {

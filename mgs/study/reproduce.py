@@ -8,8 +8,7 @@ from typing import Any
 from mgs.errors import flag
 from mgs.policy import from_file as policy_file
 from mgs.run.inputs import policy_record
-from mgs.study.case import Case, Size
-from mgs.study.rocks import FRESH, Rock
+from mgs.study.case import Case, Rock, Size
 from mgs.study.setups import DRAWS, POLICIES, SetupSize
 from mgs.study.sweep import Cell
 
@@ -59,6 +58,26 @@ class RunSize:
 
 TABLE_ROCK = Rock("boulder", 0)
 """Rock of Table I."""
+
+_SEEDS = {
+    "boulder": (11, 12),
+    "contact-binary": (12, 14),
+    "low-sun": (11, 12),
+    "pebbles": (11, 12),
+    "strata": (12,),
+    "horseshoe": (11,),
+    "obsidian": (12,),
+    "half-banded": (11,),
+}
+
+FRESH = tuple(
+    Rock(scene, seed, index)
+    for index, (scene, seed) in enumerate(
+        (scene, seeds[k]) for k in range(2) for scene, seeds in _SEEDS.items() if k < len(seeds)
+    )
+)
+"""Rocks that chose no setting: of each scene the first seeds from 11 on with which the rock is
+wholly in every view, one of each scene first. Three scenes are new with them."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +133,7 @@ class Run:
     def case(self) -> Case:
         """Case of the dataset and the prior; the prior is of the whole flight."""
         settings = {"gaussians": self.size.gaussians, "seed": 0}
-        return Case(self.rock.at(RING), self.size.images, settings)
+        return Case(self.rock, self.size.images, settings).on_orbit(RING)
 
     def cells(self) -> list[Cell]:
         """Cells of the run; the last is the run itself."""

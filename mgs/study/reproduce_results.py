@@ -20,9 +20,9 @@ from mgs.report.evaluation import evaluate_run
 from mgs.report.writing import write_report
 from mgs.run.inputs import file_digest
 from mgs.study import flights, setups
+from mgs.study.case import Rock
 from mgs.study.output import table, write_table
-from mgs.study.reproduce import ReproduceSize, Run, figure_runs, table_runs
-from mgs.study.rocks import FRESH, Rock
+from mgs.study.reproduce import FRESH, ReproduceSize, Run, figure_runs, table_runs
 from mgs.study.setups import ORACLE, POLICIES, SURVEYED, Found, cells_of
 from mgs.study.statistics import MOST_ROCKS
 from mgs.study.sweep import Cell, Report, cell_folder, found, names_of, run_cells

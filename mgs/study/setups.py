@@ -31,10 +31,9 @@ from mgs.run.problem import Problem
 from mgs.run.settings import NbvSettings, with_defaults
 from mgs.run.state import Fitted
 from mgs.splat import ListCache
-from mgs.study.case import Case, Size, test_views_of
+from mgs.study.case import Case, Rock, Size, test_views_of
 from mgs.study.oracle import foretold, oracle
 from mgs.study.output import Panel, draw_matrix, table, with_interval
-from mgs.study.rocks import Rock
 from mgs.study.statistics import holm, interval, permutation_p
 from mgs.study.sweep import Cell
 from mgs.study.verdict import Row
@@ -132,7 +131,7 @@ def case_of(rock: Rock, setup: Setup, size: SetupSize) -> Case:
     """Dataset and prior."""
     images = Size(size.width, size.height, setup.frames // size.fewer, size.tests, size.spp)
     number = {} if size.gaussians is None else {"gaussians": size.gaussians}
-    return Case(rock.at(dict(setup.orbit)), images, number | {"seed": 0})
+    return Case(rock, images, number | {"seed": 0}).on_orbit(setup.orbit)
 
 
 def cells_of(

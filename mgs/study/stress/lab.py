@@ -22,7 +22,7 @@ from mgs.policy.poses import seed_views
 from mgs.prior.build import Prior, load_prior
 from mgs.prior.initial import initial_gaussians, initial_normals, pixel_on
 from mgs.splat import ListCache, fisher, groups
-from mgs.study.case import Case, Scene, Size, judge
+from mgs.study.case import Case, Rock, Size, judge
 from mgs.study.output import Panel
 from mgs.study.sweep import Cell
 from mgs.study.verdict import Claim
@@ -54,7 +54,7 @@ class StressSize:
 
     def case(self, scene: str, seed: int) -> Case:
         """Case of a rock."""
-        return Case(Scene(scene, seed), self.images, {"gaussians": self.gaussians, "seed": seed})
+        return Case(Rock(scene, seed), self.images, {"gaussians": self.gaussians, "seed": seed})
 
 
 SIZES = {
