@@ -21,10 +21,9 @@ from mgs.files import write_json
 from mgs.run.folder import read_checkpoint
 from mgs.run.loop import fit_views
 from mgs.study import case, flights, free_fit, reproduce, setups
-from mgs.study.case import Case, Scene, Size
+from mgs.study.case import Case, Rock, Size
 from mgs.study.oracle import foretold
 from mgs.study.reproduce import ReproduceSize, Run, RunSize
-from mgs.study.rocks import Rock
 from mgs.study.setups import SetupSize
 from mgs.study.sweep import cell_folder, run_cells
 from mgs.survey import flight
@@ -208,8 +207,9 @@ def test_a_case_is_the_scene_with_some_keys_changed(tmp_path, monkeypatch):
     )
     monkeypatch.setattr(case, "load_dataset", lambda folder: ())
     changes = {"rock": {"specular": 0.0}, "orbit": {"kind": "hemisphere", "distances": [1, 2]}}
-    for scene in (Scene("strata", 3), Scene("strata", 3, changes)):
-        (cell, prior) = Case(scene, ONE.images, {"density": 0.125}).cells()
+    for changed in ({}, changes):
+        rock, settings = Rock("strata", 3), {"density": 0.125}
+        (cell, prior) = Case(rock, ONE.images, settings, changes=changed).cells()
         assert cell.name == "dataset/strata-3/8x48x36"
         assert prior.name == "prior/strata-3/8x48x36-0.125"
         case.make_dataset(tmp_path, tmp_path, **json.loads(json.dumps(cell.arguments)))
