@@ -8,6 +8,7 @@ there are the metres with which even spacing has the same.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -92,10 +93,11 @@ def cells_of(size: SetupSize, rocks: Iterable[Rock]) -> list[Cell]:
             count = "" if size.gaussians is None else f"-{size.gaussians}"
             folder = f"{name.replace(' ', '-')}-{size.width}x{size.height}{count}"
             frames = setup.frames // size.fewer
-            made = case.with_task(
+            *data, last = case.with_task(
                 f"flights/{rock.name}/{folder}", f"{__name__}:fly_and_judge", frames=frames
             )
-            cells |= {cell.name: cell for cell in made}
+            about = {"rock": rock.name, "scene": rock.scene, "pool": name}
+            cells |= {cell.name: cell for cell in (*data, replace(last, about=about))}
     return list(cells.values())
 
 
@@ -129,22 +131,18 @@ def fly_and_judge(root: Path, out: Path, dataset: str, prior: str, frames: int) 
     return {"whole": whole, "flights": flights}
 
 
-def rows_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> list[Row]:
+def rows_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
     """A row for each flight, with "gain": dB over even spacing with the same metres, and "ratio":
     metres over those with which even spacing has the same PSNR, both interpolated. The ratio is
     None where the PSNR is below that of the shortest flight with even spacing."""
-    scenes = {rock.name: rock.scene for rock in rocks}
     rows: list[Row] = []
-    for cell in (cell for cell in cells if cell.name.startswith("flights/")):
-        _, rock, where = cell.name.split("/")
-        pool = next(name for name in POOLS if where.startswith(name.replace(" ", "-") + "-"))
-        about = {"rock": rock, "scene": scenes[rock], "pool": pool}
+    for cell in (cell for cell in cells if cell.about):
         flights = results[cell.name]["flights"]
         even = sorted((one["metres"], one["psnr"]) for one in flights if one["policy"] == EVEN)
         metres, psnr = np.array(even).T
         psnr = np.maximum.accumulate(psnr)
         for one in flights:
-            row = about | {key: value for key, value in one.items() if key != "taken"}
+            row = cell.about | {key: value for key, value in one.items() if key != "taken"}
             if one["policy"] != EVEN:
                 row["gain"] = one["psnr"] - float(np.interp(one["metres"], metres, psnr))
                 same = float(np.interp(one["psnr"], psnr, metres))

@@ -134,10 +134,10 @@ def write_survey(work: Work) -> list[Path]:
 
 
 def _write_setups(work: Work, name: str, cells: Sequence[Cell]) -> list[Path]:
-    rocks, prefix = work.size.some_rocks(work.count), "" if name == "setups" else f"{name}-"
+    prefix = "" if name == "setups" else f"{name}-"
     known = _known(work.root, cells)
     done = [cell for cell in cells if cell.name in known]
-    rows, predicted = setups.rows_of(known, done, rocks), setups.foretold_of(known, done, rocks)
+    rows, predicted = setups.rows_of(known, done), setups.foretold_of(known, done)
     leads = [lead for key in setups.MEASURES for lead in setups.leads_of(rows, setups.LEADER, key)]
     files = [work.out / f"{prefix}leads.csv", work.out / f"{name}.png"]
     write_csv(files[0], leads)
@@ -156,8 +156,7 @@ def _flight_cells(size: ReproduceSize, count: int) -> list[Cell]:
 
 def write_flights(work: Work) -> list[Path]:
     """flights.csv, .json, .md and .png."""
-    rocks = work.size.some_rocks(work.count)
-    rows = flights.rows_of(work.results, work.cells, rocks)
+    rows = flights.rows_of(work.results, work.cells)
     flights.draw(work.out / "flights.png", rows)
     text = flights.text_of(rows)
     written = write_table(work.out, "flights", rows, text, work.command, rocks=work.count)

@@ -152,9 +152,9 @@ def cells_of(
                 for draw in range(DRAWS if policy == RANDOM else 1):
                     settings = common | {"policy": policy, "seed": rock.index + 1000 * draw}
                     version = "".join(f"-{d[:8]}" for d in policy_record(policy).values())
-                    label = f"{policy_file.label(policy)}{version}-{draw}"
-                    folder = name.replace(" ", "-")
-                    of = f"setup/{rock.name}/{folder}-{size.width}x{size.height}/{label}"
+                    label = policy_file.label(policy)
+                    where = f"{name.replace(' ', '-')}-{size.width}x{size.height}"
+                    of = f"setup/{rock.name}/{where}/{label}{version}-{draw}"
                     made = case.with_task(
                         of,
                         f"{__name__}:choose_and_judge",
@@ -163,7 +163,8 @@ def cells_of(
                         settings=settings,
                     )
                     needs = (ring.cells()[0].name, *(cell.name for cell in data))
-                    last = replace(made[-1], needs=needs)
+                    about = {"rock": rock.name, "scene": rock.scene, "setup": name, "policy": label}
+                    last = replace(made[-1], needs=needs, about=about)
                     for cell in (*ring.cells()[:1], *data, last):
                         cells[cell.name] = cell
     return list(cells.values())
@@ -270,20 +271,16 @@ def _after_seeds(problem: Problem) -> Fitted:
     return learn(problem, problem.seeds)
 
 
-def rows_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> list[Row]:
+def rows_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
     """A row for each rock, set-up and policy, draws averaged: MEASURES, "path", and KEY_gain, the
     difference from `random`."""
-    scenes = {rock.name: rock.scene for rock in rocks}
-    groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for cell in cells:
-        if cell.name.startswith("setup/"):
-            rock, setup = _place(cell)
-            policy = policy_file.label(cell.arguments["settings"]["policy"])
-            groups.setdefault((rock, setup, policy), []).append(results[cell.name])
+        if cell.about:
+            groups.setdefault(tuple(cell.about.items()), []).append(results[cell.name])
     rows: list[Row] = [
-        {"rock": rock, "scene": scenes[rock], "setup": setup, "policy": policy}
-        | {key: float(np.mean([one[key] for one in found])) for key in (*MEASURES, "path")}
-        for (rock, setup, policy), found in groups.items()
+        dict(about) | {key: float(np.mean([one[key] for one in of])) for key in (*MEASURES, "path")}
+        for about, of in groups.items()
     ]
     base = {(row["rock"], row["setup"]): row for row in rows if row["policy"] == RANDOM}
     for row in rows:
@@ -292,23 +289,13 @@ def rows_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> lis
     return rows
 
 
-def foretold_of(results: Found, cells: Sequence[Cell], rocks: Sequence[Rock]) -> list[Row]:
+def foretold_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
     """Rows with FORETOLD for each rock and set-up of the oracle, and each of SCORED."""
-    scenes = {rock.name: rock.scene for rock in rocks}
-    rows: list[Row] = []
-    for cell in cells:
-        for policy, numbers in results[cell.name].get("foretold", {}).items():
-            rock, setup = _place(cell)
-            about = {"rock": rock, "scene": scenes[rock], "setup": setup, "policy": policy}
-            rows.append(about | numbers)
-    return rows
-
-
-def _place(cell: Cell) -> tuple[str, str]:
-    """Rock and set-up of a cell of `choose_and_judge`."""
-    _, rock, where, _ = cell.name.split("/")
-    names = {name.replace(" ", "-"): name for name in (*SETUPS, *SURVEYED)}
-    return rock, names[where.rpartition("-")[0]]
+    return [
+        cell.about | {"policy": policy} | numbers
+        for cell in cells
+        for policy, numbers in results[cell.name].get("foretold", {}).items()
+    ]
 
 
 def by_scene(rows: Sequence[Row], setup: str, policy: str, key: str) -> dict[str, float]:

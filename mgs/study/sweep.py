@@ -47,7 +47,7 @@ class Cell:
     function(root, out, **arguments) with the study's folder and the cell's own folder, which may
     hold files of an interrupted call; returns JSON data. needs: names of cells that must be done
     before. alone: the result contains seconds, so the cell runs in this process while all workers
-    are idle.
+    are idle. about: first columns of its rows in tables.
     """
 
     name: str
@@ -55,6 +55,7 @@ class Cell:
     arguments: dict[str, Any] = field(default_factory=dict)
     needs: tuple[str, ...] = ()
     alone: bool = False
+    about: dict[str, Any] = field(default_factory=dict)
 
 
 def names_of(only: str | None, known: Iterable[str]) -> list[str]:
