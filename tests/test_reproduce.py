@@ -138,13 +138,13 @@ def test_flights_keep_their_length_and_are_compared_with_even_spacing(
 
 
 def test_metres_are_compared_at_the_same_psnr():
-    cell = SimpleNamespace(name="flights/boulder-11/dome-128x96")
+    about = {"rock": "boulder-11", "scene": "boulder", "pool": "dome"}
+    cell = SimpleNamespace(name="flights/boulder-11/dome-128x96", about=about)
     even = [(10, 20), (20, 24), (30, 23.5), (40, 28)]
     flown = [{"policy": flights.EVEN, "length": None, "metres": m, "psnr": p} for m, p in even]
     flown += [{"policy": "mine", "length": 0.5, "metres": 15, "psnr": 26}]
     flown += [{"policy": "mine", "length": 0.2, "metres": 12, "psnr": 19}]
-    rocks = [Rock("boulder", 11)]
-    *_, found, low = flights.rows_of({cell.name: {"flights": flown}}, [cell], rocks)
+    *_, found, low = flights.rows_of({cell.name: {"flights": flown}}, [cell])
     assert (found["ratio"], found["gain"]) == (pytest.approx(15 / 35), pytest.approx(4))
     assert (low["ratio"], low["gain"]) == (None, pytest.approx(-1.8))
 
@@ -424,10 +424,10 @@ def test_an_oracle_that_sees_the_truth_is_best_in_its_first_choice(quick, tmp_pa
     assert len(others) == setups.DRAWS
     assert next(iter(ring.values())) >= max(others) - 0.1, "its fit is warm, the judge's is not"
     cells = setups.cells_of(size, rocks, ("oracle", "random"))
-    predicted = setups.foretold_of(found, cells, rocks)
+    predicted = setups.foretold_of(found, cells)
     assert {row["policy"] for row in predicted} == set(setups.SCORED)
     assert all(-1 <= row["spearman"] <= 1 <= 1 + row["regret"] for row in predicted)
-    text = setups.text_of(setups.rows_of(found, cells, rocks), [], predicted)
+    text = setups.text_of(setups.rows_of(found, cells), [], predicted)
     assert "| rank correlation of the score with the gain | ring |" in text
 
 
