@@ -150,10 +150,6 @@ def _write_setups(work: Work, name: str, cells: Sequence[Cell]) -> list[Path]:
     return written
 
 
-def _flight_cells(size: ReproduceSize, count: int) -> list[Cell]:
-    return flights.cells_of(size.flights, size.some_rocks(count))
-
-
 def write_flights(work: Work) -> list[Path]:
     """flights.csv, .json, .md and .png."""
     rows = flights.rows_of(work.results, work.cells)
@@ -179,6 +175,10 @@ def _oracle_cells(size: ReproduceSize, count: int) -> list[Cell]:
     """Set-ups, and the oracle in each on the same rocks."""
     rocks = size.some_rocks(count)
     return _setup_cells(size, count) + cells_of(size.setups, rocks, (ORACLE,))
+
+
+def _flight_cells(size: ReproduceSize, count: int) -> list[Cell]:
+    return flights.cells_of(size.flights, size.some_rocks(count))
 
 
 @dataclass(frozen=True)
