@@ -9,7 +9,7 @@ from mgs.errors import flag
 from mgs.policy import from_file as policy_file
 from mgs.run.inputs import policy_record
 from mgs.study.case import Case, Rock, Size
-from mgs.study.setups import DRAWS, POLICIES, SetupSize
+from mgs.study.setups import DRAWS, POLICIES, RING, SetupSize
 from mgs.study.sweep import Cell
 
 SEEDS = 4
@@ -36,9 +36,6 @@ ALL_3DGS: dict[str, dict[str, Any]] = {
     "3DGS, random points, twice the steps": {"random": True, "passes": 2},
 }
 """Rows of Table I for 3DGS, which sees all views: settings of `mgs.study.free_fit.time_3dgs`."""
-
-RING = {"kind": "circle", "distances": [1]}
-"""Orbit of Table I and of the numbers of seeds: the paper's."""
 
 FIGURE_POLICIES = ("paper", "d-optimal", "coverage", "uniform")
 """Runs of Table I that the figures show."""

@@ -96,6 +96,8 @@ class Setup:
 
 
 RING = {"kind": "circle", "distances": [1]}
+"""Orbit of the paper."""
+
 DOME = {"kind": "hemisphere", "distances": [1]}
 
 SETUPS = {
@@ -106,7 +108,7 @@ SETUPS = {
     "five nearest": Setup(RING, 48, settings={"nearest": 5}),
     "mixed distances": Setup({"kind": "hemisphere", "distances": [1, 2, 3]}, 36),
 }
-"""The ring is the paper's; in the others the choice matters more."""
+"""In all but the ring the choice matters more."""
 
 SURVEYED = {"surveyed ring": Setup(RING, 48, survey=True)}
 """Set-ups with the estimated poses, measured depth and prior of `mgs survey`."""

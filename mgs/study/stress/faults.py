@@ -28,6 +28,7 @@ from mgs.run.detectors import DETECTORS
 from mgs.seeds import generator
 from mgs.splat import render
 from mgs.study.output import Panel
+from mgs.study.stress.fits import FREE_PASSES
 from mgs.study.stress.lab import Experiment, Lab, StressSize, open_lab, rock_cell, turns
 from mgs.study.sweep import Cell
 from mgs.study.verdict import Claim, Row, single
@@ -242,8 +243,8 @@ ANOTHER = "another rock's prior"
 SHORT_FITS = (1, 2, 5)
 """Passes of fits that are stopped too early, as a fault."""
 
-FREE_VIEWS, FREE_PASSES = (2, 4), 40
-"""Views and passes of fits whose means are free and held by no prior, as a fault."""
+FREE_VIEWS = (2, 4)
+"""Views of fits whose means are free and held by no prior, as a fault."""
 
 ONE_POSE = (1.0, 4.0)
 """Sizes of `pose_noise` in a single view."""
