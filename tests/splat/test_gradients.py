@@ -1,5 +1,5 @@
-"""Gradients of images against the float64 reference, judged as vectors: relative L2 error, cosine
-and signed bias. Scenes have no pixel near a threshold, where no gradient exists.
+"""Gradients of images against the float64 reference, judged as vectors by the relative L2 error.
+Scenes have no pixel near a threshold, where no gradient exists.
 """
 
 from functools import cache
@@ -18,12 +18,13 @@ from mgs.splat.rendering import composite_channels, splats_and_lists
 from .scenes import (
     calm,
     changed,
-    compare,
     double,
     gradients_of,
     make_camera,
+    make_clamped,
     make_gaussians,
     margins,
+    relative_error,
     with_gradients,
 )
 
@@ -71,9 +72,10 @@ def differences(gaussians, camera, weights, wanted, step=1e-6) -> dict[str, np.n
 
 @cache
 def case(degree: int, n=10):
-    """(gaussians, camera, weights, expected gradients per output)."""
-    camera, style = make_camera(), {"log_scales": (-4.0, -1.0)}
-    gaussians = calm(lambda seed: make_gaussians(n, seed, degree, **style), camera, 10 + degree)
+    """(gaussians, camera, weights, expected gradients per output). Of even degrees not
+    antialiased, so that alphas are clamped at ALPHA_MAX."""
+    camera, antialiased = make_camera(), degree % 2 == 1
+    gaussians = calm(lambda seed: make_clamped(seed, degree, n, antialiased), camera, 10 + degree)
     weights = image_weights(camera, degree)
     expected = differences(gaussians, camera, weights, ARRAYS[:4])
     J = reference.jacobian(gaussians, camera, BACKGROUND)
@@ -82,24 +84,20 @@ def case(degree: int, n=10):
     expected["sh"] = np.zeros((len(OUTPUTS), n, K, 3))
     expected["sh"][0] = flat[:, : 3 * K].reshape(n, K, 3)
     shapes = [expected[name][0].reshape(n, -1) for name in ARRAYS[1:4]]
-    assert compare(flat[:, 3 * K :], np.concatenate(shapes, 1))[0] < 1e-7
+    assert relative_error(flat[:, 3 * K :], np.concatenate(shapes, 1)) < 1e-7
     return gaussians, camera, weights, expected
 
 
 @pytest.mark.parametrize("output", OUTPUTS)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gradient_of_each_output(degree, output, record_property):
+def test_gradient_of_each_output(degree, output):
     gaussians, camera, weights, expected = case(degree)
     wanted = ARRAYS if output == "rgb" else ARRAYS[:4]
     found = gradients(gaussians, camera, {output: weights[output]}, wanted)
     for name in wanted:
         truth = expected[name][OUTPUTS.index(output)]
         assert found[name].shape == getattr(gaussians, name).shape
-        error, sine, bias = compare(found[name], truth)
-        record_property(name, (error, sine, bias))
-        assert error < TOLERANCE, name
-        assert sine < TOLERANCE**2, name
-        assert abs(bias) < TOLERANCE / 2, name
+        assert relative_error(found[name], truth) < TOLERANCE / 2, name
 
 
 @pytest.mark.parametrize("seed", [4, 5])
@@ -113,7 +111,7 @@ def test_gradient_of_the_depth_of_faint_splats(seed):
     found = gradients(gaussians, camera, {"depth": weights["depth"]}, wanted)
     expected = differences(gaussians, camera, weights, wanted)
     for name in wanted:
-        assert compare(found[name], expected[name][OUTPUTS.index("depth")])[0] < TOLERANCE, name
+        assert relative_error(found[name], expected[name][OUTPUTS.index("depth")]) < TOLERANCE, name
 
 
 LOSSES = {
@@ -137,7 +135,7 @@ def test_gradient_of_any_loss(loss):
     dr.backward(dr.sum(LOSSES[loss](image), axis=None))
     weights = {name: np.asarray(dr.grad(getattr(leaf, name))) for name in OUTPUTS}
     expected = gradients(gaussians, camera, weights, ("log_scales",))["log_scales"]
-    assert compare(gradients_of(model, ["log_scales"])["log_scales"], expected)[0] < 1e-5
+    assert relative_error(gradients_of(model, ["log_scales"])["log_scales"], expected) < 1e-5
 
 
 @pytest.mark.parametrize("means", [False, True])
@@ -175,25 +173,12 @@ def test_some_channels_alone_have_the_same_image_and_derivatives(means, channels
     np.testing.assert_array_equal(found[0][..., :3], expected[0][..., :3])
     assert np.abs(found[0] - expected[0]).max() < 1e-6  # alpha: 1 - T, not the sum of weights
     for name, a, b in zip(("tangent", *wanted), found[1:], expected[1:], strict=True):
-        assert compare(a, b)[0] < 1e-5, name
+        assert relative_error(a, b) < 1e-5, name
 
 
-def test_frozen_means_change_no_other_gradient():
-    """The kernel then leaves out two sums."""
+def test_gradient_stops_where_a_scale_is_clamped():
     gaussians, camera, weights, _ = case(1)
-    free = gradients(gaussians, camera, weights)
-    frozen = gradients(gaussians, camera, weights, ARRAYS[1:])
-    for name in ARRAYS[1:]:
-        np.testing.assert_array_equal(free[name], frozen[name], err_msg=name)
-
-
-def test_gradient_stops_where_something_is_clamped():
-    """A colour below 0, a log-scale outside its range."""
-    gaussians, camera, weights, _ = case(0)
-    dark, scales = gaussians.sh.copy(), gaussians.log_scales.copy()
-    dark[3] = -10
-    found = gradients(changed(gaussians, sh=dark), camera, {"rgb": weights["rgb"]})
-    assert (found["sh"][3] == 0).all()
+    scales = gaussians.log_scales.copy()
     scales[2, 1], scales[4, 0] = -30, 30
     found = gradients(changed(gaussians, log_scales=scales), camera, {"rgb": weights["rgb"]})
     assert found["log_scales"][2, 1] == found["log_scales"][4, 0] == 0
