@@ -1,7 +1,5 @@
 """Block lists are complete, ordered, and never change an image, however old they are."""
 
-import sys
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -18,30 +16,17 @@ from mgs.splat import (
     as_drjit,
     blocks,
     fisher,
-    information,
     kernels,
     reference,
     render,
+    rendering,
     walking,
 )
-from mgs.splat.blocks import (
-    BLOCK_X,
-    BLOCK_Y,
-    TILE,
-    build,
-    depth_order,
-)
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE, build, depth_order
 from mgs.splat.projection import camera_array, project
 from mgs.splat.walking import PIXELS, packet_count
 
-from .scenes import (
-    changed,
-    gradients_of,
-    make_camera,
-    make_gaussians,
-    place,
-    with_gradients,
-)
+from .scenes import changed, gradients_of, make_camera, make_gaussians, place, with_gradients
 
 
 def projected(gaussians, camera):
@@ -77,7 +62,7 @@ def needed_pairs(gaussians, camera) -> set[tuple[int, int]]:
 
 @pytest.mark.parametrize(
     ("seed", "scales"),
-    [*((seed, (-6.0, -1.0)) for seed in range(4)), (4, (-9.0, 0.5)), (5, (-2.0, 1.0))],
+    [(0, (-6.0, -1.0)), (4, (-9.0, 0.5)), (5, (-2.0, 1.0))],
 )
 def test_lists_hold_every_pair_and_little_more(seed, scales):
     """For small splats, needles and splats as large as the image."""
@@ -85,23 +70,6 @@ def test_lists_hold_every_pair_and_little_more(seed, scales):
     needed, listed = needed_pairs(g, camera), pairs_of(lists_of(g, camera)[0])
     assert needed <= listed
     assert len(listed) < 1.25 * len(needed)
-
-
-def test_lists_are_in_depth_order_and_slots_of_a_splat_contiguous():
-    camera, g = make_camera(), make_gaussians(60, 9)
-    lists, splats = lists_of(g, camera)
-    splat, pair, start, end = (
-        np.asarray(a) for a in (lists.splat, lists.pair, lists.start, lists.end)
-    )
-    by_place = np.argsort(np.asarray(lists.place))
-    assert sorted(by_place) == list(range(60)), "every splat has a place of its own"
-    z, used = np.asarray(splats.depth)[by_place], int((end - start).sum())
-    for s, e in zip(start, end, strict=True):
-        assert (np.diff(z[splat[s:e]]) >= 0).all()
-    assert sorted(pair[:used]) == list(range(used))
-    first, last = np.asarray(lists.slot_start), np.asarray(lists.slot_end)
-    for j in range(len(g)):
-        assert sorted(pair[first[j] : last[j]]) == list(np.nonzero(splat[:used] == j)[0])
 
 
 def test_memory_and_lanes_go_by_tile():
@@ -184,10 +152,12 @@ def assert_cached_is_cold(gaussians, camera, cache) -> None:
     drift=st.sampled_from([1e-3, 1e-2, 0.1, 1.0]),
     names=st.sets(st.sampled_from(ARRAYS), min_size=1),
     teleport=st.booleans(),
+    antialiased=st.booleans(),
 )
-def test_stale_lists_never_change_an_image(seed, drift, names, teleport):
+def test_stale_lists_never_change_an_image(seed, drift, names, teleport, antialiased):
     """Parameters drift, jump behind the camera and back."""
-    camera, g = make_camera(), make_gaussians(60, seed, log_scales=(-5.0, -1.5))
+    camera, style = make_camera(), {"log_scales": (-5.0, -1.5), "antialiased": antialiased}
+    g = make_gaussians(60, seed, **style)
     rng, cache = np.random.default_rng(seed), ListCache()
     behind = place(camera, rng.uniform(0, 30, (60, 2)), np.full(60, -1.5))
     for step in range(6):
@@ -225,21 +195,7 @@ def test_lists_are_reused_until_a_footprint_changes(monkeypatch):
     assert see() == (5, 3)
 
 
-@settings(derandomize=True, deadline=None, max_examples=12)
-@given(seed=st.integers(0, 2**31), large=st.floats(-2.5, -0.5), shrink=st.floats(0.5, 5))
-def test_splats_that_shrank_are_not_drawn_where_they_were(seed, large, shrink):
-    camera, cache = make_camera((140, 70), focal=140.0), ListCache()
-    g = make_gaussians(12, seed, log_scales=(large - 0.5, large), logits=(0, 4))
-    render(g, camera, cache=cache)
-    small = changed(g, log_scales=g.log_scales - shrink)
-    assert_cached_is_cold(small, camera, cache)
-    for estimator in ("exact", "block"):
-        cached = fisher(small, camera, estimator, cache=cache)
-        np.testing.assert_array_equal(cached, fisher(small, camera, estimator))
-    assert cache.builds == 2
-
-
-def test_each_camera_has_its_own_lists():
+def test_each_camera_and_number_of_gaussians_has_its_own_lists():
     g, cache = make_gaussians(60, 3), ListCache()
     options = {}, {"eye": (1, 1, 1)}, {"focal": 40.0}, {"size": (24, 16)}, {"centre": (9, 9)}
     cameras = [make_camera(**values) for values in options]
@@ -247,12 +203,8 @@ def test_each_camera_has_its_own_lists():
         for camera in cameras:
             assert_cached_is_cold(g, camera, cache)
     assert cache.builds == len(cameras)
-
-
-def test_another_number_of_gaussians_is_another_scene():
-    camera, cache = make_camera(), ListCache()
-    for n in (60, 16, 60):
-        assert_cached_is_cold(make_gaussians(n, 4), camera, cache)
+    for n in (16, 60):
+        assert_cached_is_cold(make_gaussians(n, 4), cameras[0], cache)
 
 
 RING = [
@@ -279,34 +231,24 @@ def misses(passes, room: int) -> list[int]:
     return built
 
 
-def test_cache_keeps_what_it_has_room_for_in_every_pass():
+def test_cache_keeps_what_it_has_room_for():
     assert misses(IN_ORDER, 12) == [12, 0, 0, 0, 0]
     assert misses(IN_ORDER, 11) == [12, 1, 1, 1, 1]
     assert misses(IN_ORDER, 6) == [12, 6, 6, 6, 6]
     assert max(misses(SHUFFLED, 11)[1:]) <= 2
     assert np.mean(misses(SHUFFLED, 6)[1:]) < 8.5, "LRU: 10"
-
-
-@pytest.mark.parametrize("passes", [IN_ORDER, SHUFFLED])
-def test_cache_goes_over_to_other_cameras(passes):
-    others = [cameras + 12 for cameras in passes]
-    assert max(misses([*passes, *others], 11)[-2:]) <= 2
+    for passes in (IN_ORDER, SHUFFLED):
+        others = [cameras + 12 for cameras in passes]
+        assert max(misses([*passes, *others], 11)[-2:]) <= 2, "it goes over to other cameras"
     assert misses([[0], [1], [1], [1]], 1) == [1, 1, 1, 0], "one camera after another"
 
 
-def test_cache_remembers_a_bounded_number_of_uses(monkeypatch):
-    monkeypatch.setattr(sys.modules[ListCache.__module__], "REMEMBERED", 5)
-    cache, splats = ListCache(budget=1), projected(make_gaussians(60, 3), RING[0])
-    for camera in RING:
-        cache.get(camera, splats)
-        assert len(cache._used) <= 6
-
-
-def test_one_view_larger_than_the_budget_still_renders():
-    g, camera, cache = make_gaussians(60, 3), make_camera(), ListCache(budget=1)
-    assert_cached_is_cold(g, camera, cache)
-    images(g, make_camera(focal=40.0), cache)
-    assert cache.builds == 2
+def test_views_larger_than_the_budget_still_render(monkeypatch):
+    """Also when the cache forgets when it saw their cameras."""
+    monkeypatch.setattr(rendering, "REMEMBERED", 2)
+    g, cache = make_gaussians(60, 3), ListCache(budget=1)
+    for i in (0, 1, 2, 3, 3, 3):
+        assert_cached_is_cold(g, RING[i], cache)
 
 
 @pytest.mark.parametrize(
@@ -323,39 +265,18 @@ def test_pairs_are_counted_in_64_bits(size, n, what):
         render(many, camera)
 
 
-def test_a_view_has_a_bounded_number_of_pairs(monkeypatch):
-    camera, g = make_camera(), make_gaussians(60, 3)
-    count = len(pairs_of(lists_of(g, camera)[0]))
-    monkeypatch.setattr(blocks, "MAX_PAIRS", count)
-    images(g, camera)
-    monkeypatch.setattr(blocks, "MAX_PAIRS", count - 1)
-    said = f"view: {count:,} pairs .* {count - 1:,} are the most; draw fewer or smaller"
-    for call in (render, fisher):
-        with pytest.raises(InputError, match=said):
-            call(g, camera)
-
-
 def test_what_memory_has_no_room_for_is_refused(monkeypatch, tmp_path):
-    camera, g = make_camera(), make_gaussians(60, 3)
-    count = len(pairs_of(lists_of(g, camera)[0]))
-    spare = tmp_path / "meminfo"
+    camera, g, spare = make_camera(), make_gaussians(60, 3), tmp_path / "meminfo"
     monkeypatch.setattr(memory, "MEMORY_FILE", spare)
     monkeypatch.setattr(memory, "LITTLE", 0)
-    whole = np.asarray(render(g, camera).rgb)
-    pairs, blocks_said = (
-        f"view: {count:,} pairs .* GiB are free; draw fewer",
-        "fisher: blocks of 60 G",
-    )
-    for room, call, said in (
-        (count * blocks.PAIR_BYTES // 2, render, pairs),
-        (60 * information.BLOCK_BYTES // 2, fisher_of_blocks, blocks_said),
-    ):
-        spare.write_text(f"MemTotal:  9 kB\nMemAvailable:  {room // 1024} kB\n")
-        with pytest.raises(InputError, match=said):
-            call(g, camera)
+    spare.write_text("MemTotal:  9 kB\nMemAvailable:  20 kB\n")
+    with pytest.raises(InputError, match=r"view: [0-9,]+ pairs .* GiB are free; draw fewer"):
+        render(g, camera)
+    with pytest.raises(InputError, match="fisher: blocks of 60 G"):
+        fisher(g, camera, "block")
     spare.write_text("MemAvailable:  1000000 kB\n")
-    np.testing.assert_array_equal(np.asarray(render(g, camera).rgb), whole)
-    fisher_of_blocks(g, camera)
+    render(g, camera)
+    fisher(g, camera, "block")
 
 
 def test_what_drjit_keeps_for_later_is_given_back_before_anything_is_refused(monkeypatch):
@@ -366,10 +287,6 @@ def test_what_drjit_keeps_for_later_is_given_back_before_anything_is_refused(mon
     assert given_back == [True]
     with pytest.raises(InputError, match=r"more may take 3\.7 GiB, and 2\.8 GiB are free; take"):
         memory.check_room(4e9, "more", "take less")
-
-
-def fisher_of_blocks(gaussians, camera):
-    return fisher(gaussians, camera, "block")
 
 
 def test_places_in_buffers_stay_below_31_bits():
@@ -406,30 +323,12 @@ def test_the_size_of_tiles_changes_no_bit(tile, monkeypatch):
     camera, g = make_camera((150, 70), focal=150.0), make_gaussians(80, 7, log_scales=(-5.0, -1.5))
 
     def everything():
-        names = "means", "quats"
-        model = with_gradients(g, names)
+        model = with_gradients(g)
         dr.backward(dr.sum(dr.square(render(model, camera).rgb), axis=None))
-        gradients = gradients_of(model, names).values()
+        gradients = gradients_of(model).values()
         return [*images(g, camera), *gradients, fisher(g, camera), fisher(g, camera, "block")]
 
     expected = everything()
     monkeypatch.setattr(blocks, "TILE", tile)
     for a, b in zip(everything(), expected, strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.parametrize("count", [0, 1, 1023, 1024, 1025])
-def test_pairs_of_any_number_are_sorted_and_padded(count):
-    rng = np.random.default_rng(count)
-    owner, number = rng.integers(0, 50, count), rng.integers(0, 256, count)
-    pairs = (mi.UInt32(owner), mi.UInt32(number)) if count else (mi.UInt32(), mi.UInt32())
-    arrays = blocks._by_block(*pairs, 256)
-    splat, pair, start, end = (np.asarray(a).astype(int) for a in arrays)
-    order = np.argsort(number, kind="stable")
-    assert len(splat) == len(pair) == blocks._room(count)
-    np.testing.assert_array_equal(splat, [*owner[order], *[0] * (len(splat) - count)])
-    np.testing.assert_array_equal(pair[:count][order], np.arange(count))
-    for k in range(256):
-        expected = np.full((number == k).sum(), k)
-        np.testing.assert_array_equal(np.sort(number)[start[k] : end[k]], expected)
-    assert dr.width(arrays[0]) % 1024 == 0
