@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mgs.splat import ListCache, as_drjit, fisher, kernels, reference, render, walking
-from mgs.splat.blocks import BLOCK_X, BLOCK_Y, on_cpu
+from mgs.splat.blocks import on_cpu
 from mgs.splat.projection import camera_array, project
-from mgs.splat.walking import computed_after, exp2
+from mgs.splat.walking import exp2
 
 from .scenes import in_own_process, make_camera, make_gaussians, place
 
@@ -38,45 +38,6 @@ def built(gaussians, camera):
     splats = project(as_drjit(gaussians), camera_array(camera))
     lists, packed = ListCache().get(camera, splats)
     return splats, lists, packed
-
-
-@pytest.mark.parametrize("log_scales", [(-9.0, -6.0), (-7.0, 1.0), (-3.0, -1.0)])
-def test_no_alpha_underflows_on_the_way_through_a_block(log_scales):
-    """`block_rows` needs an exponent above -113 at the centre of every row of a listed block."""
-    g = make_gaussians(400, 5, log_scales=log_scales, logits=(5, 9), antialiased=False)
-    splats, lists, _ = built(g, make_camera((200, 120), 160))
-    start, end = np.asarray(lists.start), np.asarray(lists.end)
-    of = np.empty(len(np.asarray(lists.place)), int)
-    of[np.asarray(lists.place)] = np.arange(len(of))
-    lane = np.repeat(np.arange(len(start)), end - start)
-    pair = np.concatenate([np.arange(a, b) for a, b in zip(start, end, strict=True)])
-    splat, block = of[np.asarray(lists.splat)[pair]], np.asarray(lists.block)[lane]
-    across = int(lists.blocks_x[0])
-    u, v, k, p, e, opacity = (
-        np.asarray(getattr(splats, name), np.float64)[splat]
-        for name in ("mean_x", "mean_y", "shear", "white_x", "white_y", "log2_opacity")
-    )
-    rows = np.arange(BLOCK_Y)[:, None]
-    dx = block % across * BLOCK_X + BLOCK_X // 2 + 0.5 - u
-    dy = block // across * BLOCK_Y + rows + 0.5 - v
-    exponent = opacity - (p * (dx - k * dy)) ** 2 - (e * dy) ** 2
-    assert len(pair) > 400
-    assert exponent.min() > -113
-    assert log_scales[0] == -3.0 or exponent.min() < -50, "the scene shows how far it goes"
-
-
-def test_splats_are_drawn_alike_one_or_several_at_a_time(monkeypatch):
-    """Lists of every length, bit for bit; `__wrapped__` is the function that is recorded."""
-    splats, lists, packed = built(make_gaussians(60, 3), make_camera())
-    tangents = kernels.pack_tangents(splats, splats, lists.place)
-    assert {0, 1} <= {int(n) % 2 for n in np.asarray(lists.end) - np.asarray(lists.start)}
-    found = []
-    for together in (1, 2, 3):
-        monkeypatch.setattr(walking, "TOGETHER", together)
-        images = kernels.forward.__wrapped__(lists, packed, True)
-        images += kernels.jvp.__wrapped__(lists, packed, tangents)
-        found.append([np.asarray(image).tobytes() for image in images])
-    assert found[0] == found[1] == found[2]
 
 
 def test_lanes_of_one_pixel_draw_the_same(monkeypatch):
@@ -130,15 +91,6 @@ print(hashlib.sha256(b"".join(image.tobytes() for image in images)).hexdigest())
     assert said[0] == said[1]
     assert kernels[0].keys() == kernels[1].keys()
     assert any(kernels[0][name] != kernels[1][name] for name in kernels[0]), "the order is another"
-
-
-def test_what_comes_after_is_the_same_number():
-    x = mi.Float([0.0, -0.0, 1.5, -3e38, np.inf])
-    y = computed_after(x, [mi.Float([1.0, -2.0, np.nan, 3.0, np.inf]), mi.Float(7.0)])
-    assert np.asarray(y).tobytes() == np.asarray(x).tobytes()
-    assert computed_after(x, []) is x
-    z = computed_after(mi.Float64(x), [mi.Float(1, 2, 3, 4, 5)])
-    assert np.asarray(z).tobytes() == np.asarray(mi.Float64(x)).tobytes()
 
 
 @pytest.mark.parametrize("log_scales", [(-7.0, 1.0), (-3.0, -1.0)])

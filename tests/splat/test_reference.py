@@ -73,13 +73,6 @@ def test_nearer_gaussian_hides_the_farther():
     assert centre[0] < 1e-3
 
 
-def test_background_shows_where_alpha_is_not():
-    camera, g = make_camera(), make_gaussians(10, 3)
-    black, over = reference.render(g, camera), reference.render(g, camera, BACKGROUND)
-    expected = (1 - black["alpha"])[..., None] * BACKGROUND
-    np.testing.assert_allclose(over["rgb"] - black["rgb"], expected, atol=1e-12)
-
-
 def central(
     gaussians: Gaussians, camera, j: int, name: str, index, direction=1.0, step=1e-6
 ) -> np.ndarray:

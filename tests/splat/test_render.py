@@ -1,6 +1,5 @@
 """Images against the float64 reference: errors, flipped pixels, thresholds."""
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,7 +7,7 @@ from hypothesis import strategies as st
 
 from mgs.colour import SH_C0
 from mgs.gaussians import Gaussians
-from mgs.splat import as_drjit, reference, render
+from mgs.splat import reference, render
 from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 from .scenes import SIZE, changed, make_camera, make_gaussians, margins, place
@@ -42,7 +41,7 @@ def errors(gaussians, camera, background) -> tuple[np.ndarray, np.ndarray]:
     return worst / TOLERANCE, margins(gaussians, camera) > NEAR
 
 
-def test_errors_and_flipped_pixels(record_property):
+def test_errors_and_flipped_pixels():
     """In scenes of five styles, four SH degrees and three seeds."""
     results, eyes = [], ((2.0, 0.4, 1.1), (-1.2, 1.5, 0.3), (0.1, -0.2, 2.5))
     for number, style in enumerate(STYLES.values()):
@@ -51,12 +50,10 @@ def test_errors_and_flipped_pixels(record_property):
                 gaussians = make_gaussians(60, 100 * number + seed, degree, **style)
                 results.append(errors(gaussians, make_camera(eye=eyes[seed]), (0.1, 0.5, 0.9)))
     error, decided = (np.stack(values) for values in zip(*results, strict=True))
-    share = float((error > 1).mean())
-    record_property("worst_error", float(error[decided].max() * TOLERANCE))
-    record_property("flipped_share", share)
+    print(f"worst error {error[decided].max() * TOLERANCE:.1e}")
     assert decided.mean() > 0.99
     assert error[decided].max() <= 1
-    assert share < 1e-4
+    assert (error > 1).mean() < 1e-4
 
 
 @settings(derandomize=True, deadline=None, max_examples=40)
@@ -135,11 +132,3 @@ def test_alpha_is_clamped():
     camera = make_camera()
     alpha = np.asarray(render(changed(stack(camera, [0.5]), logit_opacities=[20]), camera).alpha)
     assert alpha[12, 20] == pytest.approx(ALPHA_MAX, abs=1e-6)
-
-
-def test_numpy_and_drjit_parameters_give_the_same_image():
-    camera, gaussians = make_camera(), make_gaussians(60, 5, 1)
-    a, b = render(gaussians, camera), render(as_drjit(gaussians), camera)
-    for name in ("rgb", "alpha", "depth"):
-        assert isinstance(getattr(a, name), mi.TensorXf)
-        np.testing.assert_array_equal(np.asarray(getattr(a, name)), np.asarray(getattr(b, name)))
