@@ -13,7 +13,7 @@ import mgs.splat
 from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.gaussians import ARRAYS, SH_MAX, Gaussians
-from mgs.splat import ESTIMATORS, ListCache, as_drjit, fisher, jvp, reference, render
+from mgs.splat import ESTIMATORS, ListCache, fisher, jvp, reference, render
 from mgs.splat.constants import NEAR
 
 from .scenes import (
@@ -155,11 +155,6 @@ def test_needles_across_a_large_image(seed):
     assert_right(g, make_camera((640, 120), focal=600))
 
 
-def test_splats_behind_the_camera_change_nothing():
-    g = behind_camera()
-    np.testing.assert_array_equal(render(g, CAMERA).rgb, render(g[4:], CAMERA).rgb)
-
-
 @pytest.mark.parametrize("size", [(1, 1), (1, 30), (30, 1), (8, 4), (33, 17)])
 def test_any_image_size(size):
     camera = make_camera(size, focal=0.8 * max(size))
@@ -177,12 +172,6 @@ def test_image_sizes_may_be_numpys_integers_and_are_whole():
         Camera(camera.K, 45.5, 31, camera.world_to_camera)
 
 
-def test_shapes_are_looked_at_where_there_are_no_means_too():
-    g = scene()
-    with pytest.raises(InputError, match="log_scales has shape"):
-        render(changed(g, means=g.means[:0]), CAMERA)
-
-
 def test_one_gaussian():
     assert_right(make_gaussians(1, 3, spread=0.1, log_scales=(-2, -1), logits=(1, 2)), CAMERA)
 
@@ -190,12 +179,14 @@ def test_one_gaussian():
 @pytest.mark.parametrize("degree", [0, 3])
 def test_no_gaussians_is_the_background(degree):
     g = make_gaussians(0, 0, degree)
-    for cache in (None, ListCache()):
-        image = render(g, CAMERA, BACKGROUND, cache)
-        expected = np.broadcast_to(BACKGROUND, (SIZE[1], SIZE[0], 3))
-        np.testing.assert_allclose(np.asarray(image.rgb), expected, atol=1e-7)
-        assert not np.any(np.asarray(image.alpha))
-        assert not np.any(np.asarray(image.depth))
+    image = render(g, CAMERA, BACKGROUND, ListCache())
+    expected = np.broadcast_to(BACKGROUND, (SIZE[1], SIZE[0], 3))
+    np.testing.assert_allclose(np.asarray(image.rgb), expected, atol=1e-7)
+    assert not np.any(np.asarray(image.alpha))
+    assert not np.any(np.asarray(image.depth))
+    change = jvp(g, {"means": g.means}, CAMERA, BACKGROUND)
+    assert change.rgb.shape == image.rgb.shape
+    assert not any(np.asarray(values).any() for values in vars(change).values())
     columns = 3 * (degree + 1) ** 2 + 8
     for estimator in ESTIMATORS:
         shape = (0, columns, columns) if estimator == "block" else (0, columns)
@@ -236,14 +227,10 @@ def test_not_a_number_names_the_parameter_and_the_first_gaussian(name):
     render(scene(), CAMERA, cache=cache)
     for call in (
         lambda: render(g, CAMERA),
-        lambda: render(as_drjit(g), CAMERA),
         lambda: render(g, CAMERA, cache=cache),
         lambda: fisher(g, CAMERA),
-        lambda: fisher(g, CAMERA, "hutchinson"),
     ):
-        with pytest.raises(
-            InputError, match=f"^.*{name} is NaN or infinite, first at Gaussian 5.*$"
-        ):
+        with pytest.raises(InputError, match=f"{name} is NaN or infinite, first at Gaussian 5"):
             call()
 
 
@@ -258,20 +245,14 @@ def test_opacities_of_extreme_logits():
     np.testing.assert_allclose(projected.opacities, expected * projected.compensations, rtol=1e-6)
 
 
-@pytest.mark.parametrize("colour", [3e38, -1e38, 1.01 * SH_MAX])
-def test_colours_beyond_measure_are_an_error(colour):
+def test_colours_beyond_measure_are_an_error():
     g = scene()
-    g.sh[5, 0, 1] = colour
-    for call in (
-        g.check,
-        lambda: render(g, CAMERA),
-        lambda: fisher(g, CAMERA),
-        lambda: fisher(g, CAMERA, "hutchinson"),
-    ):
+    g.sh[5, 0, 1] = -1.01 * SH_MAX
+    for call in (render, fisher):
         with pytest.raises(InputError, match="sh is beyond 1,000,000, first at Gaussian 5; remove"):
-            call()
+            call(g, CAMERA)
     with pytest.raises(InputError, match="one or three numbers, linear RGB, up to 1,000,000"):
-        fisher(scene(), CAMERA, background=(0, colour, 0))
+        fisher(scene(), CAMERA, background=(0, -1.01 * SH_MAX, 0))
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
@@ -291,21 +272,19 @@ def test_a_bad_number_behind_the_camera_is_an_error_too():
 
 
 @pytest.mark.parametrize(
-    ("name", "shape"),
+    ("name", "shape", "message"),
     [
-        ("means", (N, 2)),
-        ("log_scales", (N, 2)),
-        ("quats", (N - 1, 4)),
-        ("logit_opacities", (N, 1)),
-        ("sh", (N, 3)),
-        ("sh", (N, 5, 3)),
+        ("means", (N, 2), "means has shape"),
+        ("means", (0, 3), "log_scales has shape"),
+        ("quats", (N - 1, 4), "quats has shape"),
+        ("sh", (N, 3), "sh has shape"),
+        ("sh", (N, 5, 3), "sh has shape"),
     ],
 )
-def test_shapes_that_do_not_fit_are_an_error(name, shape):
-    values = {**vars(scene()), name: np.zeros(shape, np.float32)}
+def test_shapes_that_do_not_fit_are_an_error(name, shape, message):
     for call in (render, fisher):
-        with pytest.raises(InputError, match=f"{name} has shape"):
-            call(Gaussians(**values), CAMERA)
+        with pytest.raises(InputError, match=message):
+            call(changed(scene(), **{name: np.zeros(shape)}), CAMERA)
 
 
 def test_no_variant_is_named_in_the_code():
