@@ -22,7 +22,7 @@ from mgs.splat import (
     rendering,
     walking,
 )
-from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE, build, depth_order
+from mgs.splat.blocks import BLOCK_X, BLOCK_Y, build, depth_order
 from mgs.splat.projection import camera_array, project
 from mgs.splat.walking import PIXELS, packet_count
 
@@ -70,28 +70,6 @@ def test_lists_hold_every_pair_and_little_more(seed, scales):
     needed, listed = needed_pairs(g, camera), pairs_of(lists_of(g, camera)[0])
     assert needed <= listed
     assert len(listed) < 1.25 * len(needed)
-
-
-def test_memory_and_lanes_go_by_tile():
-    """Splats by the tile of their centre, then block, then depth; lanes by tile, then longest
-    list."""
-    camera = make_camera((300, 200), focal=300.0)
-    g = make_gaussians(500, 9, log_scales=(-5.0, -3.0))
-    lists, splats = lists_of(g, camera)
-    across = -(-camera.width // BLOCK_X)
-    u, v, z = (
-        np.asarray(a, np.float64)[np.argsort(np.asarray(lists.place))]
-        for a in (splats.mean_x, splats.mean_y, splats.depth)
-    )
-    bx = np.clip(u // BLOCK_X, 0, across - 1)
-    by = np.clip(v // BLOCK_Y, 0, camera.height // BLOCK_Y - 1)
-    tile = by // TILE * -(-across // TILE) + bx // TILE
-    assert len(set(tile)) > 4
-    np.testing.assert_array_equal(np.lexsort((z, bx, by, tile)), np.arange(len(g)))
-    block = np.asarray(lists.block).astype(int)
-    length = (np.asarray(lists.end) - np.asarray(lists.start)).astype(int)
-    tile = block // across // TILE * -(-across // TILE) + block % across // TILE
-    np.testing.assert_array_equal(np.lexsort((-length, tile)), np.arange(len(block)))
 
 
 def test_a_new_camera_compiles_nothing():
