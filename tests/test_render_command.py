@@ -47,7 +47,7 @@ def columns(g: Gaussians) -> dict[str, np.ndarray]:
     return named | {"opacity": g.logit_opacities}
 
 
-def foreign_ply(path, g: Gaussians, encoding: str = "ascii"):
+def foreign_ply(path, g: Gaussians, encoding: str = "ascii") -> None:
     """Write a PLY as another tool might: properties shuffled, unknown properties, another element
     first."""
     rng, n = np.random.default_rng(g.sh_degree), len(g)
@@ -99,22 +99,6 @@ def folder(tmp_path):
     """Folder with the cameras, for `run`."""
     write_cameras(tmp_path / "transforms.json")
     return tmp_path
-
-
-@pytest.mark.parametrize(
-    ("degree", "encoding"), [(0, "ascii"), (2, "binary_big_endian"), (3, "binary_little_endian")]
-)
-def test_any_ply(folder, degree, encoding):
-    """Each camera gets the image of the model in any order of properties; other tools' colours are
-    sRGB."""
-    model = gaussians(degree)
-    foreign_ply(folder / "x.ply", model, encoding)
-    run(folder)
-    assert sorted(path.name for path in (folder / "out").iterdir()) == ["a.png", "b.png"]
-    for name, camera in zip("ab", CAMERAS, strict=True):
-        truth = np.clip(np.asarray(render(model, camera).rgb), 0, 1)
-        assert truth.max() > 0.3
-        np.testing.assert_allclose(pixels(folder / f"out/{name}.png"), truth, atol=0.51 / 255)
 
 
 SH_AS_PUBLISHED = [

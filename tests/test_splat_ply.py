@@ -1,4 +1,4 @@
-"""Compressed PLY files of SuperSplat and PlayCanvas, and comments in any script."""
+"""PLY files of other tools, and compressed ones of SuperSplat and PlayCanvas."""
 
 import base64
 
@@ -111,10 +111,17 @@ def test_a_broken_compressed_file_is_one_line(tmp_path, old, new, message):
         read_ply(tmp_path / "x.ply")
 
 
-def test_a_comment_in_any_script(tmp_path):
-    model = gaussians(1)
-    foreign_ply(tmp_path / "x.ply", model, "binary_little_endian")
-    for comment in ("été, 岩".encode(), "été".encode("latin-1")):
-        data = (tmp_path / "x.ply").read_bytes()
-        (tmp_path / "y.ply").write_bytes(data.replace(b"from another tool", comment, 1))
-        assert read_ply(tmp_path / "y.ply") == model
+ANY = [
+    (0, "ascii", b"made elsewhere"),
+    (2, "binary_big_endian", "été, 岩".encode()),
+    (3, "binary_little_endian", "été".encode("latin-1")),
+]
+
+
+@pytest.mark.parametrize(("degree", "encoding", "comment"), ANY)
+def test_any_ply(tmp_path, degree, encoding, comment):
+    """Properties in any order, others that are ignored, and a comment in any script."""
+    path, model = tmp_path / "x.ply", gaussians(degree)
+    foreign_ply(path, model, encoding)
+    path.write_bytes(path.read_bytes().replace(b"from another tool", comment, 1))
+    assert read_ply(path) == model
