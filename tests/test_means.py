@@ -1,11 +1,11 @@
 """Learned means, along the prior's normals or free: steps of a fit, and runs of `mgs nbv`."""
 
-import json
-from typing import get_args
+import shutil
 
 import numpy as np
 import pytest
 import tiny
+from program import change_settings
 from refusals import refused
 
 from mgs.camera import Camera, look_at
@@ -64,10 +64,8 @@ def targets(cameras) -> list[np.ndarray]:
     return [np.asarray(render(ball(), camera).rgb) for camera in cameras]
 
 
-def settings(means: str, rate: float = MEAN_RATE * SPACING, **values) -> TrainSettings:
-    return TrainSettings(
-        means=means, rates={"mean": rate}, **({"passes": 8, "tolerance": 0.0} | values)
-    )
+def settings(means: str, passes: int, rate: float = MEAN_RATE * SPACING) -> TrainSettings:
+    return TrainSettings(means=means, rates={"mean": rate}, passes=passes, tolerance=0.0)
 
 
 LAM = {
@@ -79,20 +77,16 @@ LAM = {
 }
 
 
-def fitted(start, cameras, targets, train, begun=None):
-    """A fit from `begun`, by default `start`, the mean of the prior."""
-    begun = start if begun is None else begun
+def fitted(begun, cameras, targets, train, start=None):
+    """A fit from `begun`; start: the mean of the prior, by default the same."""
+    start = begun if start is None else start
     return fit(begun, cameras, targets, train, start=start, lam=LAM, normals=3 * normals())
-
-
-def test_the_names_are_those_of_the_information():
-    assert get_args(TrainSettings.model_fields["means"].annotation) == tuple(MEANS)
 
 
 def test_frozen_is_the_default_and_ignores_normals_and_their_lam(cameras, targets):
     start, lam = ball(0.05), {kind: value for kind, value in LAM.items() if kind != "mean"}
     plain = fit(start, cameras, targets, TrainSettings(passes=3), start=start, lam=lam)
-    frozen = fitted(start, cameras, targets, settings("frozen", passes=3))
+    frozen = fitted(start, cameras, targets, settings("frozen", 3))
     assert plain.gaussians == frozen.gaussians
     assert plain.losses == frozen.losses
     assert np.array_equal(plain.gaussians.means, start.means)
@@ -106,12 +100,12 @@ def test_one_step_is_natural_on_the_gradient_of_the_objective(cameras, targets, 
     start, rng = ball(0.02), np.random.default_rng(1)
     for _ in range(2):
         begun = ball(0.02 + 0.01 * rng.standard_normal(N))
-        train = settings(means, 0.002, passes=1)
+        train = settings(means, 1, 0.002)
         goal = objective(begun, cameras[:1], targets[:1], start, LAM, None, means, normals())
         model = as_drjit(begun)
         g, d = (np.asarray(part(model)[-1]) for part in (goal.gradient, goal.diagonal))
         expected = np.clip(-0.1 * g / (4 * d), -0.002, 0.002)
-        moved = fitted(start, cameras[:1], targets[:1], train, begun).gaussians
+        moved = fitted(begun, cameras[:1], targets[:1], train, start).gaussians
         step = moved.means.astype(np.float64) - begun.means
         if means == "normal":
             along = (step * normals()).sum(1)
@@ -127,7 +121,7 @@ def test_displaced_means_move_back_to_the_surface(cameras, targets, means):
     offsets = 0.4 * SPACING * np.random.default_rng(3).standard_normal(N)
     start = ball(offsets)
     frozen, moved = (
-        fitted(start, cameras, targets, settings(mode, passes=10)) for mode in ("frozen", means)
+        fitted(start, cameras, targets, settings(mode, 10)) for mode in ("frozen", means)
     )
     seen = sum(fisher(start, camera)[:, 0] for camera in cameras) > 0.3
     assert seen.sum() > 0.8 * N
@@ -241,17 +235,13 @@ def test_policies_choose_with_learned_means(files, tmp_path, policy):
     assert np.isfinite(state.steps[1]["score"])
 
 
-def test_means_that_changed_since_the_start_are_one_line(files, whole, capsys):
+def test_means_that_changed_since_the_start_are_one_line(whole, tmp_path, capsys):
     means, out, _ = whole
-    text = (out / "config.json").read_text()
-    changed = json.loads(text)
-    changed["settings"]["train"]["means"] = "free" if means == "normal" else "frozen"
-    try:
-        (out / "config.json").write_text(json.dumps(changed))
-        said = refused(capsys, ["nbv", "--resume", out], out)
-    finally:
-        (out / "config.json").write_text(text)
-    assert f"settings.train.means has changed since {out} was started; restore it" in said
+    run = shutil.copytree(out, tmp_path / "run")
+    train = run_folder.open_run(run).settings.train.model_dump(mode="json")
+    change_settings(run, train=train | {"means": "free" if means == "normal" else "frozen"})
+    said = refused(capsys, ["nbv", "--resume", run], run)
+    assert f"settings.train.means has changed since {run} was started; restore it" in said
 
 
 def test_diagnostics_and_viewer_read_such_a_run(files, whole):
