@@ -1,0 +1,334 @@
+"""Gradients and tangents of images against the float64 reference, judged as vectors by the relative
+L2 error, and against one another. Scenes have no pixel near a threshold, where no derivative
+exists.
+"""
+
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mgs.errors import InputError
+from mgs.gaussians import ARRAYS
+from mgs.splat import Image, as_drjit, jvp, reference, render
+from mgs.splat.rendering import composite_channels, splats_and_lists
+
+from .scenes import (
+    calm,
+    changed,
+    double,
+    gradients_of,
+    make_camera,
+    make_clamped,
+    make_gaussians,
+    margins,
+    relative_error,
+    with_gradients,
+)
+
+BACKGROUND = (0.3, 0.6, 0.1)
+OUTPUTS = ("rgb", "alpha", "depth")
+GRADIENT, TANGENT = 1e-4, 1e-5
+"""Tolerances."""
+
+
+@cache
+def case(degree: int):
+    """(gaussians, camera). Of even degrees not antialiased, so that alphas are clamped."""
+    camera, antialiased = make_camera(), degree % 2 == 1
+    gaussians = calm(lambda seed: make_clamped(seed, degree, 10, antialiased), camera, 30 + degree)
+    clamped = reference.composite(reference.project(gaussians, camera), camera)[3]
+    assert clamped.any() or antialiased
+    return gaussians, camera
+
+
+def image_weights(camera, seed=0) -> dict[str, np.ndarray]:
+    """Random gradients of a loss by each output image."""
+    rng, shape = np.random.default_rng([seed, 99]), (camera.height, camera.width)
+    sizes = {"rgb": (*shape, 3), "alpha": shape, "depth": shape}
+    return {name: rng.normal(0, 1, size) for name, size in sizes.items()}
+
+
+def gradients(gaussians, camera, weights, wanted=ARRAYS) -> dict[str, np.ndarray]:
+    """Gradient of sum(weight * image), summed over the outputs, by `dr.backward`."""
+    model = with_gradients(gaussians, wanted)
+    image = render(model, camera, BACKGROUND)
+    weights = {name: mi.TensorXf(w.astype(np.float32)) for name, w in weights.items()}
+    dr.backward(sum(dr.sum(getattr(image, name) * w, axis=None) for name, w in weights.items()))
+    return gradients_of(model, wanted)
+
+
+def random_tangents(gaussians, seed=0, names=ARRAYS) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng([seed, 7])
+    shapes = {name: getattr(gaussians, name).shape for name in names}
+    return {name: rng.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
+
+
+def images(image) -> dict[str, np.ndarray]:
+    return {name: np.asarray(getattr(image, name)) for name in OUTPUTS}
+
+
+def difference(gaussians, tangents, camera, step=1e-6) -> dict[str, np.ndarray]:
+    """Derivative of the reference's images along the tangents, by a central difference."""
+    ends = []
+    for sign in (+1, -1):
+        moved = double(gaussians)
+        for name, tangent in tangents.items():
+            setattr(moved, name, getattr(moved, name) + sign * step * tangent.astype(np.float64))
+        ends.append(reference.render(moved, camera, BACKGROUND))
+    return {name: (ends[0][name] - ends[1][name]) / (2 * step) for name in OUTPUTS}
+
+
+def gradient_differences(gaussians, camera, weights, wanted) -> dict[str, np.ndarray]:
+    """{parameter: [3 outputs, shape of the parameter]} by central differences."""
+    result = {}
+    for name in wanted:
+        shape = getattr(gaussians, name).shape
+        result[name] = np.zeros((len(OUTPUTS), *shape))
+        for index in np.ndindex(shape):
+            unit = np.zeros(shape)
+            unit[index] = 1
+            change = difference(gaussians, {name: unit}, camera)
+            sums = [(change[output] * weights[output]).sum() for output in OUTPUTS]
+            result[name][(slice(None), *index)] = sums
+    return result
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_gradients_of_each_output(degree):
+    gaussians, camera = case(degree)
+    weights = image_weights(camera, degree)
+    expected = gradient_differences(gaussians, camera, weights, ARRAYS)
+    for i, output in enumerate(OUTPUTS):
+        wanted = ARRAYS if output == "rgb" else ARRAYS[:4]  # no colour changes alpha or depth
+        found = gradients(gaussians, camera, {output: weights[output]}, wanted)
+        for name in wanted:
+            assert relative_error(found[name], expected[name][i]) < GRADIENT / 2, (output, name)
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_gradient_of_the_depth_of_faint_splats(seed):
+    """Expected depth is a quotient by alpha, here a few 1/255."""
+    camera = make_camera()
+    gaussians = make_gaussians(5, seed, logits=(-3, -1))
+    assert margins(gaussians, camera).min() > 1e-3
+    weights = image_weights(camera, seed)
+    wanted = ARRAYS[:4]
+    found = gradients(gaussians, camera, {"depth": weights["depth"]}, wanted)
+    expected = gradient_differences(gaussians, camera, weights, wanted)
+    for name in wanted:
+        assert relative_error(found[name], expected[name][OUTPUTS.index("depth")]) < GRADIENT, name
+
+
+LOSSES = {
+    "a part of alpha": lambda image: image.alpha[10:20, 5:30],
+    "columns of alpha": lambda image: dr.square(dr.sum(image.alpha, axis=0)),
+    "alpha times rgb": lambda image: image.alpha[..., None] * image.rgb,
+    "rgba": lambda image: dr.square(dr.concat([image.rgb, image.alpha[..., None]], axis=2)),
+    "columns of depth": lambda image: dr.square(dr.sum(image.depth, axis=0)),
+}
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_gradient_of_any_loss(loss):
+    """Losses that slice, join and reduce images, against the same loss in two steps."""
+    gaussians, camera = case(1)
+    model = with_gradients(gaussians, ["log_scales"])
+    image = render(model, camera, BACKGROUND)
+    leaf = Image(*(dr.copy(dr.detach(getattr(image, name))) for name in OUTPUTS))
+    dr.enable_grad(leaf)
+    dr.backward(dr.sum(LOSSES[loss](leaf), axis=None))
+    dr.backward(dr.sum(LOSSES[loss](image), axis=None))
+    weights = {name: np.asarray(dr.grad(getattr(leaf, name))) for name in OUTPUTS}
+    expected = gradients(gaussians, camera, weights, ("log_scales",))["log_scales"]
+    assert relative_error(gradients_of(model, ["log_scales"])["log_scales"], expected) < 1e-5
+
+
+@pytest.mark.parametrize("means", [False, True])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_some_channels_alone_have_the_same_image_and_derivatives(means, channels):
+    """`composite_channels` against `render` over black."""
+    camera, gaussians = make_camera(), make_gaussians(60, 3, 1, log_scales=(-5.0, -1.5))
+    weights = image_weights(camera)
+    weights = np.dstack([weights["rgb"], weights["alpha"]])[..., :channels].astype(np.float32)
+    wanted = ARRAYS if means else ARRAYS[1:]
+
+    def alone(model):
+        splats, lists, packed = splats_and_lists(model, camera, None)
+        return composite_channels(splats, packed, lists, camera.width, camera.height, channels)
+
+    def together(model):
+        image = render(model, camera)
+        rgba = mi.Vector4f(*mi.Color3f(dr.unravel(mi.Color3f, image.rgb.array)), image.alpha.array)
+        shape = (camera.height, camera.width, 4)
+        return image.rgb if channels == 3 else mi.TensorXf(dr.ravel(rgba), shape)
+
+    def derivatives(draw):
+        """Image, tangent along the parameters' own values, and gradients by them."""
+        model = with_gradients(gaussians, wanted)
+        for name in wanted:
+            dr.set_grad(getattr(model, name), getattr(gaussians, name))
+        rgb = draw(model)
+        dr.forward_to(rgb)
+        results = [dr.detach(rgb), dr.grad(rgb)]
+        model = with_gradients(gaussians, wanted)
+        dr.backward(dr.sum(draw(model) * mi.TensorXf(weights), axis=None))
+        return [np.asarray(r) for r in (*results, *gradients_of(model, wanted).values())]
+
+    expected, found = derivatives(together), derivatives(alone)
+    np.testing.assert_array_equal(found[0][..., :3], expected[0][..., :3])
+    assert np.abs(found[0] - expected[0]).max() < 1e-6  # alpha: 1 - T, not the sum of weights
+    for name, a, b in zip(("tangent", *wanted), found[1:], expected[1:], strict=True):
+        assert relative_error(a, b) < 1e-5, name
+
+
+def test_gradient_stops_where_a_scale_is_clamped():
+    gaussians, camera = case(1)
+    scales = gaussians.log_scales.copy()
+    scales[2, 1], scales[4, 0] = -30, 30
+    found = gradients(changed(gaussians, log_scales=scales), camera, image_weights(camera))
+    assert found["log_scales"][2, 1] == found["log_scales"][4, 0] == 0
+    assert all(np.isfinite(g).all() for g in found.values())
+
+
+@settings(derandomize=True, deadline=None, max_examples=10)
+@given(
+    seed=st.integers(0, 2**31),
+    degree=st.integers(0, 3),
+    scale=st.floats(-5, -0.5),
+    stretch=st.floats(0.1, 4),
+    logit=st.floats(-2, 10),
+    focal=st.floats(20, 80),
+    antialiased=st.booleans(),
+)
+def test_gradient_for_any_scene(seed, degree, scale, stretch, logit, focal, antialiased):
+    camera, style = make_camera(focal=focal), {"antialiased": antialiased}
+    style |= {"log_scales": (scale - stretch, scale), "logits": (logit - 4, logit)}
+    gaussians = calm(lambda s: make_gaussians(10, s, degree, **style), camera, seed)
+    weights = {"rgb": image_weights(camera, seed)["rgb"]}
+    J = reference.jacobian(gaussians, camera, BACKGROUND)
+    expected = np.tensordot(weights["rgb"].reshape(-1, 3), J, axes=([0, 1], [0, 1]))
+    found = gradients(gaussians, camera, weights, ARRAYS[1:])
+    K = 3 * (degree + 1) ** 2
+    parts = np.split(expected, (K, K + 3, K + 7), axis=1)
+    for name, part in zip(("sh", *ARRAYS[1:4]), parts, strict=True):
+        error = np.linalg.norm(found[name].reshape(10, -1) - part)
+        assert error < GRADIENT * np.linalg.norm(part) + 1e-12, name
+
+
+def assert_as_differences(gaussians, tangents, camera) -> None:
+    found = images(jvp(gaussians, tangents, camera, BACKGROUND))
+    expected = difference(gaussians, tangents, camera)
+    for output in OUTPUTS:
+        assert found[output].shape == expected[output].shape
+        assert relative_error(found[output], expected[output]) < TANGENT, output
+
+
+@pytest.mark.parametrize("names", [ARRAYS, *((name,) for name in ARRAYS[:4])])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_all_images_change_as_differences_say(degree, names):
+    gaussians, camera = case(degree)
+    assert_as_differences(gaussians, random_tangents(gaussians, 10 + degree, names), camera)
+
+
+@settings(derandomize=True, deadline=None, max_examples=20)
+@given(
+    seed=st.integers(0, 2**31),
+    degree=st.integers(0, 3),
+    scale=st.floats(-5, -0.5),
+    stretch=st.floats(0.1, 4),
+    logit=st.floats(-2, 10),
+    names=st.sets(st.sampled_from(ARRAYS), min_size=1),
+    antialiased=st.booleans(),
+)
+def test_tangents_and_gradients_are_of_one_jacobian(
+    seed, degree, scale, stretch, logit, names, antialiased
+):
+    """<u, J v> = <J^T u, v> for images u and tangents v: forward and reverse mode are two different
+    kernels."""
+    camera, style = make_camera(), {"antialiased": antialiased}
+    style |= {"log_scales": (scale - stretch, scale), "logits": (logit - 4, logit)}
+    gaussians = make_gaussians(12, seed, degree, **style)
+    tangents = random_tangents(gaussians, seed, sorted(names))
+    u = image_weights(camera, seed)
+    Jv = images(jvp(gaussians, tangents, camera, BACKGROUND))
+    JTu = gradients(gaussians, camera, u, tuple(tangents))
+    forward = sum(float((Jv[name] * u[name]).sum(dtype=np.float64)) for name in OUTPUTS)
+    reverse = sum(float((JTu[name] * tangents[name]).sum(dtype=np.float64)) for name in tangents)
+    squares = [sum((image[n].astype(float) ** 2).sum() for n in OUTPUTS) for image in (Jv, u)]
+    assert abs(forward - reverse) <= 1e-6 * np.sqrt(squares[0] * squares[1])
+
+
+def test_forward_mode_of_drjit_through_render():
+    """`dr.forward` from a number t that moves parameters and background."""
+    gaussians, camera = case(1)
+    tangents = random_tangents(gaussians)
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    model = as_drjit(gaussians)
+    for name in ARRAYS:
+        setattr(model, name, getattr(model, name) + t * mi.TensorXf(tangents[name]))
+    change = np.array([0.5, -1, 2], np.float32)
+    image = render(model, camera, mi.Color3f(*BACKGROUND) + t * mi.Color3f(*change.tolist()))
+    dr.forward(t)
+    found, expected = images(dr.grad(image)), images(jvp(gaussians, tangents, camera, BACKGROUND))
+    expected["rgb"] = expected["rgb"] + (1 - np.asarray(dr.detach(image.alpha)))[..., None] * change
+    for output in OUTPUTS:
+        np.testing.assert_allclose(found[output], expected[output], rtol=1e-5, atol=1e-5)
+        assert np.abs(found[output]).max() > 1
+
+
+def test_enabled_gradients_and_suspended_ones_play_no_part():
+    gaussians, camera = case(0)
+    tangents = random_tangents(gaussians)
+    expected = images(jvp(gaussians, tangents, camera, BACKGROUND))
+    model = with_gradients(gaussians, ["sh"])
+    background = mi.Color3f(*BACKGROUND)
+    dr.enable_grad(background)
+    dr.set_grad(background, 1)
+    with dr.suspend_grad():
+        tensors = {name: mi.TensorXf(value) for name, value in tangents.items()}
+        found = jvp(model, tensors, camera, background)
+    assert not dr.grad_enabled(found)
+    assert not np.any(dr.grad(model.sh))
+    for output in OUTPUTS:
+        np.testing.assert_array_equal(images(found)[output], expected[output])
+
+
+def test_what_is_not_named_does_not_change():
+    gaussians, camera = case(1)
+    for tangents in ({}, {"sh": np.zeros_like(gaussians.sh)}):
+        for change in images(jvp(gaussians, tangents, camera, BACKGROUND)).values():
+            assert not change.any()
+    by_colour = images(jvp(gaussians, random_tangents(gaussians, names=["sh"]), camera))
+    assert by_colour["rgb"].any()
+    assert not by_colour["alpha"].any()
+    assert not by_colour["depth"].any()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (9, 5), (150, 70)])
+def test_any_image_size(size):
+    """Several tiles, too, and images whose last blocks reach beyond the edge."""
+    camera = make_camera(size, focal=0.8 * max(size))
+    gaussians = calm(lambda seed: make_gaussians(16, seed, log_scales=(-4.0, -1.5)), camera, 3)
+    assert_as_differences(gaussians, random_tangents(gaussians), camera)
+
+
+@pytest.mark.parametrize(
+    ("tangents", "message"),
+    [
+        ({"scales": np.zeros((10, 3))}, "'scales' is no parameter; choose from means, log_scales"),
+        ({"quats": np.zeros((10, 3))}, r"quats has shape \(10, 3\), expected \(10, 4\), that of"),
+        ({"means": "north"}, "means must be numbers of the parameter's shape"),
+        ({"means": np.full((10, 3), 1e39)}, "means is NaN or infinite, first at Gaussian 0; rem"),
+    ],
+)
+def test_bad_tangents_are_one_line(tangents, message):
+    gaussians, camera = case(0)
+    with pytest.raises(InputError, match=message) as error:
+        jvp(gaussians, tangents, camera)
+    assert "\n" not in str(error.value)
