@@ -35,11 +35,6 @@ def projected(gaussians, camera):
     return splats
 
 
-def lists_of(gaussians, camera):
-    splats = projected(gaussians, camera)
-    return build(splats, camera.width, camera.height), splats
-
-
 def pairs_of(lists) -> set[tuple[int, int]]:
     """{(splat, block)}."""
     place, splat, block, start, end = (
@@ -67,7 +62,8 @@ def needed_pairs(gaussians, camera) -> set[tuple[int, int]]:
 def test_lists_hold_every_pair_and_little_more(seed, scales):
     """For small splats, needles and splats as large as the image."""
     camera, g = make_camera(), make_gaussians(60, seed, log_scales=scales)
-    needed, listed = needed_pairs(g, camera), pairs_of(lists_of(g, camera)[0])
+    needed = needed_pairs(g, camera)
+    listed = pairs_of(build(projected(g, camera), camera.width, camera.height))
     assert needed <= listed
     assert len(listed) < 1.25 * len(needed)
 
@@ -152,24 +148,19 @@ def test_stale_lists_never_change_an_image(names, seed, drift, teleport):
         g = changed(g, **values)
 
 
-def test_lists_are_reused_until_a_footprint_changes(monkeypatch):
-    """Colours change no list; scales do, but only means change the depth order."""
+def test_lists_are_reused_until_a_footprint_changes():
     camera, g, cache = make_camera(), make_gaussians(60, 3), ListCache()
-    sorts = []
-    monkeypatch.setattr(blocks, "depth_order", lambda depth: sorts.append(1) or depth_order(depth))
 
     def see(**values):
         render(changed(g, **values), camera, cache=cache)
-        return cache.builds, len(sorts)
+        return cache.builds
 
     larger = g.log_scales + np.float32(0.01)
-    assert [see(), see(), see(sh=g.sh + 1)] == [(1, 1)] * 3
-    assert [see(log_scales=larger), see(log_scales=larger, sh=g.sh + 1)] == [(2, 1)] * 2
+    assert [see(), see(), see(sh=g.sh + 1)] == [1, 1, 1]
+    assert [see(log_scales=larger), see(log_scales=larger, sh=g.sh + 1)] == [2, 2]
     fisher(changed(g, log_scales=larger), camera, cache=cache)
-    assert cache.builds == 2
-    assert see(logit_opacities=g.logit_opacities - 1, log_scales=larger) == (3, 1)
-    assert see(means=g.means + np.float32(0.01)) == (4, 2)
-    assert see() == (5, 3)
+    assert see(logit_opacities=g.logit_opacities - 1, log_scales=larger) == 3
+    assert see(means=g.means + np.float32(0.01)) == 4
 
 
 def test_each_camera_and_number_of_gaussians_has_its_own_lists():

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from mgs.errors import InputError
 from mgs.gaussians import ARRAYS
 from mgs.splat import Image, as_drjit, jvp, reference, render
-from mgs.splat.rendering import composite_channels, splats_and_lists
 
 from .scenes import (
     calm,
@@ -126,8 +125,6 @@ def test_gradient_of_the_depth_of_faint_splats(seed):
 
 LOSSES = {
     "a part of alpha": lambda image: image.alpha[10:20, 5:30],
-    "columns of alpha": lambda image: dr.square(dr.sum(image.alpha, axis=0)),
-    "alpha times rgb": lambda image: image.alpha[..., None] * image.rgb,
     "rgba": lambda image: dr.square(dr.concat([image.rgb, image.alpha[..., None]], axis=2)),
     "columns of depth": lambda image: dr.square(dr.sum(image.depth, axis=0)),
 }
@@ -146,44 +143,6 @@ def test_gradient_of_any_loss(loss):
     weights = {name: np.asarray(dr.grad(getattr(leaf, name))) for name in OUTPUTS}
     expected = gradients(gaussians, camera, weights, ("log_scales",))["log_scales"]
     assert relative_error(gradients_of(model, ["log_scales"])["log_scales"], expected) < 1e-5
-
-
-@pytest.mark.parametrize("means", [False, True])
-@pytest.mark.parametrize("channels", [3, 4])
-def test_some_channels_alone_have_the_same_image_and_derivatives(means, channels):
-    """`composite_channels` against `render` over black."""
-    camera, gaussians = make_camera(), make_gaussians(60, 3, 1, log_scales=(-5.0, -1.5))
-    weights = image_weights(camera)
-    weights = np.dstack([weights["rgb"], weights["alpha"]])[..., :channels].astype(np.float32)
-    wanted = ARRAYS if means else ARRAYS[1:]
-
-    def alone(model):
-        splats, lists, packed = splats_and_lists(model, camera, None)
-        return composite_channels(splats, packed, lists, camera.width, camera.height, channels)
-
-    def together(model):
-        image = render(model, camera)
-        rgba = mi.Vector4f(*mi.Color3f(dr.unravel(mi.Color3f, image.rgb.array)), image.alpha.array)
-        shape = (camera.height, camera.width, 4)
-        return image.rgb if channels == 3 else mi.TensorXf(dr.ravel(rgba), shape)
-
-    def derivatives(draw):
-        """Image, tangent along the parameters' own values, and gradients by them."""
-        model = with_gradients(gaussians, wanted)
-        for name in wanted:
-            dr.set_grad(getattr(model, name), getattr(gaussians, name))
-        rgb = draw(model)
-        dr.forward_to(rgb)
-        results = [dr.detach(rgb), dr.grad(rgb)]
-        model = with_gradients(gaussians, wanted)
-        dr.backward(dr.sum(draw(model) * mi.TensorXf(weights), axis=None))
-        return [np.asarray(r) for r in (*results, *gradients_of(model, wanted).values())]
-
-    expected, found = derivatives(together), derivatives(alone)
-    np.testing.assert_array_equal(found[0][..., :3], expected[0][..., :3])
-    assert np.abs(found[0] - expected[0]).max() < 1e-6  # alpha: 1 - T, not the sum of weights
-    for name, a, b in zip(("tangent", *wanted), found[1:], expected[1:], strict=True):
-        assert relative_error(a, b) < 1e-5, name
 
 
 def test_gradient_stops_where_a_scale_is_clamped():
@@ -304,10 +263,6 @@ def test_what_is_not_named_does_not_change():
     for tangents in ({}, {"sh": np.zeros_like(gaussians.sh)}):
         for change in images(jvp(gaussians, tangents, camera, BACKGROUND)).values():
             assert not change.any()
-    by_colour = images(jvp(gaussians, random_tangents(gaussians, names=["sh"]), camera))
-    assert by_colour["rgb"].any()
-    assert not by_colour["alpha"].any()
-    assert not by_colour["depth"].any()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (9, 5), (150, 70)])

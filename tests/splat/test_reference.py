@@ -1,7 +1,5 @@
 """The reference itself: camera convention, projection, derivatives against central differences."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -16,18 +14,6 @@ from .scenes import calm, double, make_camera, make_gaussians, parameter_columns
 BACKGROUND = (0.2, 0.7, 0.4)
 
 
-def single(mean, **values) -> Gaussians:
-    """One round, nearly opaque white Gaussian."""
-    one = Gaussians(
-        np.asarray(mean, np.float64)[None],
-        np.full((1, 3), -3.0),
-        np.array([[1.0, 0, 0, 0]]),
-        np.array([3.0]),
-        np.full((1, 1, 3), 0.5 / SH_C0),
-    )
-    return replace(one, **values)
-
-
 @pytest.mark.parametrize(
     ("pixel", "depth"), [((11.5, 8.5), 1.5), ((33.0, 20.25), 2.5), ((22.5, 13.5), 4.0)]
 )
@@ -35,7 +21,15 @@ def test_gaussian_lands_on_the_pixel_of_the_camera(pixel, depth):
     camera = make_camera()
     mean = place(camera, [pixel], [depth])[0]
     np.testing.assert_allclose(camera.project([mean])[0][0], pixel, atol=1e-9)
-    image = reference.render(single(mean), camera)
+    white = 0.5 / SH_C0
+    g = Gaussians(
+        mean[None],
+        np.full((1, 3), -3.0),
+        np.array([[1.0, 0, 0, 0]]),
+        np.array([3.0]),
+        np.full((1, 1, 3), white),
+    )
+    image = reference.render(g, camera)
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     weight = image["alpha"] / image["alpha"].sum()
     assert abs((weight * u).sum() - pixel[0]) < 0.05
