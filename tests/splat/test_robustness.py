@@ -27,6 +27,7 @@ from .scenes import (
     relative_error,
     with_gradients,
 )
+from .test_render import errors
 
 BACKGROUND = (0.2, 0.5, 0.7)
 CAMERA = make_camera()
@@ -87,6 +88,7 @@ CASES = {
     "quaternions of norm 1e-9": lambda: scene(quats=scene().quats * 1e-9),
     "quaternions of norm 1e30": lambda: scene(quats=scene().quats * 1e30),
     "black": lambda: scene(sh=np.full((N, 1, 3), -100.0)),
+    "one": lambda: make_gaussians(1, 3, spread=0.1, log_scales=(-2, -1), logits=(1, 2)),
     "all at one place": lambda: scene(means=np.zeros((N, 3))),
 }
 
@@ -102,18 +104,10 @@ def gradients(gaussians, camera) -> dict[str, np.ndarray]:
 def assert_right(gaussians, camera, quats: bool = True) -> None:
     """Image and Fisher information as the reference has them; gradients, tangents, and information
     of means finite. quats=False: without the columns of quaternions."""
-    image = render(gaussians, camera, BACKGROUND)
     with np.errstate(all="ignore"):
-        truth = reference.render(gaussians, camera, BACKGROUND)
-        assert margins(gaussians, camera).min() > 1e-4
-    for name in ("rgb", "alpha"):
-        found = np.asarray(getattr(image, name))
-        assert np.isfinite(found).all(), name
-        assert np.abs(found - truth[name]).max() < 2e-5, name
-    depth = np.asarray(image.depth)
-    assert np.isfinite(depth).all()
-    error = np.abs(depth - truth["depth"]) * truth["alpha"] / max(1, truth["depth"].max())
-    assert error.max() < 2e-5
+        error, _ = errors(gaussians, camera, BACKGROUND)
+        expected = reference.fisher_block(gaussians, camera, BACKGROUND)
+    assert error.max() <= 1
     for name, gradient in gradients(gaussians, camera).items():
         assert np.isfinite(gradient).all(), f"gradient of {name}"
     tangents = {name: np.ones_like(getattr(gaussians, name)) for name in ARRAYS}
@@ -122,10 +116,7 @@ def assert_right(gaussians, camera, quats: bool = True) -> None:
     for estimator in ("exact", "block"):
         found = fisher(gaussians, camera, estimator, means="free", alpha_weight=1.0)
         assert np.isfinite(found).all()
-    with np.errstate(all="ignore"):
-        expected = reference.fisher_block(gaussians, camera, BACKGROUND)
     found, blocks = (fisher(gaussians, camera, e, BACKGROUND) for e in ("exact", "block"))
-    assert np.isfinite(found).all()
     assert np.isfinite(blocks).all()
     assert (found >= 0).all()
     diagonal = np.einsum("nii->ni", expected)
@@ -157,11 +148,7 @@ def test_needles_across_a_large_image(seed):
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 30), (30, 1), (8, 4), (33, 17)])
 def test_any_image_size(size):
-    camera = make_camera(size, focal=0.8 * max(size))
-    assert_right(scene(2), camera)
-    shape = size[::-1]
-    image = render(scene(2), camera)
-    assert (image.rgb.shape, image.alpha.shape, image.depth.shape) == ((*shape, 3), shape, shape)
+    assert_right(scene(2), make_camera(size, focal=0.8 * max(size)))
 
 
 def test_image_sizes_may_be_numpys_integers_and_are_whole():
@@ -170,10 +157,6 @@ def test_image_sizes_may_be_numpys_integers_and_are_whole():
     np.testing.assert_array_equal(render(scene(2), counted).rgb, render(scene(2), camera).rgb)
     with pytest.raises(InputError, match="must be whole pixels"):
         Camera(camera.K, 45.5, 31, camera.world_to_camera)
-
-
-def test_one_gaussian():
-    assert_right(make_gaussians(1, 3, spread=0.1, log_scales=(-2, -1), logits=(1, 2)), CAMERA)
 
 
 @pytest.mark.parametrize("degree", [0, 3])
