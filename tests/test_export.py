@@ -119,10 +119,9 @@ def test_the_command_converts_and_keeps_what_is_there(tmp_path, capsys):
     assert "is there already" in refused(capsys, given, tmp_path)
 
 
-def glb(content: object, body: bytes = b"") -> bytes:
+def glb(content: object) -> bytes:
     text = json.dumps(content).encode()
-    chunk = struct.pack("<II", len(text), 0x4E4F534A) + text
-    return struct.pack("<4sII", b"glTF", 2, 0) + chunk + struct.pack("<II", len(body), 0x4E4942)
+    return struct.pack("<4sIIII", b"glTF", 2, 0, len(text), 0x4E4F534A) + text
 
 
 SPLATS = {"mode": 0, "attributes": {}, "extensions": {"KHR_gaussian_splatting": {}}}

@@ -94,8 +94,8 @@ def test_error_at_the_edge_of_a_large_image(centre):
         assert error[decided].max() <= 1
 
 
-def stack(camera, opacities, rgb=1.0) -> Gaussians:
-    """Round Gaussians one behind the other, all centred on the middle of pixel (20, 12)."""
+def stack(camera, opacities) -> Gaussians:
+    """Round white Gaussians one behind the other, all centred on the middle of pixel (20, 12)."""
     n = len(opacities)
     opacities = np.asarray(opacities, np.float64)
     return Gaussians(
@@ -103,7 +103,7 @@ def stack(camera, opacities, rgb=1.0) -> Gaussians:
         np.full((n, 3), -2.0, np.float32),
         np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
         np.log(opacities / (1 - opacities)).astype(np.float32),
-        np.full((n, 1, 3), (rgb - 0.5) / SH_C0, np.float32),
+        np.full((n, 1, 3), 0.5 / SH_C0, np.float32),
         antialiased=False,
     )
 
