@@ -13,7 +13,7 @@ import numpy as np
 
 from mgs.camera import Camera, look_at
 from mgs.gaussians import ARRAYS, Gaussians
-from mgs.splat import as_drjit
+from mgs.splat import as_drjit, reference
 from mgs.splat.reference import margins
 
 SIZE = (45, 27)
@@ -79,6 +79,18 @@ def double(gaussians: Gaussians) -> Gaussians:
     return gaussians.map(lambda array: np.array(array, np.float64))
 
 
+def difference(gaussians, tangents, camera, background, step=1e-6) -> dict[str, np.ndarray]:
+    """Derivative of the reference's images along tangents of parameters, by a central
+    difference."""
+    ends = []
+    for sign in (+1, -1):
+        moved = double(gaussians)
+        for name, tangent in tangents.items():
+            setattr(moved, name, getattr(moved, name) + sign * step * tangent.astype(np.float64))
+        ends.append(reference.render(moved, camera, background))
+    return {name: (ends[0][name] - ends[1][name]) / (2 * step) for name in ends[0]}
+
+
 def changed(gaussians: Gaussians, **values) -> Gaussians:
     """The Gaussians with some parameters replaced."""
     single = {name: np.asarray(value, np.float32) for name, value in values.items()}
@@ -96,13 +108,6 @@ def with_gradients(gaussians: Gaussians, names=ARRAYS) -> Gaussians:
 
 def gradients_of(model: Gaussians, names=ARRAYS) -> dict[str, np.ndarray]:
     return {name: np.asarray(dr.grad(getattr(model, name))) for name in names}
-
-
-def parameter_columns(degree: int) -> list[tuple[str, tuple[int, ...]]]:
-    """(parameter, index) of each column of the Fisher information."""
-    columns = [("sh", (k, c)) for k in range((degree + 1) ** 2) for c in range(3)]
-    columns += [("log_scales", (i,)) for i in range(3)] + [("quats", (i,)) for i in range(4)]
-    return [*columns, ("logit_opacities", ())]
 
 
 @contextmanager

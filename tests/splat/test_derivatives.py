@@ -19,7 +19,7 @@ from mgs.splat import Image, as_drjit, jvp, reference, render
 from .scenes import (
     calm,
     changed,
-    double,
+    difference,
     gradients_of,
     make_camera,
     make_clamped,
@@ -71,17 +71,6 @@ def images(image) -> dict[str, np.ndarray]:
     return {name: np.asarray(getattr(image, name)) for name in OUTPUTS}
 
 
-def difference(gaussians, tangents, camera, step=1e-6) -> dict[str, np.ndarray]:
-    """Derivative of the reference's images along the tangents, by a central difference."""
-    ends = []
-    for sign in (+1, -1):
-        moved = double(gaussians)
-        for name, tangent in tangents.items():
-            setattr(moved, name, getattr(moved, name) + sign * step * tangent.astype(np.float64))
-        ends.append(reference.render(moved, camera, BACKGROUND))
-    return {name: (ends[0][name] - ends[1][name]) / (2 * step) for name in OUTPUTS}
-
-
 def gradient_differences(gaussians, camera, weights, wanted) -> dict[str, np.ndarray]:
     """{parameter: [3 outputs, shape of the parameter]} by central differences."""
     result = {}
@@ -91,7 +80,7 @@ def gradient_differences(gaussians, camera, weights, wanted) -> dict[str, np.nda
         for index in np.ndindex(shape):
             unit = np.zeros(shape)
             unit[index] = 1
-            change = difference(gaussians, {name: unit}, camera)
+            change = difference(gaussians, {name: unit}, camera, BACKGROUND)
             sums = [(change[output] * weights[output]).sum() for output in OUTPUTS]
             result[name][(slice(None), *index)] = sums
     return result
@@ -181,7 +170,7 @@ def test_gradient_for_any_scene(seed, degree, scale, stretch, logit, focal, anti
 
 def assert_as_differences(gaussians, tangents, camera) -> None:
     found = images(jvp(gaussians, tangents, camera, BACKGROUND))
-    expected = difference(gaussians, tangents, camera)
+    expected = difference(gaussians, tangents, camera, BACKGROUND)
     for output in OUTPUTS:
         assert found[output].shape == expected[output].shape
         assert relative_error(found[output], expected[output]) < TANGENT, output
