@@ -146,10 +146,9 @@ DEGREE = {"frozen": 0, "normal": 0, "free": 1}
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory):
+def files(tmp_path_factory, pristine):
     """A dataset and a prior on disk."""
-    root = tmp_path_factory.mktemp("means")
-    return tiny.write_dataset(root / "dataset"), tiny.write_prior(root / "prior")
+    return pristine, tiny.write_prior(tmp_path_factory.mktemp("means") / "prior")
 
 
 def options(files, means: str, **values):

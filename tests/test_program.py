@@ -31,8 +31,7 @@ def test_ctrl_c_while_modules_are_imported_is_one_line():
         assert (ended.returncode, ended.stderr) == (130, "mgs: interrupted\n")
 
 
-def test_a_damaged_model_is_restored_from_the_checkpoint(tmp_path, capsys):
-    dataset, prior = tiny.write_dataset(tmp_path / "dataset"), tiny.write_prior(tmp_path / "prior")
+def test_a_damaged_model_is_restored_from_the_checkpoint(dataset, prior, tmp_path, capsys):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     model, intact = run / "gaussians.ply", (run / "gaussians.ply").read_bytes()
     flipped = bytearray(intact)

@@ -11,22 +11,19 @@ from PIL import Image
 from program import command
 from refusals import refused
 
-from mgs.data.dataset import load_dataset
 from mgs.report import story
 from mgs.report.video import PATHS, camera_path, write_film
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(tmp_path_factory, pristine):
     root = tmp_path_factory.mktemp("film")
-    data, prior = tiny.write_dataset(root / "data"), tiny.write_prior(root / "prior")
-    return tiny.write_run(root / "run", data, prior)
+    return tiny.write_run(root / "run", pristine, tiny.write_prior(root / "prior"))
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_a_path_goes_around_the_object_and_looks_at_it(tmp_path, path):
-    dataset = load_dataset(tiny.write_dataset(tmp_path / "data"))
-    cameras = camera_path(dataset, np.zeros((5, 3)), (0, 0, 1), path, 48, 30)
+def test_a_path_goes_around_the_object_and_looks_at_it(loaded, path):
+    cameras = camera_path(loaded, np.zeros((5, 3)), (0, 0, 1), path, 48, 30)
     eyes = np.array([camera.position for camera in cameras])
     distances = np.linalg.norm(eyes, axis=1)
     np.testing.assert_allclose(distances, np.hypot(3, 1.5), rtol=0.05)
