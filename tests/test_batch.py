@@ -2,7 +2,7 @@
 
 import pytest
 import tiny
-from program import command, steps
+from program import steps
 from tiny import run
 
 from mgs.policy import criteria
@@ -92,15 +92,3 @@ def test_a_batch_ends_before_a_view_below_the_gain_limit(loaded, tmp_path):
     assert (ended["reason"], ended["views"]) == ("gain", len(state.taken) - 3)
     assert ended["information_gain"] < limit
     assert len(state.taken) < len(whole.taken)
-
-
-def test_lines_report_and_page_of_a_run_in_batches(dataset, prior, tmp_path, capsys):
-    out = tmp_path / "run"
-    options = ["--budget", "3", "--batch", "2", "--passes", "1", "--evaluate-every", "1"]
-    command("nbv", dataset, "--prior", prior, "--out", out, *options)
-    lines = [line for line in capsys.readouterr().out.splitlines() if ", coverage " in line]
-    assert [line.partition(":")[0] for line in lines] == ["step 0", "step 1", "step 2", "step 3"]
-    assert [" passes" in line for line in lines] == [True, False, True, True]
-    command("eval", out)
-    command("report", out, "--out", tmp_path / "report", "--html", tmp_path / "page.html")
-    assert len(list((tmp_path / "report").iterdir())) == 7

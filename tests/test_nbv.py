@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
-from program import steps, timeless
+from program import change_settings, steps, timeless
 from tiny import resume, run
 
 import mgs.data.frames
@@ -24,8 +24,8 @@ from mgs.fit.stopping import StopReason
 from mgs.policy import criteria
 from mgs.policy.poses import POSE_POLICIES
 from mgs.policy.registry import policy_names
-from mgs.run import ending, loop
 from mgs.run import folder as run_folder
+from mgs.run import loop
 from mgs.splat_ply import read_ply
 
 
@@ -41,11 +41,10 @@ def uninterrupted(dataset, tmp_path_factory):
     return run(out, dataset, seed=3), (out / "gaussians.ply").read_bytes(), steps(out)
 
 
-@pytest.mark.parametrize("batch", [1, 3])
-def test_views_are_the_best_at_the_model_and_given_the_batch_so_far(dataset, tmp_path, batch):
+def test_views_are_the_best_at_the_model_and_given_the_batch_so_far(dataset, tmp_path):
     """Every view has the largest gain, given the information of those before it at one model."""
     before = run(tmp_path / "seeds", dataset, budget=0)
-    state = run(tmp_path / "run", dataset, budget=batch, batch=batch)
+    state = run(tmp_path / "run", dataset, budget=3, batch=3)
     lam, taken = criteria.regularisation(tiny.GROUPS), list(before.taken)
 
     def information(model, views):
@@ -142,8 +141,8 @@ def test_a_run_reads_the_images_of_its_choices_and_writes_what_it_did(
     assert [count for _, count in at_choice] == [3, 4, 5, 6, 7]
     assert [seen for seen, _ in at_choice] == [set(names[:count]) for count in known]
     assert opened == set(names)
-    lines, chosen = steps(tmp_path / "run"), len(set(state.taken)) - 3
-    assert [line["step"] for line in lines] == list(range(chosen + 1)) == list(range(6))
+    lines = steps(tmp_path / "run")
+    assert [line["step"] for line in lines] == list(range(6))
     assert (lines[0]["seeds"], lines[0]["seed_names"]) == (state.taken[:3], names[:3])
     assert [line["frame"] for line in lines[1:]] == state.taken[3:]
     assert [line["name"] for line in lines[1:]] == names[3:]
@@ -151,7 +150,6 @@ def test_a_run_reads_the_images_of_its_choices_and_writes_what_it_did(
     fits = [(line["stop_reason"], line["iterations"]) for line in lines if "loss" in line]
     assert fits == [("settled", 7)] * (len(set(known)) + 1)
     assert {"capture", "fit", "information"} <= set(lines[-1]["seconds"])
-    assert "psnr" not in lines[1]
     config = json.loads((tmp_path / "run/config.json").read_text())
     assert config["settings"]["policy"] == policy
     assert {"mgs", "python", "mitsuba", "drjit", "numpy"} == set(config["versions"]) - {"commit"}
@@ -178,13 +176,6 @@ def test_random_depends_on_the_seed_only(dataset, tmp_path):
         for name, seed in {"a": 1, "b": 1, "c": 2}.items()
     )
     assert one == same != other
-
-
-def test_evaluation_is_logged_and_changes_nothing(dataset, tmp_path):
-    plain = run(tmp_path / "plain", dataset)
-    measured = run(tmp_path / "measured", dataset, evaluate_every=2)
-    assert ["psnr" in line for line in measured.steps] == [True, False, True, False, True, False]
-    assert measured.taken == plain.taken
 
 
 @pytest.mark.parametrize(
@@ -215,10 +206,10 @@ def test_a_killed_run_that_is_resumed_takes_the_same_views(
     assert not list(out.glob(".*"))
 
 
-@pytest.mark.parametrize(("batch", "fits", "kept"), [(1, 4, 3), (2, 2, 1), (2, 3, 3)])
+@pytest.mark.parametrize(("batch", "fits", "kept"), [(1, 4, 3), (2, 3, 3)])
 def test_an_interrupted_run_keeps_whole_batches(dataset, tmp_path, batch, fits, kept):
     """Interrupted in a fit, then resumed: the same views and model."""
-    whole = run(tmp_path / "whole", dataset, batch=batch)
+    run(tmp_path / "whole", dataset, batch=batch)
     calls = []
 
     def fit(*arguments):
@@ -231,7 +222,8 @@ def test_an_interrupted_run_keeps_whole_batches(dataset, tmp_path, batch, fits, 
     with pytest.raises(KeyboardInterrupt):
         run(out, dataset, tiny.operations(fit=fit), batch=batch)
     assert len(steps(out)) == kept
-    assert resume(out, dataset).taken == whole.taken
+    resume(out, dataset)
+    assert timeless(steps(out)) == timeless(steps(tmp_path / "whole"))
     assert (out / "gaussians.ply").read_bytes() == (tmp_path / "whole/gaussians.ply").read_bytes()
 
 
@@ -239,8 +231,6 @@ def test_an_interrupted_run_keeps_whole_batches(dataset, tmp_path, batch, fits, 
     ("images", "batch", "kept", "named"),
     [
         (3, 1, 0, "the fit to the seeds"),
-        (4, 1, 1, "the fit of step 1 .*step 0 is kept"),
-        (6, 1, 3, "steps 0 to 2 are kept"),
         (7, 2, 3, "the fit of step 4 diverged.*; steps 0 to 2 are kept"),
     ],
 )
@@ -260,34 +250,20 @@ def test_a_fit_that_diverges_ends_the_run_which_can_go_on(
     said = str(stop.value)
     assert "diverged: its loss was 0.0123 at the start, and 0.5, nan in the last passes" in said
     assert f"`train.rates` in {out / 'config.json'}" in said
-    assert f"mgs.resume_nbv('{out}')" in said
     assert "\n" not in said
     assert ((out / "steps.jsonl").exists() and len(steps(out))) == kept
-    whole = run(tmp_path / "whole", dataset, batch=batch)
-    assert resume(out, dataset).taken == whole.taken
+    run(tmp_path / "whole", dataset, batch=batch)
+    resume(out, dataset)
     assert (out / "gaussians.ply").read_bytes() == (tmp_path / "whole/gaussians.ply").read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("losses", "cure"),
-    [
-        ([0.01, 0.02], "; raise `train.passes`, or lower"),
-        ([0.01, math.nan], "passes; lower"),
-        ([0.01] + 5 * [0.02], "passes; lower"),
-    ],
-)
-def test_a_short_fit_that_diverges_may_need_more_passes(losses, cure):
-    assert cure in ending.diverged(Path("run"), 0, 0, losses)
-
-
-@pytest.mark.parametrize("batch", [1, 2])
-def test_a_choice_takes_the_seconds_of_its_policy(dataset, tmp_path, monkeypatch, batch):
+def test_a_choice_takes_the_seconds_of_its_policy(dataset, tmp_path, monkeypatch):
     def slow(candidates, taken, centre, rng):
         time.sleep(0.05)
         return rng.random(len(candidates))
 
     monkeypatch.setitem(POSE_POLICIES, "slow", slow)
-    state = run(tmp_path / "run", dataset, policy="slow", batch=batch, budget=2)
+    state = run(tmp_path / "run", dataset, policy="slow", batch=2, budget=2)
     assert all(step["seconds"]["score"] >= 0.05 for step in state.steps[1:])
 
 
@@ -302,10 +278,10 @@ def test_a_policy_that_returns_no_number_is_named(dataset, tmp_path, monkeypatch
 def test_a_run_of_other_frames_or_without_settings_is_named(dataset, tmp_path):
     out = tmp_path / "run"
     run(out, dataset, budget=0)
-    run_folder.check_same_frames(out, dataset)
-    other = load_dataset(tiny.write_dataset(tmp_path / "other", frames=5))
+    other = tiny.write_dataset(tmp_path / "other", frames=5)
+    change_settings(out, dataset=str(other))
     with pytest.raises(InputError, match="frames differ"):
-        run_folder.check_same_frames(out, other)
+        run_folder.open_run(out).dataset  # noqa: B018
     (out / "config.json").write_text("{}")
     with pytest.raises(InputError, match="no settings"):
         run_folder.open_run(out)

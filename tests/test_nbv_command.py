@@ -21,7 +21,6 @@ from mgs.fit.settings import ALPHA_WEIGHT, TrainSettings
 from mgs.images import write_png
 from mgs.policy import criteria
 from mgs.prior.build import load_prior, save_prior
-from mgs.report.runs import read_run
 from mgs.run import folder as run_folder
 from mgs.run import nbv
 from mgs.run.operations import psnr_measure
@@ -298,17 +297,6 @@ def test_files_of_a_run_know_how_it_draws(dataset, prior, tmp_path, antialiased)
     assert read_ply(tmp_path / "run/gaussians.ply").antialiased == antialiased
     state = run_folder.open_run(tmp_path / "run").state
     assert state.gaussians.antialiased == antialiased
-
-
-def test_a_run_of_a_policy_of_ones_own_can_be_read_without_it(loaded, tmp_path, monkeypatch):
-    run = tmp_path / "run"
-    mine = criteria.Criterion(lambda F, H, lam: float(F.sum()))
-    monkeypatch.setitem(criteria.CRITERIA, "mine", mine)
-    tiny.run(run, loaded, policy="mine", budget=1)
-    monkeypatch.undo()
-    assert read_run(run).policy == "mine"
-    with pytest.raises(InputError, match=r"^policy mine: unknown; choose one of d-optimal"):
-        tiny.resume(run, loaded)
 
 
 def test_steps_are_logged_for_tensorboard(dataset, prior, tmp_path):

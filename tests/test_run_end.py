@@ -13,7 +13,6 @@ from mgs.policy import criteria
 from mgs.report.page_facts import read_shown
 from mgs.report.runs import read_run
 from mgs.report.tables import markdown_table
-from mgs.run import folder as run_folder
 from mgs.run.ending import GAIN_UNIT, run_end, why_ended
 from mgs.run.settings import NbvSettings
 
@@ -67,42 +66,28 @@ def test_uncertainty_is_the_variance_left_over_that_of_the_prior():
     assert (criteria.uncertainty(H + 1e-6, lam) < criteria.uncertainty(H, lam)).all()
 
 
-def test_a_run_stops_before_a_view_whose_gain_is_below_the_limit(loaded, whole, tmp_path):
-    gains = [line["information_gain"] for line in whole.steps[1:]]
-    limit = (gains[1] + gains[2]) / 2
-    assert min(gains[:2]) > limit > gains[2]
-    fits = []
-
-    def fit(*arguments):
-        fits.append(1)
-        return tiny.fit(*arguments)
-
-    out = tmp_path / "run"
-    state = run(out, loaded, tiny.operations(fit=fit), stop_gain=limit)
-    assert state.taken == whole.taken[:5]
-    assert len(fits) == 3, "the seeds and two views"
-    name = loaded.frames[whole.taken[5]].name
-    ended = {"reason": "gain", "views": 2, "name": name}
-    ended |= {"information_gain": gains[2], "limit": limit}
-    lines = steps(out)
-    assert ["ended" in line for line in lines] == [False, False, True]
-    assert lines[-1]["ended"] == run_folder.read_checkpoint(out).steps[-1]["ended"] == ended
-    assert name not in state.inputs["files"]
-    assert whole.steps[-1]["ended"] == {"reason": "budget", "views": 5}
-
-
 @pytest.mark.parametrize("rule", ["stop_gain", "stop_uncertainty", "budget"])
 def test_a_run_that_ended_goes_on_only_when_its_rule_is_changed(loaded, whole, tmp_path, rule):
     two, three = whole.steps[2:4]
     assert two["uncertainty"] > three["uncertainty"]
-    value, changed, reason = {
-        "stop_gain": ((two["information_gain"] + three["information_gain"]) / 2, None, "gain"),
-        "stop_uncertainty": (two["uncertainty"], None, "uncertainty"),
-        "budget": (2, 5, "budget"),
+    limit = (two["information_gain"] + three["information_gain"]) / 2
+    next_view = {"name": three["name"], "information_gain": three["information_gain"]}
+    left = two["uncertainty"]
+    value, changed, ended = {
+        "stop_gain": (limit, None, {"reason": "gain", **next_view, "limit": limit}),
+        "stop_uncertainty": (
+            left,
+            None,
+            {"reason": "uncertainty", "uncertainty": left, "limit": left},
+        ),
+        "budget": (2, 5, {"reason": "budget"}),
     }[rule]
     out = tmp_path / "run"
     state = run(out, loaded, **{rule: value})
-    assert (len(state.taken), state.steps[-1]["ended"]["reason"]) == (5, reason)
+    assert state.taken == whole.taken[:5]
+    assert "ended" not in state.steps[-2]
+    assert state.steps[-1]["ended"] == {"views": 2, **ended}
+    assert three["name"] not in state.inputs["files"], "the image of a view that was refused"
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     again = resume(out, loaded, tiny.operations(fit=never, fisher=never))
     assert again.taken == state.taken
@@ -130,7 +115,9 @@ def test_one_line_says_why_a_run_ended(dataset, prior, tmp_path, capsys):
     line = f"the run has ended: {next_view}, {gain}, less than --stop-gain 1000"
     assert shown.count(line) == 1
     assert mgs("nbv", "--resume", early).count(line) == 1
-    mgs(*start, "--out", whole, "--policy", "random")
+    shown = mgs(*start, "--out", whole, "--policy", "random", "--batch", "2")
+    lines = [line for line in shown.splitlines() if ", coverage " in line]
+    assert [" passes" in line for line in lines] == [True, False, True]
     for out in runs:
         mgs("eval", out)
     shown = mgs("report", *runs, "--out", tmp_path / "report")
