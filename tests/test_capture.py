@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,6 @@ from mgs.data.dataset import FILES, load_dataset
 from mgs.errors import InputError
 from mgs.prior.build import build_prior, prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.report.evaluation import read_comparison
 from mgs.report.tables import table_columns
 from mgs.run import nbv
 from mgs.run.inputs import prior_digest
@@ -152,28 +152,24 @@ def test_an_interrupted_dataset_goes_on_only_as_on_demand(poses, tmp_path):
     assert ours == theirs
 
 
-def test_the_command_says_what_it_rendered(tmp_path, capsys):
+def test_the_command_renders_no_frame(tmp_path):
     scene, out = tmp_path / "mine.toml", tmp_path / "out"
     scene.write_text(TOML)
     options = ["--scene", scene, "--frames", 3, "--size", "32x24"]
     command("synth-orbit", out, "--on-demand", *options)
-    said = capsys.readouterr().out
-    assert "3 frames, none rendered" in " ".join(said.split())
-    assert "contact_sheet" not in said
     assert there(load_dataset(out)) == []
 
 
 def test_a_frame_rendered_alone_is_that_of_the_whole_orbit(full, fresh):
     """Bit for bit, in any order; a frame that exists is not written again."""
     capture = capture_of(fresh)
+    capture(fresh.frames[5])
+    before = [path.stat().st_mtime_ns for path in files(fresh.frames[5])]
     for index in (5, 1):
         capture(fresh.frames[index])
-    assert there(fresh) == [fresh.frames[1].name, fresh.frames[5].name]
-    before = [path.stat().st_mtime_ns for path in files(fresh.frames[5])]
-    for index in (5, 0):
-        capture(fresh.frames[index])
     assert [path.stat().st_mtime_ns for path in files(fresh.frames[5])] == before
-    for index in (0, 1, 5):
+    assert there(fresh) == [fresh.frames[1].name, fresh.frames[5].name]
+    for index in (1, 5):
         assert same_files(fresh.frames[index], full.frames[index])
 
 
@@ -191,9 +187,6 @@ def test_a_mesh_with_noisy_poses_is_captured_from_the_true_ones(full, tmp_path):
     assert ours == theirs
     (tmp_path / "rock.glb").write_bytes(b"another")
     with pytest.raises(InputError, match=r"rock\.glb: has changed since .*poses was made of it"):
-        capture_of(poses)(poses.frames[3])
-    (tmp_path / "rock.glb").unlink()
-    with pytest.raises(InputError, match=r"rock\.glb: no such mesh"):
         capture_of(poses)(poses.frames[3])
 
 
@@ -249,22 +242,16 @@ def test_killed_while_it_captures_and_resumed(captured, prior, fresh, tmp_path):
 
 
 def test_every_command_that_reads_a_run_reads_this_one(captured, tmp_path, capsys):
-    """Without the images of frames that were never taken, and without making them.
-
-    Candidates have no images, so there are no held-out views, and no columns for them.
-    """
+    """Without the images of frames that were never taken, and without making them."""
     dataset = load_dataset(captured.parent / "captured-poses")
     before, never = there(dataset), {frame.name for frame in dataset.frames} - set(taken(captured))
     metrics = json.loads((captured / "metrics.json").read_text())
     assert [metrics[name]["count"] for name in ("test", "all", "held_out")] == [2, 6, 0]
-    assert {view["name"] for view in metrics["views"]} == set(taken(captured))
     columns = table_columns(table_numbers([captured]))
     assert "test.psnr" in columns
     assert not any(key.startswith("held_out") for key in columns)
-    capsys.readouterr()
     command("eval", captured)
-    said = capsys.readouterr().out
-    assert "held out" not in said
+    assert "held out" not in capsys.readouterr().out
     assert {path.stem for path in (captured / "renders").glob("*.png")} == set(taken(captured))
     (pose, *_) = never
     command("diagnose", captured, "--views", pose)  # maps of a pose need no image
@@ -279,9 +266,6 @@ def test_every_command_that_reads_a_run_reads_this_one(captured, tmp_path, capsy
     assert there(dataset) == before
     for checked in (dataset, dataset.survey()):
         assert not any("no run has taken" in line for line in check_dataset(checked).problems)
-    middle = dataset.test_views().frames[1]
-    picture = captured / "renders/test" / f"{middle.name}.png"
-    assert read_comparison(picture, middle.camera)[0].any()
     page = page_path.read_text()
     assert all(f'"truth/{name}"' in page for name in (*taken(captured), "test/tv_0000"))
     assert not any(f'"truth/{name}"' in page for name in never)
@@ -289,23 +273,15 @@ def test_every_command_that_reads_a_run_reads_this_one(captured, tmp_path, capsy
     assert {name for name, role in roles.items() if role == "candidate"} == never
 
 
-def test_runs_that_share_a_dataset_can_be_compared(prior, fresh, tmp_path, monkeypatch):
-    """A frame taken by another run is not rendered again; the report shows frames of both."""
+def test_runs_that_share_a_dataset_can_be_compared(prior, fresh, tmp_path):
+    """Without test views; each has taken a frame that the other has not."""
     shutil.rmtree(fresh.root / "test")
-    first, second = runs = [tmp_path / policy for policy in ("farthest", "d-optimal")]
+    runs = [tmp_path / policy for policy in ("farthest", "d-optimal")]
     begin = ["nbv", fresh.root, "--prior", prior, *RUN, "--budget", 1]
-    command(*begin, "--policy", "farthest", "--out", first)
-    take, rendered = rendering.Photographer.take, []
-
-    def logged(self, frame):
-        rendered.append(frame.name)
-        take(self, frame)
-
-    monkeypatch.setattr(rendering.Photographer, "take", logged)
-    command(*begin, "--out", second)
-    assert rendered == [name for name in taken(second) if name not in taken(first)]
     for run in runs:
+        command(*begin, "--policy", run.name, "--out", run)
         command("eval", run)
+    assert taken(runs[0])[-1] != taken(runs[1])[-1]
     assert not any(key.startswith("held_out") for key in table_columns(table_numbers(runs)))
     command("report", *runs, "--out", tmp_path / "report")
     assert (tmp_path / "report/comparison.png").is_file()
@@ -341,14 +317,11 @@ def test_a_survey_with_noise_of_an_on_demand_dataset(poses, tmp_path):
 
 def test_bad_scenes_and_options_are_refused(small, tmp_path, capsys):
     """With one line, before anything is made."""
-    bad, out = tmp_path / "bad.toml", ["--out", tmp_path / "out"]
-    bad.write_text("[rock]\nsiez = 1\n")
-    for arguments, message in (
-        ([bad, *out], "rock.siez"),
-        (["boulder", "--seed-views", 3, "--budget", 6, *out], "--budget 6 exceeds its 5"),
-        (["boulder", "--out", occupied(tmp_path / "full")], "is there already"),
-    ):
-        assert message in refused(capsys, ["nbv", "--capture", *arguments], tmp_path)
+    begin = ["nbv", "--capture", "boulder", "--seed-views", 3]
+    line = refused(capsys, [*begin, "--budget", 6, "--out", tmp_path / "out"], tmp_path)
+    assert "--budget 6 exceeds its 5" in line
+    line = refused(capsys, [*begin, "--out", occupied(tmp_path / "full")], tmp_path)
+    assert "is there already" in line
 
 
 def test_commands_say_which_image_an_on_demand_dataset_lacks(fresh, tmp_path, capsys):
@@ -364,35 +337,20 @@ def test_commands_say_which_image_an_on_demand_dataset_lacks(fresh, tmp_path, ca
     assert not out.exists()
 
 
-def edit(root: Path, change) -> None:
-    """Change the record of the first frame in transforms.json."""
-    data = json.loads((root / "transforms.json").read_text())
-    change(data["frames"][0])
-    (root / "transforms.json").write_text(json.dumps(data))
-
-
-def rename(frame: dict) -> None:
-    frame["file_path"] = "images/kf_9.png"
-
-
-def move(frame: dict) -> None:
-    frame["transform_matrix"][0][3] += 1e-3
-
-
-@pytest.mark.parametrize(
-    ("spoil", "said"),
-    [
-        (lambda root: (root / "config.json").unlink(), r"config\.json: no such file"),
-        (lambda root: (root / "config.json").write_text("{}"), "is not of `mgs synth-orbit --on-d"),
-        (lambda root: edit(root, rename), "kf_9 is not one of the scene's"),
-        (lambda root: edit(root, move), "kf_0000 is not one of the scene's orbit"),
-    ],
-)
-def test_a_frame_that_cannot_be_rendered_is_refused(fresh, spoil, said):
-    spoil(fresh.root)
-    changed = load_dataset(fresh.root)
-    with pytest.raises(InputError, match=said):
-        capture_of(changed)(changed.frames[0])
+def test_a_frame_that_cannot_be_rendered_is_refused(fresh):
+    first = fresh.frames[0]
+    pose = first.camera.world_to_camera.copy()
+    pose[0, 3] += 1e-3
+    moved = replace(first.camera, world_to_camera=pose)
+    for frame in (replace(first, name="kf_9"), replace(first, camera=moved)):
+        with pytest.raises(InputError, match=f"{frame.name} is not one of the scene's orbit"):
+            capture_of(fresh)(frame)
+    (fresh.root / "config.json").write_text("{}")
+    with pytest.raises(InputError, match="is not of `mgs synth-orbit --on-demand`"):
+        capture_of(fresh)(first)
+    (fresh.root / "config.json").unlink()
+    with pytest.raises(InputError, match=r"config\.json: no such file"):
+        capture_of(fresh)(first)
 
 
 def test_the_denoiser_that_other_images_have_must_be_there(fresh, monkeypatch):
