@@ -27,59 +27,26 @@ from mgs.run.live import check_photograph
 
 SCRIPT = """
 name=$(basename "$2" .pose.json)
-stem="${{3%.png}}"
-trouble() {{ {trouble}; }}
-cp "$1/masks/$name.png" "$stem.mask.png"
+cp "$1/masks/$name.png" "${3%.png}.mask.png"
 cp "$1/images/$name.png" "$3"
-[ $name = {at} ] && {tries} && trouble "$@"
-exit 0
+if [ $name = kf_0004 ] && grep -q '"attempt": 1' "$2"; then echo no link >&2; exit 7; fi
 """
-"""A drone that copies what a dataset has, in trouble at one pose, at its first try or always."""
-
-FIRST = 'grep -q \'"attempt": 1\' "$2"'
-
-TROUBLES = {
-    "exit code": ("echo no link >&2; exit 7", "exit code 7: no link"),
-    "nothing": ("rm $3", "the picture is missing"),
-    "half a file": ('head -c 90 "$1/images/$name.png" > "$3"', "the file is damaged"),
-    "another size": ('cp "$1/other.png" "$3"', "is 8x6, but its camera is 16x12"),
-    "white": ('cp "$1/white.png" "$3"', "overexposed, 100 % of the object"),
-    "no object": ('cp "$1/empty.png" "$stem.mask.png"', "the object is not in the picture"),
-    "no pose": ('echo "{}" > "$stem.flown.json"', "has no transform_matrix"),
-    "far away": ('cp "$1/far.json" "$stem.flown.json"', "from the pose asked for, more than"),
-}
+"""A drone that copies what a dataset has, and fails at its first try of one pose."""
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    """A complete dataset, with what goes wrong beside it."""
-    root = tiny.write_dataset(tmp_path_factory.mktemp("live") / "data")
-    write_png(root / "other.png", np.full((6, 8, 3), 0.5))
-    write_png(root / "white.png", np.ones((tiny.HEIGHT, tiny.WIDTH, 3)))
-    write_png(root / "empty.png", np.zeros((tiny.HEIGHT, tiny.WIDTH), bool))
-    matrix = opengl_from_opencv(look_at((9, 9, 9), (0, 0, 0))).tolist()
-    (root / "far.json").write_text(json.dumps({"transform_matrix": matrix}))
-    return root
-
-
-@pytest.fixture(scope="module")
-def whole(data, tmp_path_factory):
+def whole(pristine, tmp_path_factory):
     """The run on the complete dataset."""
     out = tmp_path_factory.mktemp("whole") / "run"
-    tiny.run(out, load_dataset(data))
+    tiny.run(out, load_dataset(pristine))
     return out
 
 
 @pytest.fixture
-def prior(tmp_path):
-    return load_prior(tiny.write_prior(tmp_path / "prior"))
-
-
-@pytest.fixture
-def poses(data, tmp_path):
+def poses(pristine, tmp_path):
     """A folder of the poses alone."""
     (tmp_path / "poses").mkdir()
-    shutil.copy(data / "transforms.json", tmp_path / "poses")
+    shutil.copy(pristine / "transforms.json", tmp_path / "poses")
     return tmp_path / "poses"
 
 
@@ -87,9 +54,9 @@ class Flight:
     """A live run with the operations of tests/tiny.py."""
 
     def __init__(self, root, poses, prior):
-        self.out, self.prior = root / "run", prior
-        self.dataset = self.out / "dataset"
-        live.begin(self.dataset, load_dataset(poses, to_capture=True), prior)
+        self.out, self.dataset = root / "run", root / "run/dataset"
+        self.prior = load_prior(prior)
+        live.begin(self.dataset, load_dataset(poses, to_capture=True), self.prior)
         tiny.start(self.out, load_dataset(self.dataset))
 
     def fly(self, deliver, **options):
@@ -116,11 +83,9 @@ def flight(tmp_path, poses, prior):
     return Flight(tmp_path, poses, prior)
 
 
-def drone(data, folder, trouble=":", at="none", tries="true"):
-    """Transport of SCRIPT."""
-    script = folder / "drone.sh"
-    script.write_text(SCRIPT.format(trouble=trouble, at=at, tries=tries))
-    return transports.command(f"sh '{script}' '{data}' {{pose}} {{out}}", 600)
+@pytest.fixture
+def other(tmp_path, poses, prior):
+    return Flight(tmp_path / "other", poses, prior)
 
 
 def copying(data, change=lambda pose, out: None):
@@ -134,24 +99,49 @@ def copying(data, change=lambda pose, out: None):
     return deliver
 
 
-def test_the_run_is_that_on_the_complete_dataset(flight, data, whole, tmp_path):
-    assert flight.fly(drone(data, tmp_path)) == []
+def test_the_run_of_a_command_is_that_on_the_complete_dataset(flight, pristine, whole, tmp_path):
+    script = tmp_path / "drone.sh"
+    script.write_text(SCRIPT)
+    text = f"sh '{script}' '{pristine}' {{pose}} {{out}}"
+    (said,) = flight.fly(transports.command(text, 600))
+    assert said.startswith("kf_0004, try 1 of 3: ")
+    assert "exit code 7: no link" in said
     assert flight.steps == timeless(steps(whole))
     assert (flight.out / "gaussians.ply").read_bytes() == (whole / "gaussians.ply").read_bytes()
     assert {path.stem for path in (flight.dataset / "captured").iterdir()} == set(flight.taken)
 
 
-@pytest.mark.parametrize("case", TROUBLES)
-def test_what_goes_wrong_is_one_line_and_is_tried_again(flight, data, whole, tmp_path, case):
-    trouble, message = TROUBLES[case]
-    said = flight.fly(drone(data, tmp_path, trouble, "kf_0004", FIRST))
-    assert len(said) == 1
-    assert said[0].startswith("kf_0004, try 1 of 3: ")
-    assert message in said[0]
-    assert "\n" not in said[0]
+def far_away(out: Path) -> None:
+    matrix = opengl_from_opencv(look_at((9, 9, 9), (0, 0, 0))).tolist()
+    out.with_suffix(".flown.json").write_text(json.dumps({"transform_matrix": matrix}))
+
+
+NO_MASK = np.zeros((tiny.HEIGHT, tiny.WIDTH), bool)
+TROUBLES = {
+    "the picture is missing": Path.unlink,
+    "the file is damaged": lambda out: out.write_bytes(out.read_bytes()[:90]),
+    "is 8x6, but its camera is 16x12": lambda out: write_png(out, np.full((6, 8, 3), 0.5)),
+    "the object is not in the picture": (
+        lambda out: write_png(out.with_suffix(".mask.png"), NO_MASK)
+    ),
+    "has no transform_matrix": lambda out: out.with_suffix(".flown.json").write_text("{}"),
+    "from the pose asked for, more than": far_away,
+}
+
+
+@pytest.mark.parametrize("message", TROUBLES)
+def test_what_goes_wrong_is_one_line_and_is_tried_again(flight, pristine, whole, message):
+    def trouble(pose, out):
+        if out.stem == "kf_0004" and json.loads(pose.read_text())["attempt"] == 1:
+            TROUBLES[message](out)
+
+    (said,) = flight.fly(copying(pristine, trouble))
+    assert said.startswith("kf_0004, try 1 of 3: ")
+    assert message in said
+    assert "\n" not in said
     assert flight.steps == timeless(steps(whole))
     refused = [path.name for path in (flight.dataset / "flight").glob("*refused-1*")]
-    assert ("kf_0004.refused-1.png" in refused) == (case != "nothing")
+    assert ("kf_0004.refused-1.png" in refused) == (message != "the picture is missing")
 
 
 def test_a_command_that_hangs_is_ended_with_its_children(tmp_path):
@@ -161,30 +151,31 @@ def test_a_command_that_hangs_is_ended_with_its_children(tmp_path):
 
 
 @pytest.mark.parametrize("seed", [True, False])
-def test_a_pose_without_a_picture_is_skipped_or_stops_the_run(flight, data, whole, tmp_path, seed):
-    names = [line["name"] for line in steps(whole)]
-    lost = "kf_0004" if seed else names[2]
-    lose = drone(data, tmp_path, "exit 1", lost)
-    with pytest.raises(InputError, match=f"{lost}: no picture after 2 tries .*exit code 1.*resume"):
-        flight.fly(lose, tries=2, failure="stop")
-    said = flight.fly(lose, tries=2)
-    assert len(said) == 2
+def test_a_pose_without_a_picture_is_skipped_or_stops_the_run(flight, other, pristine, whole, seed):
+    lost = "kf_0004" if seed else steps(whole)[2]["name"]
+
+    def lose(pose, out):
+        if out.stem == lost:
+            raise InputError("no link")
+
+    with pytest.raises(InputError, match=f"{lost}: no picture after 2 tries .*no link.*resume"):
+        flight.fly(copying(pristine, lose), tries=2, failure="stop")
+    assert len(flight.fly(copying(pristine, lose), tries=2)) == 2
     assert lost not in flight.taken
     assert len(flight.taken) == 8
     assert not seed or steps(flight.out)[0]["seed_names"][1] in ("kf_0003", "kf_0005")
-    other = Flight(tmp_path / "other", tmp_path / "poses", flight.prior)
-    other.fly(lose, tries=1)  # without an interruption
+    other.fly(copying(pristine, lose), tries=1)  # without an interruption
     assert other.steps == flight.steps
 
 
-def test_a_run_ends_when_no_candidate_is_left(flight, data):
+def test_a_run_ends_when_no_candidate_is_left(flight, pristine):
     def lose(pose, out):
         if out.stem not in ("kf_0000", "kf_0004", "kf_0008", "kf_0009"):
             raise InputError("no link")
 
-    assert len(flight.fly(copying(data, lose), tries=1)) == 8
+    assert len(flight.fly(copying(pristine, lose), tries=1)) == 8
     assert steps(flight.out)[-1]["ended"]["reason"] == "flight"
-    assert flight.fly(copying(data, lose)) == []
+    assert flight.fly(copying(pristine, lose)) == []
 
 
 def aside(pose: Path, out: Path) -> None:
@@ -196,12 +187,12 @@ def aside(pose: Path, out: Path) -> None:
     out.with_suffix(".flown.json").write_text(json.dumps(flown))
 
 
-def test_no_distance_from_the_pose_may_be_allowed(flight, data):
+def test_no_distance_from_the_pose_may_be_allowed(flight, pristine):
     with pytest.raises(InputError, match=r"is 0\.0866 from the pose asked for, more than 0"):
-        flight.fly(copying(data, aside), tries=1, failure="stop", distance=0.0)
+        flight.fly(copying(pristine, aside), tries=1, failure="stop", distance=0.0)
 
 
-def test_the_pose_flown_counts_and_a_resumed_run_is_the_same(flight, data, whole, tmp_path):
+def test_the_pose_flown_counts_and_a_resumed_run_is_the_same(flight, other, pristine, poses, whole):
     calls = []
 
     def interrupt(pose, out):
@@ -211,48 +202,41 @@ def test_the_pose_flown_counts_and_a_resumed_run_is_the_same(flight, data, whole
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        flight.fly(copying(data, interrupt))
-    flight.fly(copying(data, aside))
-    other = Flight(tmp_path / "other", tmp_path / "poses", flight.prior)
-    other.fly(copying(data, aside))
+        flight.fly(copying(pristine, interrupt))
+    flight.fly(copying(pristine, aside))
+    other.fly(copying(pristine, aside))
     assert flight.steps == other.steps != timeless(steps(whole))
-    asked = {
-        frame.name: frame.camera
-        for frame in load_dataset(tmp_path / "poses", to_capture=True).frames
-    }
-    for frame in load_dataset(flight.dataset).frames:
-        moved = frame.camera.position - asked[frame.name].position
+    asked, flown = load_dataset(poses, to_capture=True), load_dataset(flight.dataset)
+    for frame, before in zip(flown.frames, asked.cameras, strict=True):
+        moved = frame.camera.position - before.position
         np.testing.assert_allclose(moved, 0.05 * (frame.name in flight.taken), atol=1e-12)
         assert frame.name not in flight.taken or frame.camera.K[0, 0] == 16.5
-    for camera, before in zip(load_dataset(flight.dataset).cameras, asked.values(), strict=True):
+    for camera, before in zip(flown.cameras, asked.cameras, strict=True):
         np.testing.assert_array_equal(camera.position, before.position)
         np.testing.assert_array_equal(camera.K, before.K)
     record = flight.dataset / "captured/kf_0000.json"
     record.write_text(record.read_text().replace("16.5", "16.6"))
     with pytest.raises(InputError, match=r"kf_0000\.json has changed since"):
-        flight.fly(copying(data, aside))
+        flight.fly(copying(pristine, aside))
 
 
-def test_depth_and_images_that_exist_are_kept(data, prior, tmp_path):
-    shutil.copytree(data / "images", tmp_path / "poses/images")
-    shutil.copytree(data / "masks", tmp_path / "poses/masks")
-    shutil.copytree(data / "depth", tmp_path / "poses/depth")
-    shutil.copy(data / "transforms.json", tmp_path / "poses")
-    (tmp_path / "poses/images/kf_0004.png").unlink()
-    flight, asked = Flight(tmp_path, tmp_path / "poses", prior), []
+def test_depth_and_images_that_exist_are_kept(dataset, pristine, prior, tmp_path):
+    (dataset / "images/kf_0004.png").unlink()
+    (dataset / "depth/kf_0004.exr").unlink()
+    flight, asked, depth = Flight(tmp_path, dataset, prior), [], pristine / "depth/kf_0004.exr"
 
     def deliver(pose, out):
         asked.append(out.stem)
-        shutil.copy(data / "depth/kf_0004.exr", out.with_suffix(".depth.exr"))
+        shutil.copy(depth, out.with_suffix(".depth.exr"))
 
-    flight.fly(copying(data, deliver))
+    flight.fly(copying(pristine, deliver))
     assert asked == ["kf_0004"]
-    depth = load_dataset(flight.dataset).frames[4].depth_path
-    assert np.array_equal(read_exr(depth)["Z"], read_exr(data / "depth/kf_0004.exr")["Z"])
+    kept = load_dataset(flight.dataset).frames[4].depth_path
+    assert np.array_equal(read_exr(kept)["Z"], read_exr(depth)["Z"])
 
 
-def test_the_pose_file_says_where_to_be_and_look(flight, data):
-    flight.fly(copying(data))
+def test_the_pose_file_says_where_to_be_and_look(flight, pristine):
+    flight.fly(copying(pristine))
     asked = json.loads((flight.dataset / "flight/kf_0000.pose.json").read_text())
     assert asked["position"] == pytest.approx([row[3] for row in asked["transform_matrix"][:3]])
     assert asked["pitch"] == pytest.approx(-np.degrees(np.arctan2(1.5, 3)))
@@ -271,8 +255,8 @@ def test_heading_is_clockwise_from_y(target, heading):
     assert heading_and_pitch(turned, upright((0, -1, 0))) == pytest.approx((heading, 0))
 
 
-def test_a_watched_folder(flight, data, whole, tmp_path, monkeypatch):
-    """Somebody puts pictures there, one of them in two halves, while the clock jumps by days."""
+def test_a_watched_folder(flight, other, pristine, whole, tmp_path, monkeypatch):
+    """Somebody puts pictures there, in two halves, while the clock jumps by days."""
     monkeypatch.setattr(transports, "POLL", 0.02)
     days = itertools.cycle([0.0, 9e5, -9e5])
     monkeypatch.setattr(transports.time, "time", lambda: next(days))
@@ -283,12 +267,13 @@ def test_a_watched_folder(flight, data, whole, tmp_path, monkeypatch):
         while not end.wait(0.01):
             for pose in folder.glob("*.pose.json"):
                 name = pose.name.removesuffix(".pose.json")
-                if not (folder / f"{name}.png").exists():
-                    shutil.copy(data / f"masks/{name}.png", folder / f"{name}.mask.png")
-                    whole = (data / f"images/{name}.png").read_bytes()
-                    (folder / f"{name}.png").write_bytes(whole[:90])
+                out = folder / f"{name}.png"
+                if not out.exists():
+                    shutil.copy(pristine / f"masks/{name}.png", folder / f"{name}.mask.png")
+                    content = (pristine / f"images/{name}.png").read_bytes()
+                    out.write_bytes(content[:90])
                     end.wait(0.1)
-                    (folder / f"{name}.png").write_bytes(whole)
+                    out.write_bytes(content)
 
     thread = threading.Thread(target=somebody)
     thread.start()
@@ -300,7 +285,6 @@ def test_a_watched_folder(flight, data, whole, tmp_path, monkeypatch):
     assert len(said) == 8
     assert f"waiting at most 60 s for {folder}/kf_0000.png" in said[0]
     assert flight.steps == timeless(steps(whole))
-    other = Flight(tmp_path / "other", tmp_path / "poses", flight.prior)
     (folder / "kf_0000.pose.json").unlink()
     with pytest.raises(InputError, match="lay there before its pose was asked for"):
         other.fly(transports.watched(1), folder=folder)
@@ -318,15 +302,12 @@ def test_nobody_comes(flight, tmp_path, monkeypatch):
         (lambda grey: grey, None),
         (lambda grey: 0 * grey, "underexposed"),
         (lambda grey: grey + 1, "overexposed"),
-        (
-            lambda grey: gaussian_filter(grey, 4),
-            "blur",
-        ),
+        (lambda grey: gaussian_filter(grey, 4), "blur"),
     ],
 )
-def test_photographs_are_checked(tmp_path, data, change, said):
+def test_photographs_are_checked(tmp_path, pristine, change, said):
     stripes = np.random.default_rng(0).random((96, 128)) > 0.5
-    frame, path = load_dataset(data).frames[0], tmp_path / "one.png"
+    frame, path = load_dataset(pristine).frames[0], tmp_path / "one.png"
     write_png(path, np.repeat(change(0.1 + 0.5 * stripes)[..., None], 3, axis=-1))
     frame = replace(frame, image_path=path, mask_path=None, camera=frame.camera.resized(128))
     if said is None:
@@ -336,8 +317,8 @@ def test_photographs_are_checked(tmp_path, data, change, said):
         check_photograph(frame)
 
 
-def test_bad_options_are_one_line(capsys, data, poses, tmp_path):
-    begin = ["nbv", poses, "--prior", tiny.write_prior(tmp_path / "p"), "--out", tmp_path / "run"]
+def test_bad_options_are_one_line(capsys, pristine, poses, prior, tmp_path):
+    begin = ["nbv", poses, "--prior", prior, "--out", tmp_path / "run"]
     program = "--capture-command"
     for arguments, message in (
         ([program, "true {out}"], "has no {pose}"),
@@ -345,10 +326,9 @@ def test_bad_options_are_one_line(capsys, data, poses, tmp_path):
         ([program, "nosuchprogram {pose} {out}"], "there is no program nosuchprogram"),
         ([program, "true {pose} {out}", "--capture-failure", "never"], "choose skip or stop"),
         ([program, "true {pose} {out}", "--capture-folder", tmp_path], "give either"),
-        ([program, "true {pose} {out}", "--capture", "boulder"], "give a DATASET or --capture"),
     ):
         assert message in refused(capsys, [*begin, *arguments], tmp_path)
-    begin[1] = data
+    begin[1] = pristine
     line = refused(capsys, [*begin, program, "true {pose} {out}"], tmp_path)
     assert "all its images exist" in line
 
