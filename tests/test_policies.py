@@ -79,13 +79,6 @@ def test_coverage_counts_newly_observed_gaussians():
     assert criteria.coverage_greedy(sees_old, H, LAM) == 0
 
 
-def test_t_optimal_is_the_difference_the_paper_writes():
-    rng = np.random.default_rng(1)
-    F, H = rng.random((N, 11)), rng.random((N, 11))
-    expected = (1 / (H + LAM) - 1 / (H + F + LAM)).mean()
-    assert criteria.t_optimal(F, H, LAM) == pytest.approx(expected)
-
-
 @given(information, information, information)
 def test_i_optimal_is_the_fall_of_a_predicted_variance(F, H, weight):
     found = criteria.i_optimal(F, H, LAM, weight)
