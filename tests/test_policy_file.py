@@ -9,7 +9,6 @@ from refusals import refused
 import mgs
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
-from mgs.policy import from_file
 from mgs.policy.registry import check_policy, policy_named
 from mgs.report.runs import read_run
 from mgs.run import recording
@@ -36,24 +35,21 @@ def surface(surface_F, surface_H, prior_lam):
 def draw(rng, candidates):
     return rng.random(len(candidates))
 
+@dataclass
+class Height:
+    ground: float
+
+    def __call__(self, position: np.ndarray) -> float:
+        return float(position[2] - self.ground)
+
 def everything(context, seen, seen_taken, points, candidate, centre):
     assert seen.shape == (len(context.candidate_frames), len(points))
     assert seen_taken.shape == (len(context.taken_frames), len(points))
     assert len(context.dome().positions) == len(context.dome().seen)
-    return float(candidate[2] - centre[2])
+    return Height(centre[2])(candidate)
 
 def wrong(F, photos):
     return 0.0
-
-@dataclass
-class Height:
-    weight: float
-
-    def __call__(self, candidates: np.ndarray) -> np.ndarray:
-        return self.weight * candidates[:, 2]
-
-def higher(candidates):
-    return Height(2.0)(candidates)
 
 def broken(candidates):
     return 1 / 0
@@ -79,31 +75,24 @@ def run(out, dataset, **values):
     ("function", "same"),
     [("poses", "farthest"), ("information", "d-optimal"), ("surface", "coverage")],
 )
-def test_arguments_are_passed_by_parameter_name(dataset, file, tmp_path, function, same):
-    loaded = load_dataset(dataset)
+def test_arguments_are_passed_by_parameter_name(loaded, file, tmp_path, function, same):
     ours = run(tmp_path / "ours", loaded, policy=f"{file}:{function}")
     theirs = run(tmp_path / "theirs", loaded, policy=same)
     assert ours.taken == theirs.taken
     assert [step["score"] for step in ours.steps] == [step["score"] for step in theirs.steps]
 
 
-def test_a_function_can_use_the_whole_context(dataset, file, tmp_path):
-    state = run(tmp_path / "run", load_dataset(dataset), policy=f"{file}:everything")
+def test_a_function_can_use_the_whole_context_and_classes(loaded, file, tmp_path):
+    state = run(tmp_path / "run", loaded, policy=f"{file}:everything")
     assert [step["score"] for step in state.steps[1:]] == pytest.approx([1.5] * 3)
 
 
-def test_a_file_can_hold_classes(dataset, file, tmp_path):
-    state = run(tmp_path / "run", load_dataset(dataset), policy=f"{file}:higher", budget=1)
-    assert state.steps[1]["score"] == pytest.approx(2 * tiny.orbit()[state.taken[-1]].position[2])
-
-
-def test_draws_do_not_depend_on_the_folder_of_the_file(dataset, file, tmp_path):
+def test_draws_do_not_depend_on_the_folder_of_the_file(loaded, file, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     paths = file, tmp_path / "elsewhere/mine.py"
     paths[1].write_text(FUNCTIONS)
     runs = [
-        run(tmp_path / f"run{i}", load_dataset(dataset), policy=f"{path}:draw")
-        for i, path in enumerate(paths)
+        run(tmp_path / f"run{i}", loaded, policy=f"{path}:draw") for i, path in enumerate(paths)
     ]
     assert runs[0].taken == runs[1].taken
 
@@ -132,13 +121,13 @@ def test_a_policy_that_cannot_be_loaded_is_one_line(dataset, file, tmp_path, nam
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        ("broken", r"line 41 of .*mine\.py failed: ZeroDivisionError: division by zero"),
+        ("broken", r"line 38 of .*mine\.py failed: ZeroDivisionError: division by zero"),
         ("few", r"returned scores of shape \(1,\) for 9 candidates"),
     ],
 )
-def test_a_policy_that_fails_keeps_the_steps_before(dataset, file, tmp_path, function, message):
+def test_a_policy_that_fails_keeps_the_steps_before(loaded, file, tmp_path, function, message):
     with pytest.raises(InputError, match=message):
-        run(tmp_path / "run", load_dataset(dataset), policy=f"{file}:{function}")
+        run(tmp_path / "run", loaded, policy=f"{file}:{function}")
     assert len((tmp_path / "run/steps.jsonl").read_text().splitlines()) == 1
 
 
@@ -161,16 +150,8 @@ def test_a_run_goes_on_with_the_same_file_only(dataset, file, tmp_path, monkeypa
     assert len(further().taken) == 5
 
 
-def test_names_in_files_and_in_tables():
-    assert from_file.absolute("d-optimal") == from_file.label("d-optimal") == "d-optimal"
-    assert from_file.label("/a/b/mine.py:best") == "mine.py:best"
-    with pytest.raises(InputError, match=r"^policy mine\.py: unknown; choose one of d-optimal"):
-        policy_named("mine.py")
-
-
 def test_a_name_is_checked_without_running_its_file(tmp_path):
     (tmp_path / "loud.py").write_text("raise SystemExit\n\ndef loud(candidates): ...\n")
-    check_policy("d-optimal")
     check_policy(f"{tmp_path}/loud.py:loud")
     with pytest.raises(InputError, match="unknown; choose one"):
         check_policy("best")
