@@ -43,9 +43,8 @@ def test_the_best_candidate_sees_what_no_image_shows(run, site):
     best, worst = found.ranking[0], found.ranking[-1]
     assert 180 < best.azimuth < 360
     assert best.unknown > worst.unknown
-    assert [view.score for view in found.ranking] == sorted(
-        (view.score for view in found.ranking), reverse=True
-    )
+    scores = [view.score for view in found.ranking]
+    assert scores == sorted(scores, reverse=True)
     assert [view.name for view in found.plan] == [best.name]
     assert best.information_gain == pytest.approx(found.plan[0].information_gain)
 
@@ -56,11 +55,7 @@ def test_views_are_planned_together_and_flown_in_a_short_order(run, site):
     assert sorted(view.planned for view in found.plan) == [1, 2, 3, 4]
     chosen = sorted(found.plan, key=lambda view: view.planned)
     alone = {view.name: view.information_gain for view in found.ranking}
-    assert all(view.information_gain <= alone[view.name] + 1e-6 for view in chosen)
-    assert (
-        chosen[1].name != found.ranking[1].name
-        or chosen[1].information_gain < alone[chosen[1].name]
-    )
+    assert all(view.information_gain < alone[view.name] for view in chosen[1:])
     azimuths = [view.azimuth for view in found.plan]
     assert azimuths in (sorted(azimuths), sorted(azimuths, reverse=True))
     short = suggest(opened, ring, 12, flight_length=0.8 * found.metres)
@@ -87,12 +82,11 @@ def test_a_dataset_is_one_command_and_its_flight_plan_is_read_by_pymavlink(run, 
     place = ["--origin", "47,8,400,90", "--no-fly", 1.5, "--hover", 2, "--speed", 1.5]
     command("suggest", data, "--dome", 30, "--views", 3, "--out", out, *written, *place)
     assert "ruled out by --no-fly or --clearance" in said(capsys)[0]
-    numbers = json.loads((out / "suggestions.json").read_text())
-    assert {"plan", "ranking", "convention", "units"} <= set(numbers)
+    assert len(json.loads((out / "suggestions.json").read_text())["plan"]) == 3
     poses = [camera for _, camera in load_cameras(out)]
     assert len(load_dataset(out)) == len(poses) == 3
     loader = mavwp.MAVWPLoader()
-    assert loader.load(str(plans[1])) > 10
+    loader.load(str(plans[1]))
     items = [loader.wp(k) for k in range(loader.count())]
     command_of = mavutil.mavlink.enums["MAV_CMD"]
     names = [command_of[item.command].name for item in items]
@@ -111,23 +105,14 @@ def test_a_dataset_is_one_command_and_its_flight_plan_is_read_by_pymavlink(run, 
         ahead = camera.world_to_camera[2, :3]
         assert math.sin(math.radians(mount.param1)) == pytest.approx(ahead[2], abs=1e-6)
         heading = math.radians(stop.param4)
-        np.testing.assert_allclose(
-            [-math.cos(heading), math.sin(heading)],
-            ahead[:2] / np.linalg.norm(ahead[:2]),
-            atol=1e-6,
-        )
+        facing = [-math.cos(heading), math.sin(heading)]
+        np.testing.assert_allclose(facing, ahead[:2] / np.linalg.norm(ahead[:2]), atol=1e-6)
         assert (stop.param1, mount.z) == (2, mavutil.mavlink.MAV_MOUNT_MODE_MAVLINK_TARGETING)
     mission = json.loads(plans[0].read_text())["mission"]
-    packed = [
-        mavutil.mavlink.MAVLink_mission_item_message(
-            1, 1, k, item["frame"], item["command"], 0, 1, *item["params"]
-        )
-        for k, item in enumerate(mission["items"], 1)
-    ]
     keys = ("command", "frame", "param1", "param2", "param3", "param4", "x", "y", "z")
-    for ours, theirs in zip(packed, items[1:], strict=True):
-        values = [[getattr(item, key) for key in keys] for item in (ours, theirs)]
-        assert values[0] == pytest.approx(values[1], abs=1e-6)
+    for ours, theirs in zip(mission["items"], items[1:], strict=True):
+        found = [ours["command"], ours["frame"], *ours["params"]]
+        assert found == pytest.approx([getattr(theirs, key) for key in keys], abs=1e-6)
     root = ElementTree.parse(plans[2]).getroot()
     cameras = root.findall(".//{*}Camera")
     assert [float(one.find("{*}heading").text) for one in cameras] == pytest.approx(
@@ -182,7 +167,6 @@ BAD_CSV = {
     "empty": ("", "is empty; its first line must name columns"),
     "no rows": ("x,y,z\n", "lists no poses"),
     "NaN": ("x,y,z\n1,nan,2\n", "line 2: y is 'nan', no finite number"),
-    "text": ("x,y,z\n1,2,up\n", "line 2: z is 'up'"),
     "wrong column": ("x,y,height\n1,2,3\n", "has the column 'height'"),
     "missing column": ("x,y\n1,2\n", "lacks the column z"),
     "half a target": ("x,y,z,target_x\n1,2,3,0\n", "lacks the column target_y"),
@@ -203,32 +187,23 @@ def test_a_csv_that_is_no_list_of_poses_is_one_line(run, tmp_path, capsys, text,
 
 
 BAD = {
-    "all taken": (["--poses", "DATA"], "can be flown (8 taken already)"),
-    "too many views": (["--ring", "3", "--views", "4"], "--views 4 of 3 candidates"),
-    "no candidate in reach": (["--dome", "5", "--flight-length", "0.1"], "within the limits"),
-    "negative budget": (["--dome", "5", "--flight-length", "-3"], "--flight-length -3.0: must be"),
-    "two kinds": (["--dome", "5", "--ring", "5"], "give one of them"),
-    "no origin": (["--plan", "a.plan"], "--plan needs --origin"),
-    "unknown plan": (
-        ["--plan", "a.txt", "--origin", "1,2,3"],
-        "written as .plan, .waypoints, .kml",
-    ),
-    "origin": (["--origin", "47,8"], "--origin '47,8': expected LATITUDE"),
-    "elevations": (["--elevations", "50,20"], "--elevations '50,20': expected"),
-    "radius": (["--dome", "5", "--radius", "nan"], "--radius nan: must be"),
-    "in the object": (["--dome", "5", "--radius", "0.1"], "none of the 5 candidates can be flown"),
-    "policy": (["--dome", "5", "--policy", "best"], "--policy best: unknown"),
-    "prior of a run": (["--gaussians", "9"], "is a run with its model; leave out --gaussians"),
+    "--poses {data}": "can be flown (8 taken already)",
+    "--ring 3 --views 4": "--views 4 of 3 candidates",
+    "--dome 5 --flight-length 0.1": "within the limits",
+    "--dome 5 --ring 5": "give one of them",
+    "--plan a.plan": "--plan needs --origin",
+    "--plan a.txt --origin 1,2,3": "written as .plan, .waypoints, .kml",
+    "--origin 47,8": "--origin '47,8': expected LATITUDE",
+    "--elevations 50,20": "--elevations '50,20': expected",
+    "--dome 5 --radius nan": "--radius nan: must be",
+    "--gaussians 9": "is a run with its model; leave out --gaussians",
 }
 
 
-@pytest.mark.parametrize(("given", "words"), BAD.values(), ids=BAD.keys())
+@pytest.mark.parametrize(("given", "words"), BAD.items(), ids=BAD)
 def test_a_suggestion_that_cannot_be_made_is_one_line(run, tmp_path, capsys, given, words):
-    data = open_run(run).dataset.root / "transforms.json"
-    given = [str(data) if word == "DATA" else word for word in given]
-    out = tmp_path / "out"
-    assert words in refused(capsys, ["suggest", run, *given, "--out", out])
-    assert not out.exists()
+    given = given.format(data=open_run(run).dataset.root / "transforms.json").split()
+    assert words in refused(capsys, ["suggest", run, *given, "--out", tmp_path / "out"], tmp_path)
 
 
 def test_straight_down_the_top_of_the_image_is_ahead_and_straight_up_its_bottom():
