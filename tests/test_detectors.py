@@ -15,7 +15,7 @@ from mgs.cli.nbv import resume_and_print
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset, target_of, write_transforms
 from mgs.images import write_png
-from mgs.prior.build import load_prior, prior_from_mesh, save_prior
+from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate_model
 from mgs.report.page_facts import measured, read_shown
@@ -100,17 +100,12 @@ def test_signs_that_a_step_cannot_have_are_left_out():
     assert {"unconverged", "worse"}.isdisjoint(unknown)
 
 
-@pytest.mark.parametrize("views", [1, 3, 4])
-def test_coverage_is_expected_of_four_views_and_more(views):
-    assert bool(alarms(indicators(views=(GOOD,) * views, coverage=0.7))) == (views == 4)
-
-
-@pytest.mark.parametrize("last", [False, True])
-@pytest.mark.parametrize("views", [7, 8])
-def test_few_views_need_not_fit_well_while_more_are_to_come(views, last):
+@pytest.mark.parametrize(
+    ("views", "last", "warnings"), [(3, True, 1), (4, True, 2), (7, False, 0), (8, False, 2)]
+)
+def test_few_views_need_not_cover_all_nor_fit_well_while_more_are_to_come(views, last, warnings):
     bad = (replace(GOOD, unexplained=0.9),) * views
-    said = alarms(indicators(bad, coverage=0.5, last=last))
-    assert len(said) == (2 if last or views == 8 else 0)
+    assert len(alarms(indicators(bad, coverage=0.7, last=last))) == warnings
 
 
 def test_the_outline_is_the_share_of_pixels_that_disagree_by_more_than_the_margin():
@@ -211,7 +206,7 @@ def test_drift_is_in_standard_deviations_of_the_prior():
 
 @pytest.fixture(scope="module")
 def rock(tmp_path_factory):
-    """A dataset of an ellipsoid that can be fitted well, with its prior."""
+    """A dataset of an ellipsoid, with its prior."""
     root = tmp_path_factory.mktemp("rock") / "dataset"
     synthetic.write_dataset(root, synthetic.orbit_cameras(10, 64, 48))
     save_prior(root / "prior", prior_from_mesh(root / "rock.glb", PriorSettings(gaussians=600)))
@@ -293,19 +288,6 @@ def test_a_warning_is_printed_recorded_and_on_the_page(rock, tmp_path):
     assert not any("indicators" in key for key in measured(first))
 
 
-def test_a_prior_in_the_wrong_place_is_noticed_at_the_seeds(rock, tmp_path):
-    prior = load_prior(rock / "prior")
-    save_prior(tmp_path / "prior", replace(prior, points=prior.points + np.array([0.4, 0, 0])))
-    given = {"prior": tmp_path / "prior", "budget": 0, "seeds": 5, "train": {"passes": 2}}
-    state = run_nbv(rock, tmp_path / "run", **given).state
-    assert any("the prior's outline and the masks disagree" in said for said in warnings(state))
-
-
-def test_a_loop_without_renders_has_no_signs(dataset, tmp_path):
-    state = tiny.run(tmp_path / "run", load_dataset(dataset))
-    assert not any("indicators" in line or "warnings" in line for line in state.steps)
-
-
 def wrong_pose(frames):
     """Turn one camera by 3 degrees."""
     camera = frames[2].camera
@@ -320,14 +302,6 @@ def drifting_exposure(frames):
         write_png(frame.image_path, frame.rgb() * np.float32(0.6 * 1.05**k))
 
 
-def one_wrong_mask(frames):
-    """Remove the left third of one mask."""
-    mask = frames[4].mask()
-    columns = np.flatnonzero(mask.any(axis=0))
-    mask[:, columns[: len(columns) // 3]] = False
-    write_png(frames[4].mask_path, mask)
-
-
 def wide_masks(frames):
     """Widen all masks far beyond the rock."""
     for frame in frames:
@@ -337,7 +311,6 @@ def wide_masks(frames):
 SPOILED = {
     wrong_pose: "prior and mask are",
     drifting_exposure: "exposure drifts",
-    one_wrong_mask: "prior and mask are",
     wide_masks: "the prior's outline and the masks disagree",
 }
 

@@ -132,13 +132,6 @@ def test_ctrl_c_inside_a_call_of_drjit_is_one_line_too(capsys, monkeypatch):
         main(["doctor"])
 
 
-def test_resuming_a_finished_run_shows_it_again(run, capsys):
-    before = (run / "checkpoint.npz").read_bytes()
-    command("nbv", "--resume", run)
-    assert (run / "checkpoint.npz").read_bytes() == before
-    assert "held-out views" in capsys.readouterr().out
-
-
 def test_errors_are_predicted_and_calibrated(run):
     """Shares inside the intervals, on the run's own views, are what they were fitted to be."""
     command("diagnose", run, "--calibrate")
