@@ -9,7 +9,7 @@ import pytest
 import synthetic
 import tiny
 import typer
-from program import command, steps
+from program import command, said, steps
 from refusals import a_file, listing, occupied, refused
 
 from mgs import __version__
@@ -91,20 +91,18 @@ def test_force_replaces_what_the_command_made_and_nothing_else(capsys, dataset, 
 
 
 ONE_FILE = {
-    "report": ["report", "RUN", "--html", "FILE.html"],
-    "bench": ["bench", "--json", "FILE.json"],
-    "prune": ["prune", "RUN"],
+    "report {run} --html {out}/kept.html": "kept.html",
+    "bench --json {out}/kept.json": "kept.json",
+    "prune {run}": "run/gaussians_pruned.ply",
 }
+"""Command -> the file that it would write."""
 
 
-@pytest.mark.parametrize("name", ONE_FILE)
-def test_a_file_that_is_there_is_kept(capsys, dataset, prior, tmp_path, name):
+@pytest.mark.parametrize("arguments", ONE_FILE)
+def test_a_file_that_is_there_is_kept(capsys, dataset, prior, tmp_path, arguments):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
-    words = [str(word) for word in ONE_FILE[name]]
-    words = [str(run) if word == "RUN" else word for word in words]
-    kept = [tmp_path / word for word in words if word.startswith("FILE")]
-    a_file(kept[0] if kept else run / "gaussians_pruned.ply")
-    words = [str(kept[0]) if word.startswith("FILE") else word for word in words]
+    a_file(tmp_path / ONE_FILE[arguments])
+    words = arguments.format(run=run, out=tmp_path).split()
     assert "is there already; choose another place" in refused(capsys, words, tmp_path)
 
 
@@ -129,26 +127,25 @@ def test_a_file_where_a_run_keeps_its_pictures(capsys, dataset, prior, tmp_path)
 
 
 WHOLE = {
-    "prior": (["--gaussians", 60], "mesh.ply points.ply prior.json prior.png"),
-    "survey": (
-        ["--poses", "exact"],
-        "cloud.ply rock.glb survey.json survey.png transforms.json",
-    ),
+    "prior": ("mgs.prior.figure", "mesh.ply points.ply prior.json prior.png"),
+    "survey": ("mgs.survey.folder", "cloud.ply rock.glb survey.json survey.png transforms.json"),
 }
+"""Command -> module that draws its picture, and the files that it writes."""
 
 
 @pytest.mark.parametrize("name", WHOLE)
 def test_a_result_appears_whole(tmp_path, monkeypatch, name):
     """Nothing is under its name while its picture, the last file, is drawn."""
-    module = importlib.import_module({"survey": "mgs.survey.folder"}.get(name, "mgs.prior.figure"))
+    module, files = importlib.import_module(WHOLE[name][0]), WHOLE[name][1]
     draw, drawn, out = getattr(module, f"draw_{name}"), [], tmp_path / "out"
-    root, (option, files) = synthetic.write_dataset(tmp_path / "data").root, WHOLE[name]
+    root = synthetic.write_dataset(tmp_path / "data").root
 
     def watched(path, *rest):
         drawn.append(len(list(path.parent.iterdir())) > 2 and not out.exists())
         draw(path, *rest)
 
     monkeypatch.setattr(module, f"draw_{name}", watched)
+    option = ["--gaussians", 60] if name == "prior" else ["--poses", "exact"]
     command(name, root, "--out", out, *option)
     assert drawn == [True]
     assert sorted(path.name for path in out.iterdir() if path.is_file()) == files.split()
@@ -158,12 +155,11 @@ def test_a_result_appears_whole(tmp_path, monkeypatch, name):
 def printed(capsys, *arguments) -> str:
     """Everything that `mgs ARGUMENTS` prints, in one line."""
     command(*arguments)
-    return " ".join(capsys.readouterr().out.split())
+    return said(capsys)[0]
 
 
 def test_help_and_version(capsys):
     assert "Usage" in printed(capsys)
-    assert "Usage" in printed(capsys, "nbv", "--help")
     assert "--background R G B" in printed(capsys, "render", "--help")
     assert f"mgs {__version__}" in printed(capsys, "--version")
 
