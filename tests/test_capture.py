@@ -273,20 +273,6 @@ def test_every_command_that_reads_a_run_reads_this_one(captured, tmp_path, capsy
     assert {name for name, role in roles.items() if role == "candidate"} == never
 
 
-def test_runs_that_share_a_dataset_can_be_compared(prior, fresh, tmp_path):
-    """Without test views; each has taken a frame that the other has not."""
-    shutil.rmtree(fresh.root / "test")
-    runs = [tmp_path / policy for policy in ("farthest", "d-optimal")]
-    begin = ["nbv", fresh.root, "--prior", prior, *RUN, "--budget", 1]
-    for run in runs:
-        command(*begin, "--policy", run.name, "--out", run)
-        command("eval", run)
-    assert taken(runs[0])[-1] != taken(runs[1])[-1]
-    assert not any(key.startswith("held_out") for key in table_columns(table_numbers(runs)))
-    command("report", *runs, "--out", tmp_path / "report")
-    assert (tmp_path / "report/comparison.png").is_file()
-
-
 def test_one_command_does_all_of_it(small, tmp_path, capsys):
     """Poses, survey, prior and run in the run's folder, which can be resumed."""
     scene, run = tmp_path / "mine.toml", tmp_path / "run"

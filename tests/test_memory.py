@@ -8,8 +8,6 @@ import weakref
 from collections import Counter
 from pathlib import Path
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -172,22 +170,13 @@ def test_a_padded_array_is_the_same_with_memory_behind_it(shape):
     copy = padded(np.asfortranarray(values), np.float64)
     assert np.array_equal(copy, values)
     assert copy.flags.c_contiguous
+    assert not copy.size or copy.ctypes.data % 64 == 0, (
+        "Dr.Jit compiles another kernel for other addresses"
+    )
     memory = copy.base if copy.base.base is None else copy.base.base
     end, needed = memory.ctypes.data + memory.nbytes, (copy.size + PADDING) * copy.itemsize
     assert end >= copy.ctypes.data + needed
     assert padded([1, 2]).dtype == np.float32
-
-
-def test_one_kernel_serves_arrays_wherever_numpy_puts_them():
-    """Dr.Jit compiles another kernel for an array that does not begin at a multiple of 64 bytes."""
-    kernels = set()
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        for size in (100, 1001, 10_007, 100_003):
-            kept = [np.empty(size + k, np.float32) for k in range(3)]  # moves the next arrays
-            arrays = [mi.Float(padded(np.ones(size), np.float32)) for _ in kept]
-            dr.eval(arrays[0] * arrays[1] + arrays[2])
-            kernels |= {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
-    assert len(kernels) == 1
 
 
 def test_all_that_dr_jit_takes_from_numpy_is_padded():

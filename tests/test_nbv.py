@@ -62,24 +62,6 @@ def test_views_are_the_best_at_the_model_and_given_the_batch_so_far(loaded, tmp_
     np.testing.assert_allclose(state.H, sum(information(state.gaussians, taken)))
 
 
-def test_coverage_is_of_the_surface_and_does_not_depend_on_training(loaded, tmp_path):
-    def blacken(*arguments):
-        fit = tiny.fit(*arguments)
-        fit.gaussians.sh[:] = -100  # no information is left at the trained model
-        return fit
-
-    state = run(tmp_path / "run", loaded, policy="coverage")
-    covered = [line["coverage"] for line in state.steps]
-    start, lam = tiny.initial([]), criteria.regularisation(tiny.GROUPS)
-    for step, share in enumerate(covered):
-        H = sum(tiny.fisher(start, loaded.frames[i].camera) for i in state.taken[: 3 + step])
-        assert share == criteria.coverage(H, lam)
-    assert covered == sorted(covered)
-    assert 0 < covered[0] < covered[-1]
-    black = run(tmp_path / "black", loaded, tiny.operations(fit=blacken), policy="coverage")
-    assert black.taken == state.taken
-
-
 def test_fits_start_in_the_colours_of_all_images_taken(loaded, tmp_path):
     """The model moves with the prior's colours; means stay those of the seeds."""
     handed, fitted = [], []
@@ -193,27 +175,6 @@ def test_a_killed_run_that_is_resumed_takes_the_same_views(
     assert timeless(steps(out)) == timeless(lines)
     assert (out / "gaussians.ply").read_bytes() == ply
     assert not list(out.glob(".*"))
-
-
-@pytest.mark.parametrize(("batch", "fits", "kept"), [(1, 4, 3), (2, 3, 3)])
-def test_an_interrupted_run_keeps_whole_batches(loaded, tmp_path, batch, fits, kept):
-    """Interrupted in a fit, then resumed: the same views and model."""
-    run(tmp_path / "whole", loaded, batch=batch)
-    calls = []
-
-    def fit(*arguments):
-        calls.append(1)
-        if len(calls) == fits:
-            raise KeyboardInterrupt
-        return tiny.fit(*arguments)
-
-    out = tmp_path / "run"
-    with pytest.raises(KeyboardInterrupt):
-        run(out, loaded, tiny.operations(fit=fit), batch=batch)
-    assert len(steps(out)) == kept
-    resume(out, loaded)
-    assert timeless(steps(out)) == timeless(steps(tmp_path / "whole"))
-    assert (out / "gaussians.ply").read_bytes() == (tmp_path / "whole/gaussians.ply").read_bytes()
 
 
 @pytest.mark.parametrize(
