@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
 import synthetic
 
 import mgs
+from mgs.data import importers
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame
-from mgs.data.importers import import_source
+from mgs.data.masks import make_masks
+from mgs.data.meshes import read_mesh
 from mgs.data.sources import read_source
 from mgs.fit import objective
 from mgs.memory import PADDING, adopted, kept_within, padded
@@ -27,10 +27,10 @@ from mgs.run import operations, problem
 from mgs.run.nbv import run_nbv
 
 
-def test_results_are_kept_within_the_budget() -> None:
-    made: Counter[int] = Counter()
+def test_results_are_kept_within_the_budget():
+    made = Counter()
 
-    def make(key: int) -> np.ndarray:
+    def make(key):
         made[key] += 1
         return np.full(10, key, np.uint8)
 
@@ -40,7 +40,7 @@ def test_results_are_kept_within_the_budget() -> None:
     assert made == {0: 1, 1: 1, 2: 3, 3: 3}
 
 
-def test_only_arrays_with_room_behind_them_are_not_copied() -> None:
+def test_only_arrays_with_room_behind_them_are_not_copied():
     known = padded(np.ones((4, 3)))
     assert adopted(known) is known
     plain = np.ones((4, 64), np.float32)
@@ -54,42 +54,39 @@ def test_only_arrays_with_room_behind_them_are_not_copied() -> None:
 class Live:
     """Count of the images that are alive, and its maximum."""
 
-    def __init__(self) -> None:
-        self.now, self.most = 0, 0
+    now = most = 0
 
-    def watch(self, image: np.ndarray) -> np.ndarray:
+    def watch(self, image):
         self.now += 1
         self.most = max(self.most, self.now)
         weakref.finalize(image, self.died)
         return image
 
-    def died(self) -> None:
+    def died(self):
         self.now -= 1
 
 
 @pytest.fixture(scope="module")
-def rock(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def rock(tmp_path_factory):
     root = tmp_path_factory.mktemp("rock") / "dataset"
     dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(9, 48, 36))
     save_prior(root / "prior", prior_from_mesh(root / "rock.glb", PriorSettings(gaussians=300)))
     return dataset
 
 
-def test_a_run_holds_few_images_at_once_and_finds_the_same(
-    rock: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    live, target = Live(), Frame.target
+def test_a_run_holds_few_images_at_once_and_finds_the_same(rock, tmp_path, monkeypatch):
+    live, target, target_of = Live(), Frame.target, problem.target_of
 
-    def watched(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    def watched(frame):
         rgba, weight = target(frame)
         return live.watch(rgba), weight
 
     monkeypatch.setattr(Frame, "target", watched)
+    monkeypatch.setattr(problem, "target_of", lambda *frame: live.watch(target_of(*frame)))
     found, most = [], []
     for name, budget in (("kept", 1 << 30), ("read again", 0)):
         for module in (problem, objective, operations):
             monkeypatch.setattr(module, "IMAGE_BYTES", budget)
-        monkeypatch.setattr(problem, "target_of", lambda *frame: live.watch(TARGET_OF(*frame)))
         gc.collect()
         live.now = live.most = 0
         settings = {"policy": "uniform", "seeds": 6, "budget": 3, "evaluate_every": 1}
@@ -103,23 +100,14 @@ def test_a_run_holds_few_images_at_once_and_finds_the_same(
     assert np.array_equal(kept.H, again.H)
 
 
-TARGET_OF = problem.target_of
-
-
 @pytest.mark.usefixtures("coarse_priors")
-def test_commands_before_a_run_hold_few_images_at_once(
-    rock: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from mgs.data import importers
-    from mgs.data.masks import make_masks
-    from mgs.data.meshes import read_mesh
-
+def test_commands_before_a_run_hold_few_images_at_once(rock, tmp_path, monkeypatch):
     live, read, rgb, mask = Live(), importers.read_rgba, Frame.rgb, Frame.mask
     monkeypatch.setattr(importers, "read_rgba", lambda path: live.watch(np.array(read(path))))
     monkeypatch.setattr(Frame, "rgb", lambda frame: live.watch(rgb(frame).copy()))
     monkeypatch.setattr(Frame, "mask", lambda frame: live.watch(mask(frame).copy()))
     build_prior(rock, PriorSettings(gaussians=300), source="hull")
-    imported = import_source(read_source(rock.root), tmp_path / "d")
+    imported = importers.import_source(read_source(rock.root), tmp_path / "d")
     for path in (tmp_path / "d/masks").iterdir():
         path.unlink()
     bare = [Frame(f.name, f.camera, f.timestamp, f.image_path) for f in imported.frames]

@@ -232,8 +232,8 @@ def dying_operations(moment: str, count: int) -> problem.Operations:
 
         return call
 
-    if moment in ("fit", "fisher", "initial"):
-        return operations(**{moment: dying(globals()[moment])})
+    if moment == "fisher":
+        return operations(fisher=dying(fisher))
     if moment == "before the lines are written":
         run_folder.write_steps = dying(run_folder.write_steps)
     if moment == "while the checkpoint is written":
