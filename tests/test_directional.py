@@ -317,8 +317,7 @@ def test_scores_are_gains_after_the_views_taken(loaded, tmp_path, policy):
 
 
 @pytest.mark.parametrize("policy", ["coverage", "directional-d", "directional-i"])
-def test_what_poses_see_is_measured_once_and_again_when_it_is_forgotten(loaded, tmp_path, policy):
-    """`mgs chart --only scoring` times each choice anew."""
+def test_what_poses_see_is_measured_once(loaded, tmp_path, policy):
     looked = []
 
     def exact(gaussians, camera):
@@ -327,14 +326,11 @@ def test_what_poses_see_is_measured_once_and_again_when_it_is_forgotten(loaded, 
 
     settings = tiny.start(tmp_path / "run", loaded, policy=policy)
     problem = Problem(loaded, settings, tiny.operations(exact=exact))
-    state, counts = loop.learn(problem, problem.seeds), []
-    for forget in (False, False, True):
-        if forget:
-            problem.__dict__.pop("visibility")
-        looked.clear()
-        loop.choose(problem, state)
-        counts.append(len(looked))
-    assert counts[1] == 0 < counts[0] == counts[2]
+    state = loop.learn(problem, problem.seeds)
+    first = loop.choose(problem, state)
+    count = len(looked)
+    assert loop.choose(problem, state) == first
+    assert len(looked) == count > len(loaded)
 
 
 def flown(loaded, out, **values):

@@ -167,6 +167,7 @@ BAD_CSV = {
     "empty": ("", "is empty; its first line must name columns"),
     "no rows": ("x,y,z\n", "lists no poses"),
     "NaN": ("x,y,z\n1,nan,2\n", "line 2: y is 'nan', no finite number"),
+    "text": ("x,y,z\n1,2,up\n", "line 2: z is 'up'"),
     "wrong column": ("x,y,height\n1,2,3\n", "has the column 'height'"),
     "missing column": ("x,y\n1,2\n", "lacks the column z"),
     "half a target": ("x,y,z,target_x\n1,2,3,0\n", "lacks the column target_y"),
