@@ -16,9 +16,8 @@ from program import command, steps, timeless
 from refusals import refused
 from scipy.ndimage import gaussian_filter
 
-from mgs.camera import Camera, heading_and_pitch, look_at, opengl_from_opencv
+from mgs.camera import look_at, opengl_from_opencv
 from mgs.data.dataset import load_dataset
-from mgs.data.up import upright
 from mgs.errors import InputError, Notice
 from mgs.images import read_exr, read_rgba, write_png
 from mgs.prior.build import load_prior
@@ -237,17 +236,6 @@ def test_depth_and_images_that_exist_are_kept(dataset, pristine, prior, tmp_path
     assert asked == ["kf_0004"]
     kept = load_dataset(flight.dataset).frames[4].depth_path
     assert np.array_equal(read_exr(kept)["Z"], read_exr(depth)["Z"])
-
-
-@pytest.mark.parametrize(
-    ("target", "heading"), [((0, 1, 0), 0), ((1, 0, 0), 90), ((0, -1, 0), 180), ((-1, 0, 0), 270)]
-)
-def test_heading_is_clockwise_from_y(target, heading):
-    camera = Camera(np.diag([9.0, 9, 1]), 9, 9, look_at((0, 0, 0), target))
-    assert heading_and_pitch(camera) == pytest.approx((heading, 0))
-    x, y, z = target
-    turned = Camera(np.diag([9.0, 9, 1]), 9, 9, look_at((0, 0, 0), (x, -z, y), (0, -1, 0)))
-    assert heading_and_pitch(turned, upright((0, -1, 0))) == pytest.approx((heading, 0))
 
 
 def test_a_watched_folder(flight, other, pristine, whole, tmp_path, monkeypatch):

@@ -15,6 +15,7 @@ import mgs
 from mgs.camera import Camera, heading_and_pitch, look_at
 from mgs.data import flight_plan
 from mgs.data.dataset import load_cameras, load_dataset
+from mgs.data.up import upright
 from mgs.run.candidates import Site, inside, place_poses, read_poses
 from mgs.run.folder import open_run
 from mgs.run.suggest import coarse_prior, suggest
@@ -207,9 +208,14 @@ def test_a_suggestion_that_cannot_be_made_is_one_line(run, tmp_path, capsys, giv
     assert words in refused(capsys, ["suggest", run, *given, "--out", tmp_path / "out"], tmp_path)
 
 
-def test_straight_down_the_top_of_the_image_is_ahead_and_straight_up_its_bottom():
+def test_headings_straight_down_and_up_and_in_a_world_that_stands_otherwise():
+    """Straight down the top of the image is ahead, straight up its bottom."""
     camera = Camera(np.diag([9.0, 9, 1]), 8, 8, look_at([0, 0, 5], [0, 0, 0], [1, 0, 0]))
     heading, pitch = flight_plan.Stop(camera.position, camera=camera).heading_and_pitch(10)
     assert (heading, pitch) == (pytest.approx(100), pytest.approx(-90))
     up = Camera(camera.K, 8, 8, look_at([0, 0, 0], [0, 0, 5], [-1, 0, 0]))
     assert heading_and_pitch(up) == pytest.approx((90, 90))
+    west = Camera(camera.K, 8, 8, look_at([0, 0, 0], [-1, 0, 0], [0, -1, 0]))
+    assert heading_and_pitch(west, upright((0, -1, 0))) == pytest.approx((270, 0))
+    north = Camera(camera.K, 8, 8, look_at([0, 0, 0], [0, 0, 1], [0, -1, 0]))
+    assert heading_and_pitch(north, upright((0, -1, 0))) == pytest.approx((0, 0))
