@@ -70,23 +70,18 @@ def test_uncertainty_is_the_variance_left_over_that_of_the_prior():
 def test_a_run_that_ended_goes_on_only_when_its_rule_is_changed(loaded, whole, tmp_path, rule):
     two, three = whole.steps[2:4]
     assert two["uncertainty"] > three["uncertainty"]
-    limit = (two["information_gain"] + three["information_gain"]) / 2
+    limit, left = (two["information_gain"] + three["information_gain"]) / 2, two["uncertainty"]
     next_view = {"name": three["name"], "information_gain": three["information_gain"]}
-    left = two["uncertainty"]
-    value, changed, ended = {
-        "stop_gain": (limit, None, {"reason": "gain", **next_view, "limit": limit}),
-        "stop_uncertainty": (
-            left,
-            None,
-            {"reason": "uncertainty", "uncertainty": left, "limit": left},
-        ),
-        "budget": (2, 5, {"reason": "budget"}),
+    value, changed, reason, numbers = {
+        "stop_gain": (limit, None, "gain", {**next_view, "limit": limit}),
+        "stop_uncertainty": (left, None, "uncertainty", {"uncertainty": left, "limit": left}),
+        "budget": (2, 5, "budget", {}),
     }[rule]
     out = tmp_path / "run"
     state = run(out, loaded, **{rule: value})
     assert state.taken == whole.taken[:5]
     assert "ended" not in state.steps[-2]
-    assert state.steps[-1]["ended"] == {"views": 2, **ended}
+    assert state.steps[-1]["ended"] == {"reason": reason, "views": 2, **numbers}
     assert three["name"] not in state.inputs["files"], "the image of a view that was refused"
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     again = resume(out, loaded, tiny.operations(fit=never, fisher=never))
