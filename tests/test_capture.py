@@ -181,6 +181,9 @@ def test_a_mesh_with_noisy_poses_is_captured_from_the_true_ones(full, tmp_path):
     (tmp_path / "rock.glb").write_bytes(b"another")
     with pytest.raises(InputError, match=r"rock\.glb: has changed since .*poses was made of it"):
         capture_of(poses)(poses.frames[3])
+    (tmp_path / "rock.glb").unlink()
+    with pytest.raises(InputError, match=r"rock\.glb: no such mesh"):
+        capture_of(poses)(poses.frames[3])
 
 
 def test_the_survey_gives_the_prior_of_the_whole_dataset(full, poses):
@@ -296,7 +299,7 @@ def test_a_survey_with_noise_of_an_on_demand_dataset(poses, tmp_path):
     assert not (tmp_path / "survey/images").exists()
 
 
-def test_bad_scenes_and_options_are_refused(small, tmp_path, capsys):
+def test_bad_options_are_refused(small, tmp_path, capsys):
     """With one line, before anything is made."""
     begin = ["nbv", "--capture", "boulder", "--seed-views", 3]
     line = refused(capsys, [*begin, "--budget", 6, "--out", tmp_path / "out"], tmp_path)
