@@ -12,11 +12,11 @@ from types import SimpleNamespace
 
 import pytest
 import synthetic
+import tiny
 from program import command, exit_code
 from refusals import occupied, refused
 
 from mgs.data.dataset import TEST_FOLDER
-from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.run.folder import read_checkpoint
 from mgs.run.loop import fit_views
@@ -32,10 +32,6 @@ from mgs.survey.flight import SurveySettings, fly
 ONE = RunSize(Size(48, 36, 8, 3, spp=1), 200, 2)
 FEW = SetupSize(48, 36, 3, 1, 6, fewer=4, gaussians=200)
 TINY = ReproduceSize(ONE, FEW, FEW, setup_rocks=2, oracle_rocks=1)
-
-
-def silent(name, done, total):
-    pass
 
 
 def ellipsoids(root, out, scene, seed, size, changes=None, mesh=None):
@@ -54,19 +50,20 @@ def quick(monkeypatch):
     """The preset `quick` is tiny, nothing is rendered, and few policies are compared."""
     monkeypatch.setitem(reproduce.SIZES, "quick", TINY)
     monkeypatch.setattr(case, "make_dataset", ellipsoids)
-    monkeypatch.setattr(reproduce, "POLICIES", ("directional-d", "random"))
-    monkeypatch.setattr(setups, "JUDGE_PASSES", 2)
-    monkeypatch.setattr(setups, "DRAWS", 2)
-    for name in list(setups.SETUPS):
-        if name not in ("ring", "one seed"):
-            monkeypatch.delitem(setups.SETUPS, name)
-    for name, value in {
-        "TABLE_POLICIES": ("d-optimal", "random"),
-        "SLOW_POLICIES": (),
-        "DRAWS": 2,
-        "FEWER_IMAGES": 1,
+    for name in set(setups.SETUPS) - {"ring", "one seed"}:
+        monkeypatch.delitem(setups.SETUPS, name)
+    for module, values in {
+        setups: {"JUDGE_PASSES": 2, "DRAWS": 2},
+        reproduce: {
+            "POLICIES": ("directional-d", "random"),
+            "TABLE_POLICIES": ("d-optimal", "random"),
+            "SLOW_POLICIES": (),
+            "DRAWS": 2,
+            "FEWER_IMAGES": 1,
+        },
     }.items():
-        monkeypatch.setattr(reproduce, name, value)
+        for name, value in values.items():
+            monkeypatch.setattr(module, name, value)
 
 
 def done(capsys, *arguments):
@@ -92,6 +89,8 @@ def test_setups_are_made_once_and_compare_a_policy_of_ones_own(
     rows = rows_of(folder / "setups.csv")
     assert {row["command"] for row in rows} == {line}
     assert len(rows) == 2 * 2 * 2
+    orbits = {path.name for path in out.glob("cells/dataset/boulder-11/*")}
+    assert orbits == {"circle-1", "hemisphere-1"}
     assert [float(row["test_gain"]) for row in rows if row["policy"] == "random"] == [0] * 4
     cells = [json.loads(path.read_text()) for path in out.glob("cells/setup/**/result.json")]
     assert len(cells) >= 8
@@ -239,35 +238,27 @@ def test_a_prior_is_built_once_and_whole(tmp_path, monkeypatch):
     assert found["gaussians"] == 200
 
 
-def test_a_run_is_timed(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr(case, "in_new_process", lambda task, out, *how: task(*how))
-    run = Run(Rock("boulder", 1), ONE, "farthest", budget=4)
-    *before, cell = run.cells()
-    found = run_cells(tmp_path, [*before, cell], silent)[cell.name]
-    assert cell.alone
-    assert found["images"] == found["all"]["count"] == 8
-    assert found["held_out"]["psnr"] is None
-    assert found["test"]["count"] == 3
-    steps = read_checkpoint(cell_folder(tmp_path, cell.name) / "run").steps
+def test_a_run_and_3dgs_are_timed_alone_and_measured_on_all_views(quick, tmp_path, monkeypatch):
+    for module in (case, free_fit):
+        monkeypatch.setattr(module, "in_new_process", lambda task, out, *how: task(*how))
+    monkeypatch.setattr(free_fit, "PASSES", 3)
+    rock, row = Rock("boulder", 1), "3DGS, random points, twice the steps"
+    runs = Run(rock, ONE, "farthest", budget=4), Run(rock, ONE, row, seeds=8, budget=0)
+    run, free = (one.cells()[-1] for one in runs)
+    results = run_cells(tmp_path, [cell for one in runs for cell in one.cells()], tiny.silent)
+    for cell in (run, free):
+        found = results[cell.name]
+        assert cell.alone
+        assert found["images"] == found["all"]["count"] == 8
+        assert found["held_out"]["psnr"] is None
+        assert found["test"]["count"] == 3
+    found = results[run.name]
+    steps = read_checkpoint(cell_folder(tmp_path, run.name) / "run").steps
     assert found["seconds"] == pytest.approx(sum(sum(step["seconds"].values()) for step in steps))
     choices = [step["seconds"]["score"] for step in steps[1:]]
     assert found["choice_seconds"] == pytest.approx(sum(choices) / 4)
-    wrong = Run(Rock("boulder", 1), ONE, "nonsense", budget=1)
-    with pytest.raises(InputError, match=r"^policy nonsense: unknown"):
-        run_cells(tmp_path, wrong.cells(), silent)
-
-
-def test_3dgs_is_measured_on_all_views(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr(free_fit, "in_new_process", lambda task, out, *how: task(*how))
-    monkeypatch.setattr(free_fit, "PASSES", 3)
-    row = "3DGS, random points, twice the steps"
-    *before, cell = Run(Rock("boulder", 1), ONE, row, seeds=8, budget=0).cells()
-    found = run_cells(tmp_path, [*before, cell], silent)[cell.name]
-    assert cell.alone
+    found = results[free.name]
     assert found["gaussians"] > 0
-    assert found["images"] == found["all"]["count"] == 8
-    assert found["test"]["count"] == 3
-    assert found["held_out"]["psnr"] is None
     assert found["choice_seconds"] is None
     assert found["all"]["psnr"] > 15
 
@@ -315,28 +306,36 @@ def wait_for(come):
         time.sleep(0.1)
 
 
-def timed(root, out, dataset, prior, settings):
-    """In place of the task that times a policy: numbers that depend on its settings."""
-    value = 20 + settings["seed"] / 1000 + settings["budget"] / 10
-    metrics = {"count": 3, "psnr": value, "ssim": 0.9, "psnr_mask": 22.0, "ssim_mask": 0.8}
-    found = {"images": settings["seeds"] + settings["budget"], "choice_seconds": 0.5}
-    found |= dict.fromkeys(("test", "all", "held_out"), metrics)
-    return found | {"seconds": 12.3, "peak_megabytes": 512.6}
-
-
 def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, monkeypatch):
+    """Interrupted, continued, and with batches."""
     asked = []
 
-    def told(root, out, dataset, prior, settings):
+    def timed(root, out, dataset, prior, settings):
+        """In place of the task that times a policy: numbers that depend on its settings."""
         asked.append(settings)
-        return timed(root, out, dataset, prior, settings)
+        if len(asked) == 3:
+            raise KeyboardInterrupt
+        value = 20 + settings["seed"] / 1000 + settings["budget"] / 10
+        metrics = {"count": 3, "psnr": value, "ssim": 0.9, "psnr_mask": 22.0, "ssim_mask": 0.8}
+        found = {"images": settings["seeds"] + settings["budget"], "choice_seconds": 0.5}
+        found |= dict.fromkeys(("test", "all", "held_out"), metrics)
+        return found | {"seconds": 12.3, "peak_megabytes": 512.6}
 
-    monkeypatch.setattr(case, "time_policy", told)
-    monkeypatch.setattr(free_fit, "time_3dgs", told)
+    monkeypatch.setattr(case, "time_policy", timed)
+    monkeypatch.setattr(free_fit, "time_3dgs", timed)
     out, table = tmp_path / "out", tmp_path / "out/results/table1.md"
+
+    def rows():
+        return {row["row"]: row for row in rows_of(out / "results/table1.csv")}
+
+    assert exit_code("reproduce", out, "--only", "table1") == 130
+    assert "run the same command again to continue" in capsys.readouterr().err
+    assert list(rows()) == ["d-optimal", "random, draw 1"]
+    assert "| random, mean of 1 | 6 |" in table.read_text()
+    left = "random, draw 2; coverage, fewer images; all views; 3DGS; 3DGS, random points"
+    assert f"Not done yet: {left}.\n" in table.read_text()
     done(capsys, out, "--only", "table1")
-    rows = {row["row"]: row for row in rows_of(out / "results/table1.csv")}
-    assert {name: row["images"] for name, row in rows.items()} == {
+    assert {name: row["images"] for name, row in rows().items()} == {
         "d-optimal": "6",
         "random, draw 1": "6",
         "random, draw 2": "6",
@@ -353,34 +352,15 @@ def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, m
     assert "| random, mean of 2 | 6 | 20.70 | " + ours.format("20.70") in text
     assert "`mgs reproduce --scale quick --only table1`" in text
     assert "Not done yet" not in text
-    line = rows["random, draw 2"]["command"]
+    line = rows()["random, draw 2"]["command"]
     assert line.startswith("mgs nbv cells/dataset/boulder-0/circle-1/8x48x36/dataset --prior ")
     assert line.endswith("--policy random --seed-views 4 --budget 2 --random-seed 1000")
     done(capsys, out, "--only", "table1", "--batch", 2)
-    rows = {row["row"]: row for row in rows_of(out / "results/table1.csv")}
     ending = "--policy d-optimal --batch 2 --seed-views 4 --budget 2 --random-seed 0"
-    assert rows["d-optimal"]["command"].endswith(ending)
+    assert rows()["d-optimal"]["command"].endswith(ending)
     batches = [settings.get("batch") for settings in asked]
-    assert batches == [None] * 7 + [2] * 5  # 3DGS is no run
+    assert batches == [None] * 8 + [2] * 5  # 3DGS is no run
     assert "--only table1 --batch 2`" in table.read_text()
-
-
-def test_table_1_is_there_for_the_rows_that_are_done(quick, tmp_path, capsys, monkeypatch):
-    def killed(root, out, dataset, prior, settings):
-        if settings["policy"] == "random" and settings["seed"]:
-            raise KeyboardInterrupt
-        return timed(root, out, dataset, prior, settings)
-
-    monkeypatch.setattr(case, "time_policy", killed)
-    out = tmp_path / "out"
-    assert exit_code("reproduce", out, "--only", "table1") == 130
-    assert "run the same command again to continue" in capsys.readouterr().err
-    done_rows = [row["row"] for row in rows_of(out / "results/table1.csv")]
-    assert done_rows == ["d-optimal", "random, draw 1"]
-    text = (out / "results/table1.md").read_text()
-    assert "| random, mean of 1 | 6 |" in text
-    left = "random, draw 2; coverage, fewer images; all views; 3DGS; 3DGS, random points"
-    assert f"Not done yet: {left}.\n" in text
 
 
 def made_up(value, scenes):
@@ -418,7 +398,7 @@ def test_leads_are_over_scenes_and_corrected_for_all_tests():
 def test_an_oracle_that_sees_the_truth_is_best_in_its_first_choice(quick, tmp_path, monkeypatch):
     monkeypatch.setattr(setups, "JUDGE_PASSES", 10)
     size, rocks = replace(TINY.setups, images=5), TINY.some_rocks(1)
-    found = run_cells(tmp_path, setups.cells_of(size, rocks, ("oracle", "random")), silent)
+    found = run_cells(tmp_path, setups.cells_of(size, rocks, ("oracle", "random")), tiny.silent)
     ring = {name: r["test"] for name, r in found.items() if "/ring-" in name and "/oracle-" in name}
     others = [r["test"] for name, r in found.items() if "/ring-" in name and "/random-" in name]
     assert len(others) == setups.DRAWS
@@ -444,15 +424,6 @@ def test_scores_equal_to_the_gains_foretell_them(monkeypatch):
     assert found["right"] == {"spearman": 1, "regret": 0}
     assert found["wrong"] == {"spearman": -1, "regret": 2}
     assert found["same"] == {"spearman": 0, "regret": 2}
-
-
-def test_a_set_up_changes_the_orbit_of_the_scene():
-    rock = Rock("boulder", 11)
-    case = setups.case_of(rock, setups.SETUPS["mixed distances"], setups.SetupSize())
-    dataset, prior = case.cells()
-    assert dataset.name == "dataset/boulder-11/hemisphere-1-2-3/36x128x96"
-    assert dataset.arguments["changes"]["orbit"] == {"kind": "hemisphere", "distances": [1, 2, 3]}
-    assert "gaussians" not in prior.arguments, "their number is automatic"
 
 
 def test_a_folder_of_another_preset_or_of_something_else_is_refused(capsys, tmp_path):
