@@ -31,7 +31,7 @@ from mgs.run.folder import open_run
 from mgs.splat import render
 from mgs.splat_ply import write_ply
 from mgs.view import layers
-from mgs.view.server import FILLED, Viewer, check_address, window_camera
+from mgs.view.server import FILLED, Viewer, window_camera
 from mgs.view.subject import read_subject, scaled
 
 
@@ -139,17 +139,13 @@ def test_a_world_of_large_numbers_is_shown_smaller(run):
 
 
 def test_covariances_have_the_scales_and_the_axes(run):
-    subject = read_subject(run)
-    g = subject.gaussians
-    values, _ = np.linalg.eigh(layers.covariances(subject).astype(np.float64))
-    variances = np.exp(2 * g.log_scales.astype(np.float64))
-    np.testing.assert_allclose(values, np.sort(variances, axis=1), rtol=1e-4)
-    flat = replace(g, log_scales=g.log_scales - np.array([0, 0, 3]))
-    found = layers.covariances(SimpleNamespace(gaussians=flat)).astype(np.float64)
-    _, vectors = np.linalg.eigh(found)
-    # The stand-in's discs lie on a sphere.
-    normals = g.means / np.linalg.norm(g.means, axis=1, keepdims=True)
-    np.testing.assert_allclose(np.abs((vectors[:, :, 0] * normals).sum(1)), 1, atol=1e-4)
+    g = read_subject(run).gaussians
+    flat = replace(g, log_scales=g.log_scales - np.array([0, 1, 3]))
+    axes = Rotation.from_quat(g.quats, scalar_first=True).as_matrix()
+    variances = np.exp(2 * flat.log_scales)
+    expected = axes @ (variances[:, :, None] * axes.transpose(0, 2, 1))
+    found = layers.covariances(SimpleNamespace(gaussians=flat))
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6 * variances.max())
 
 
 POINTS = st.tuples(*[st.floats(-5, 5)] * 3)
@@ -187,10 +183,8 @@ def test_refusals(capsys, run, dataset, prior, tmp_path, monkeypatch):
         assert "in use" in view(run, "--port", taken.getsockname()[1])
     tiny.start(tmp_path / "begun", load_dataset(dataset), prior=prior)
     assert "no finished step yet" in view(tmp_path / "begun")
-    assert read_subject(tmp_path / "begun", follow=True).gaussians is None
     monkeypatch.setitem(sys.modules, "viser", None)
     assert 'pip install "mgs[view]"' in view(run)
-    check_address("127.0.0.1", 0)
 
 
 @contextmanager
