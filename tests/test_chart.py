@@ -18,7 +18,7 @@ from mgs.cli.app import app
 from mgs.errors import InputError
 from mgs.fit.settings import ALPHA_WEIGHT, COLOURS_ALONE, TrainSettings
 from mgs.prior.settings import PriorSettings
-from mgs.run.nbv import start_run
+from mgs.run.nbv import run_nbv, start_run
 from mgs.run.settings import PRESETS, NbvSettings, with_defaults
 from mgs.study import case, chart, photographs, timing
 
@@ -102,30 +102,6 @@ def test_a_preset_gives_defaults_and_what_is_given_wins():
         assert with_defaults({"train": wrong}) == {"train": wrong}
 
 
-class Begun(Exception):
-    """A run began with these settings."""
-
-
-def test_studies_fit_colours_alone(dataset, prior, tmp_path, monkeypatch):
-    """What they begin runs with, wherever they begin them."""
-
-    def begin(*_, train, **__):
-        raise Begun(train["alpha_weight"])
-
-    monkeypatch.setattr(chart, "run_nbv", begin)
-    monkeypatch.setattr(case, "start_run", begin)
-    settings, where = {"train": {"passes": 2}}, (tmp_path, tmp_path / "out", dataset, prior)
-    (tmp_path / "out").mkdir()
-    for call in (
-        lambda: chart.measure(*where, settings, 1),
-        lambda: case.begun_run(*where, {}),
-        lambda: case.begun_run(*where, settings),
-    ):
-        with pytest.raises(Begun) as begun:
-            call()
-        assert begun.value.args == (0,)
-
-
 def test_a_run_with_a_preset_writes_what_it_came_to(dataset, prior, tmp_path, monkeypatch):
     start_run(dataset, tmp_path / "run", prior=prior, preset="fast", seeds=3, warm_passes=4)
     settings = json.loads((tmp_path / "run/config.json").read_text())["settings"]
@@ -181,14 +157,21 @@ def small(dataset, monkeypatch):
     return dataset
 
 
-def test_a_chart_is_measured_once_and_written(small, tmp_path, capsys):
-    out, times = tmp_path / "chart", []
+def test_a_chart_is_measured_once_and_written(small, tmp_path, capsys, monkeypatch):
+    out, times, weights = tmp_path / "chart", [], []
+
+    def run(*where, train, **given):
+        weights.append(train["alpha_weight"])
+        return run_nbv(*where, train=train, **given)
+
+    monkeypatch.setattr(chart, "run_nbv", run)
     for _ in range(2):
         command("chart", out, "--dataset", small, "--repeats", 1)
         told = capsys.readouterr().out
         times.append({p: p.stat().st_mtime_ns for p in out.glob("cells/**/result.json")})
     assert "/prior" not in told  # the second time all was there
     assert times[0] == times[1]
+    assert set(weights) == {0}, "studies fit colours alone"
     written = {kind: json.loads((out / f"{kind}.json").read_text()) for kind in chart.KINDS}
     for kind, record in written.items():
         rows = list(csv.DictReader((out / f"{kind}.csv").read_text().splitlines()))
@@ -209,31 +192,25 @@ def test_photographs_are_charted_beside_another_program(dataset, tmp_path, capsy
     tiny.write_dataset(dataset / "test", frames=3)
     monkeypatch.setitem(photographs.PASSES, "quick", (1, 2))
     peer, out = tmp_path / "other.csv", tmp_path / "chart"
-    charted = ["chart", out, "--only", "photographs", "--dataset", dataset, "--gaussians", "60"]
-    for text in (
-        "",
-        "cpu_seconds,psnr\n",
-        "cpu_seconds,psnr\n1,x\n",
-        "cpu_seconds\n1\n",
-        "cpu_seconds,psnr\n0,9\n",
-        "cpu_seconds,psnr\n1,inf\n",
-    ):
-        peer.write_text(text)
+    only = ["chart", out, "--only", "photographs"]
+    charted = [*only, "--dataset", dataset, "--gaussians", "60"]
+    second = Path(shutil.copytree(dataset, tmp_path / "second"))
+    namesake = shutil.copytree(dataset, tmp_path / "other" / "second")
+    for text in ("psnr\n", "psnr\n1,x\n", "step\n1,5\n", "psnr\n0,9\n", "psnr\n1,inf\n"):
+        peer.write_text(f"cpu_seconds,{text}")
         assert "one row or more; correct it" in refused(capsys, [*charted, "--peer", peer], out)
-    assert "give --dataset" in refused(capsys, charted[:4], out)
-    for option in (["--peer", peer], ["--gaussians", 60]):
-        peer.write_text("cpu_seconds,psnr\n1,20\n")
-        said = refused(capsys, ["chart", out, "--dataset", dataset, *option], out)
-        assert f"{option[0]}: is of photographs alone" in said
     peer.write_text("cpu_seconds,dataset,psnr\n0.5,third,20\n")
     assert "third is not charted" in refused(capsys, [*charted, "--peer", peer], out)
     peer.write_text("cpu_seconds,step,psnr,dataset\n0.5,9,20,\n2,50,21.5,second\n")
-    second = Path(shutil.copytree(dataset, tmp_path / "second"))
+    several = ["chart", out, "--dataset", dataset, "--dataset", second]
+    for arguments, line in (
+        (only, "give --dataset"),
+        ([*several[:4], "--peer", peer], "--peer: is of photographs alone"),
+        (several, "takes more than one"),
+        ([*several, "--dataset", namesake], "have one name"),
+    ):
+        assert line in refused(capsys, arguments, out)
     charted += ["--dataset", second]
-    namesake = shutil.copytree(dataset, tmp_path / "other" / "second")
-    assert "have one name" in refused(capsys, [*charted, "--dataset", namesake], out)
-    several = ["--dataset", dataset, "--dataset", second]
-    assert "takes more than one" in refused(capsys, ["chart", out, *several], out)
     command(*charted, "--peer", peer)
     record = json.loads((out / "photographs.json").read_text())
     ours, others = record["rows"][:4], record["rows"][4:]

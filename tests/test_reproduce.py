@@ -253,7 +253,10 @@ def test_a_run_and_3dgs_are_timed_alone_and_measured_on_all_views(quick, tmp_pat
         assert found["held_out"]["psnr"] is None
         assert found["test"]["count"] == 3
     found = results[run.name]
-    steps = read_checkpoint(cell_folder(tmp_path, run.name) / "run").steps
+    folder = cell_folder(tmp_path, run.name) / "run"
+    settings = json.loads((folder / "config.json").read_text())["settings"]
+    assert settings["train"]["alpha_weight"] == 0, "studies fit colours alone"
+    steps = read_checkpoint(folder).steps
     assert found["seconds"] == pytest.approx(sum(sum(step["seconds"].values()) for step in steps))
     choices = [step["seconds"]["score"] for step in steps[1:]]
     assert found["choice_seconds"] == pytest.approx(sum(choices) / 4)
