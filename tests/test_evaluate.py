@@ -5,6 +5,7 @@ import math
 import threading
 import time
 import weakref
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -140,19 +141,26 @@ def test_views_are_measured_beside_each_other_but_large_ones_alone(
 
 def test_evaluate(tmp_path):
     """A model that renders one grey: each metric is that of the grey image, and the averages leave
-    out what was trained on."""
+    out what was trained on. Test views may have names of training views."""
     dataset, calls = write_dataset(tmp_path / "data", orbit_cameras(4)), []
+    tests = write_dataset(tmp_path / "test", orbit_cameras(3, 40, 30)).frames
     result = evaluate_model(
         grey(),
         dataset.frames,
         {"kf_0001"},
+        test_frames=tests,
         renderer=flat,
         pictures=tmp_path / "renders",
         progress=lambda done, total: calls.append((done, total)),
     )
     assert [view["name"] for view in result["views"]] == [f"kf_000{i}" for i in range(4)]
     assert [view["trained"] for view in result["views"]] == [False, True, False, False]
+    assert [view["trained"] for view in result["test_views"]] == [False] * 3
     assert (result["images"], result["all"]["count"], result["held_out"]["count"]) == (1, 4, 3)
+    alone = evaluate_model(grey(), tests, (), renderer=flat)
+    assert (result["test"], result["test_views"]) == (alone["all"], alone["views"])
+    assert "test" not in alone
+    assert "test_views" not in alone
     truth = srgb_from_linear(dataset.frames[2].masked_rgb())
     shown = srgb_from_linear(np.full_like(truth, 0.2))
     mask, known = dataset.frames[2].mask(), dataset.frames[2].target()[1] > 0
@@ -167,9 +175,15 @@ def test_evaluate(tmp_path):
         values = [view[name] for view in result["views"]]
         assert result["all"][name] == pytest.approx(np.mean(values))
         assert result["held_out"][name] == pytest.approx(np.mean([values[i] for i in (0, 2, 3)]))
-    assert calls == [(i, 4) for i in range(5)]
+    assert calls == [(i, 7) for i in range(8)]
     assert json.loads(json.dumps(result, allow_nan=False)) == result
-    assert len(list((tmp_path / "renders").iterdir())) == 4
+    pictures = {
+        path.relative_to(tmp_path / "renders") for path in tmp_path.rglob("renders/**/*.png")
+    }
+    assert pictures == {
+        *(Path(f"kf_000{i}.png") for i in range(4)),
+        *(Path(f"test/kf_000{i}.png") for i in range(3)),
+    }
 
 
 def random_view(rng):
@@ -211,28 +225,6 @@ def test_surface_metrics_follow_their_definitions(seed):
         assert found[name] == pytest.approx(value, nan_ok=True)
 
 
-def test_test_views_are_measured_and_drawn_apart(tmp_path):
-    """They may have the names of frames that the model was trained on."""
-    dataset = write_dataset(tmp_path / "data", orbit_cameras(4))
-    tests = write_dataset(tmp_path / "data/test", orbit_cameras(3, 40, 30))
-    assert dataset.test_views().frames == tests.frames
-
-    def measured(frames, **options):
-        return evaluate_model(grey(), frames, ["kf_0001"], renderer=flat, **options)
-
-    out = tmp_path / "out"
-    result = measured(dataset.frames, test_frames=tests.frames, pictures=out)
-    without, alone = measured(dataset.frames), measured(tests.frames)
-    assert {key: result[key] for key in without} == without
-    assert result["test"] == alone["all"]
-    assert result["test"]["count"] == 3
-    assert result["test_views"] == [view | {"trained": False} for view in alone["views"]]
-    assert {path.relative_to(out).as_posix() for path in out.rglob("*.png")} == {
-        *(f"kf_000{i}.png" for i in range(4)),
-        *(f"test/kf_000{i}.png" for i in range(3)),
-    }
-
-
 def test_evaluate_a_perfect_model_and_nothing_held_out(tmp_path):
     dataset = write_dataset(tmp_path, orbit_cameras(2))
     truths = {
@@ -247,8 +239,6 @@ def test_evaluate_a_perfect_model_and_nothing_held_out(tmp_path):
     surface = [name for name in SURFACE_METRICS if name != "alpha_mae"]
     assert [result["all"][name] for name in surface] == [0] * len(surface)
     assert result["held_out"] == {"count": 0} | dict.fromkeys([*METRICS, *surface])
-    assert "test" not in result
-    assert "test_views" not in result
 
 
 def test_comparison_picture(tmp_path):

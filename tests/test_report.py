@@ -285,14 +285,6 @@ def test_runs_that_cannot_be_reported(runs, tmp_path, change, named):
     assert not (tmp_path / "report").exists()
 
 
-def test_comparison_is_cropped_to_the_rock():
-    mask = np.zeros((100, 200), bool)
-    mask[40:60, 50:80] = True
-    rows, columns = plotting.crop(mask)
-    assert (rows.start, rows.stop, columns.start, columns.stop) == (34, 66, 38, 92)
-    assert plotting.crop(np.zeros((4, 4), bool)) == (slice(None), slice(None))
-
-
 def laid_out(figure):
     """Extents of texts of a figure are known once it is drawn."""
     with rc_context(plotting.STYLE):
