@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import tiny
 from matplotlib import rc_context
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 from program import change_settings, command, table_numbers
 from program import steps as read_steps
@@ -70,7 +69,7 @@ def without(word):
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """{file name: figure} of every figure that is saved."""
+    """{file name: figure} of every figure that is saved, and the style that extents depend on."""
     found, save = {}, plotting.save_figure
 
     def keep(figure, path):
@@ -78,7 +77,8 @@ def drawn(monkeypatch):
         save(figure, path)
 
     monkeypatch.setattr(plotting, "save_figure", keep)
-    return found
+    with rc_context(plotting.STYLE):
+        yield found
 
 
 def curves(axis):
@@ -285,13 +285,6 @@ def test_runs_that_cannot_be_reported(runs, tmp_path, change, named):
     assert not (tmp_path / "report").exists()
 
 
-def laid_out(figure):
-    """Extents of texts of a figure are known once it is drawn."""
-    with rc_context(plotting.STYLE):
-        FigureCanvasAgg(figure).draw()
-    return figure
-
-
 def within(figure, box):
     page = figure.bbox
     across = page.x0 <= box.x0 < box.x1 <= page.x1
@@ -310,7 +303,7 @@ def test_no_word_of_a_comparison_is_cut_off_or_written_over(tmp_path, drawn, lab
     captions = dict.fromkeys(labels, "100 images, trained on; 30.09 dB, SSIM 0.9301")
     renders = dict.fromkeys(labels, truth + 0.1)
     figures.comparison_figure(tmp_path / "a.png", truth, renders, LONG, captions)
-    figure = laid_out(drawn["a.png"])
+    figure = drawn["a.png"]
     texts = [text for axis in figure.axes for text in (axis.title, *axis.texts)]
     texts.append(figure.axes[-1].xaxis.label)
     boxes = [text.get_window_extent() for text in texts if text.get_text()]
@@ -327,7 +320,7 @@ def test_a_legend_covers_no_line(tmp_path, drawn):
     lines = dict.fromkeys(labels, ((4, 5, 6), (0.1, 0.2, 0.3)))
     figures.gain_figure(tmp_path / "a.png", dict.fromkeys(labels, (0.1, 0.2, 0.3)))
     figures.psnr_figure(tmp_path / "b.png", {"test views": lines, "masked PSNR": lines})
-    for figure in map(laid_out, drawn.values()):
+    for figure in drawn.values():
         legend = figure.legends[0].get_window_extent()
         assert [text.get_text() for text in figure.legends[0].get_texts()] == labels
         assert within(figure, legend)
