@@ -43,6 +43,7 @@ from mgs.splat import render
 from mgs.splat_ply import read_ply
 
 VIEWS = 8
+SETTINGS = NbvSettings(dataset="data", prior="prior")
 
 
 def model(n=500):
@@ -68,10 +69,6 @@ def images_of(truth, start, views=VIEWS):
     noisy = [target + rng.normal(0, 0.002, target.shape) for target in targets]
     known = [np.dstack([target, np.ones(target.shape[:2])]).astype(np.float32) for target in noisy]
     return Images(cameras, known, lambda of: start, range(views))
-
-
-def settings(tmp_path, **train):
-    return NbvSettings(dataset=tmp_path, prior=tmp_path, train=TrainSettings(**train))
 
 
 @given(st.integers(1, 6), st.floats(0.01, 3), st.floats(0.05, 4), st.integers(0, 10**6))
@@ -135,13 +132,13 @@ def test_only_those_gaussians_learn_a_kind_that_are_asked_to(optimiser):
     assert fit(start, cameras, targets, train, learns=everyone).gaussians == whole
 
 
-def test_scales_are_learned_where_they_are_wrong(tmp_path):
+def test_scales_are_learned_where_they_are_wrong():
     truth = model()
     wrong = np.arange(len(truth)) % 10 == 0
     off = 0.3 * wrong[:, None].astype(np.float32)
     start = dataclasses.replace(truth, log_scales=truth.log_scales + off)
-    told, images, given = [], images_of(truth, start), settings(tmp_path)
-    found = lean_fit(images, given, sh="0", say=told.append)
+    told, images = [], images_of(truth, start)
+    found = lean_fit(images, SETTINGS, sh="0", say=told.append)
     scale, colour = found.learned["scale"], found.learned["colour"]
     assert scale[wrong & colour].mean() > 2 * scale[~wrong & colour].mean()
     assert found.left_out is None
@@ -153,30 +150,30 @@ def test_scales_are_learned_where_they_are_wrong(tmp_path):
     counts = {kind: int(mask.sum()) for kind, mask in found.learned.items()}
     assert found.parameters == sum(counts[kind] * size for kind, size in sizes.items())
     assert told == ["fitting all parameters", "fitting what the images pay for"]
-    everything = lean_fit(images, given, learn="all", sh="0")
+    everything = lean_fit(images, SETTINGS, learn="all", sh="0")
     assert found.parameters < everything.parameters == 11 * colour.sum()
     assert found.whole == everything.whole == everything.gaussians
-    more = lean_fit(images, given, sh="0", loss=0.0)
+    more = lean_fit(images, SETTINGS, sh="0", loss=0.0)
     assert found.parameters < more.parameters < everything.parameters
 
 
-def test_what_no_image_sees_is_not_learned(tmp_path):
+def test_what_no_image_sees_is_not_learned():
     truth = model()
     hidden = np.arange(len(truth)) >= 450
     truth.means[hidden, 2] += 1000.0  # high above all views
-    found = lean_fit(images_of(truth, truth), settings(tmp_path), sh="0")
+    found = lean_fit(images_of(truth, truth), SETTINGS, sh="0")
     assert not any(mask[hidden].any() for mask in found.learned.values())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("shine", "degree"), [(0.0, 0), (0.3, 1)])
-def test_colours_have_a_degree_where_the_truth_has_one(tmp_path, shine, degree):
+def test_colours_have_a_degree_where_the_truth_has_one(shine, degree):
     start = model()
     truth = start.with_degree(1)  # with colours of its own
     start.sh *= 0.8  # so that there is something to learn
     # All of them shine in the same direction.
     truth.sh[:, 1:] = shine * np.random.default_rng(1).normal(size=(1, 3, 1))
-    found = lean_fit(images_of(truth, start), settings(tmp_path), learn="all")
+    found = lean_fit(images_of(truth, start), SETTINGS, learn="all")
     assert found.gaussians.sh_degree == degree
     assert found.left_out.pays == bool(degree)
     assert (found.left_out.gain > 0.5) == bool(degree)
@@ -185,13 +182,13 @@ def test_colours_have_a_degree_where_the_truth_has_one(tmp_path, shine, degree):
         assert not found.gaussians.sh[~found.learned[DIRECTIONAL], 1:].any()
 
 
-def test_few_views_leave_no_choice_of_a_degree(tmp_path):
+def test_few_views_leave_no_choice_of_a_degree():
     start = model()
-    found = lean_fit(images_of(start, start, views=BLOCKS - 1), settings(tmp_path))
+    found = lean_fit(images_of(start, start, views=BLOCKS - 1), SETTINGS)
     assert (found.gaussians.sh_degree, found.left_out) == (0, None)
 
 
-def test_each_view_is_left_out_once_with_its_neighbours(tmp_path, monkeypatch):
+def test_each_view_is_left_out_once_with_its_neighbours(monkeypatch):
     start, fitted, judged = model(60), [], []
     images = dataclasses.replace(images_of(start, start), order=[3, 1, 0, 2, 5, 4, 7, 6])
 
@@ -205,15 +202,15 @@ def test_each_view_is_left_out_once_with_its_neighbours(tmp_path, monkeypatch):
 
     monkeypatch.setattr(evidence, "fitted", fit_to)
     monkeypatch.setattr(evidence, "_squared_error", error_at)
-    evidence.directional_gain(images, settings(tmp_path), None)
+    evidence.directional_gain(images, SETTINGS, None)
     left = [sorted(set(range(VIEWS)) - set(views)) for views in fitted[::2]]
     assert left == [[1, 3], [0, 2], [4, 5], [6, 7]]
     assert fitted[::2] == fitted[1::2]
     assert judged[::2] == [images.cameras[i] for i in images.order]
 
 
-def test_lambda_of_each_kind(tmp_path):
-    lam, of = regularisation(settings(tmp_path), 2), kinds(2)
+def test_lambda_of_each_kind():
+    lam, of = regularisation(SETTINGS, 2), kinds(2)
     assert list(of) == ["colour", DIRECTIONAL, "scale", "rotation", "opacity"]
     assert [columns.stop for columns in of.values()] == [3, 27, 30, 34, 35]
     assert np.allclose(lam[of["colour"]], 0.02**2)

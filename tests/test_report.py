@@ -3,6 +3,7 @@ file is missing."""
 
 import io
 import json
+import re
 import shutil
 from itertools import pairwise
 
@@ -55,11 +56,6 @@ def change_steps(run, change):
     """Change each line of steps.jsonl of a run."""
     lines = [json.dumps(change(line)) + "\n" for line in read_steps(run)]
     (run / "steps.jsonl").write_text("".join(lines))
-
-
-def edit(path, **values):
-    """Change values in a JSON file."""
-    write_json(path, read_json(path) | values)
 
 
 def without(word):
@@ -224,55 +220,38 @@ def test_runs_of_one_policy_are_told_apart_by_their_folders(runs, tmp_path):
         compare_runs([runs[1], runs[1]])
 
 
+def edit(name, **values):
+    """A change of a run: other values in a JSON file."""
+    return lambda run: write_json(run / name, read_json(run / name) | values)
+
+
+def remove(name):
+    """A change of a run: a file is gone."""
+    return lambda run: (run / name).unlink()
+
+
 def unfinished(run):
-    """Take its last steps away, as if it had been evaluated on the way."""
+    """A change of a run: it was stopped and evaluated after two steps."""
     lines = (run / "steps.jsonl").read_text().splitlines(keepends=True)
     (run / "steps.jsonl").write_text("".join(lines[:3]))
-    (run / "gaussians.ply").unlink()
-    edit(run / "metrics.json", images=5)
+    remove("gaussians.ply")(run)
+    edit("metrics.json", images=5)(run)
 
 
 UNFIT = {
-    "measured before": (
-        lambda run: edit(run / "metrics.json", images=7),
-        r"not evaluated since its last step; measure it with `mgs\.evaluate",
-    ),
-    "another dataset": (lambda run: change_settings(run, dataset="/elsewhere"), "another dataset"),
-    "frames changed": (lambda run: edit(run / "config.json", frames=[]), "its frames differ"),
-    "view not measured": (
-        lambda run: edit(run / "metrics.json", views=[], test_views=[]),
-        "was not evaluated on kf_",
-    ),
-    "pictures of another model": (
-        lambda run: edit(run / "metrics.json", pictures=False),
-        r"no picture of this model; draw it with `mgs\.evaluate",
-    ),
-    "no pictures": (lambda run: shutil.rmtree(run / "renders"), r"draw it with `mgs\.evaluate"),
-    "metrics of views without numbers": (
-        lambda run: edit(run / "metrics.json", views=[{}]),
-        r"metrics\.json: is damaged; measure",
-    ),
-    "budget raised": (
-        lambda run: change_settings(run, budget=7),
-        r"is unfinished, with 8 of 10 views; go on with `mgs\.resume_nbv",
-    ),
-    "unfinished": (unfinished, r"is unfinished, with 5 of 8 views; go on with `mgs\.resume_nbv"),
-    "no model": (
-        lambda run: (run / "gaussians.ply").unlink(),
-        r"has all 8 views, but no gaussians\.ply; write it with `mgs\.resume_nbv",
-    ),
-    "budget of words": (
-        lambda run: change_settings(run, budget="many"),
-        r"config\.json: settings.budget: Input should be a valid integer.*start the run anew",
-    ),
-    "no step": (
-        lambda run: (run / "steps.jsonl").unlink(),
-        r"steps\.jsonl: no such file; .*resume_nbv",
-    ),
-    "a line without a key": (
-        lambda run: change_steps(run, without("frame")),
-        r"steps\.jsonl: line 2 is damaged \(frame: .*anew with `mgs\.resume_nbv",
-    ),
+    "measured before": (edit("metrics.json", images=7), "not evaluated since its last step"),
+    "damaged metrics": (edit("metrics.json", views=[{}]), "metrics.json: is damaged; measure"),
+    "view not measured": (edit("metrics.json", views=[], test_views=[]), "not evaluated on kf_"),
+    "other pictures": (edit("metrics.json", pictures=False), "no picture of this model"),
+    "no pictures": (lambda run: shutil.rmtree(run / "renders"), "draw it with `mgs.evaluate"),
+    "another dataset": (lambda run: change_settings(run, dataset="/else"), "another dataset"),
+    "frames changed": (edit("config.json", frames=[]), "its frames differ"),
+    "budget of words": (lambda run: change_settings(run, budget="many"), "settings.budget: "),
+    "budget raised": (lambda run: change_settings(run, budget=7), "with 8 of 10 views; go on"),
+    "unfinished": (unfinished, "is unfinished, with 5 of 8 views; go on with `mgs.resume_nbv"),
+    "no model": (remove("gaussians.ply"), "but no gaussians.ply; write it with `mgs.resume_nbv"),
+    "no step": (remove("steps.jsonl"), "steps.jsonl: no such file"),
+    "no frame": (lambda run: change_steps(run, without("frame")), "line 2 is damaged (frame: "),
 }
 
 
@@ -280,7 +259,7 @@ UNFIT = {
 def test_runs_that_cannot_be_reported(runs, tmp_path, change, named):
     run = shutil.copytree(runs[1], tmp_path / "run")
     change(run)
-    with pytest.raises(InputError, match=named):
+    with pytest.raises(InputError, match=re.escape(named)):
         writing.write_report(tmp_path / "report", [runs[0], run])
     assert not (tmp_path / "report").exists()
 
