@@ -21,7 +21,6 @@ from mgs.fit.fitting import fit
 from mgs.fit.settings import TrainSettings
 from mgs.gaussians import LEARNED
 from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD
-from mgs.report import evidence
 from mgs.report.evaluation import evaluate_run
 from mgs.report.evidence import (
     BLOCKS,
@@ -186,27 +185,6 @@ def test_few_views_leave_no_choice_of_a_degree():
     start = model()
     found = lean_fit(images_of(start, start, views=BLOCKS - 1), SETTINGS)
     assert (found.gaussians.sh_degree, found.left_out) == (0, None)
-
-
-def test_each_view_is_left_out_once_with_its_neighbours(monkeypatch):
-    start, fitted, judged = model(60), [], []
-    images = dataclasses.replace(images_of(start, start), order=[3, 1, 0, 2, 5, 4, 7, 6])
-
-    def fit_to(images, views, *_):
-        fitted.append(list(views))
-        return start
-
-    def error_at(model, camera, target, cache):
-        judged.append(camera)
-        return 1.0
-
-    monkeypatch.setattr(evidence, "fitted", fit_to)
-    monkeypatch.setattr(evidence, "_squared_error", error_at)
-    evidence.directional_gain(images, SETTINGS, None)
-    left = [sorted(set(range(VIEWS)) - set(views)) for views in fitted[::2]]
-    assert left == [[1, 3], [0, 2], [4, 5], [6, 7]]
-    assert fitted[::2] == fitted[1::2]
-    assert judged[::2] == [images.cameras[i] for i in images.order]
 
 
 def test_lambda_of_each_kind():

@@ -117,13 +117,6 @@ def test_a_fault_of_the_prior_leaves_the_prior_as_it_was(lab, name):
     assert np.array_equal(prior.points, before)
 
 
-def test_signs_of_a_good_fit_and_of_a_shifted_prior(lab):
-    _, good = faults.indicators_of(lab, lab.even(5))
-    shifted = faults.shifted(lab.prior, 0.4, np.random.default_rng(0))
-    _, bad = faults.indicators_of(lab.changed(prior=shifted), lab.even(5))
-    assert bad["prior"] > 2 * good["prior"]
-
-
 def test_even_views_turn(lab):
     assert lab.even(5) == [0, 2, 4, 6, 8]
     assert sorted(lab.even(5, 0.5)) == [1, 3, 5, 7, 9]
