@@ -4,7 +4,7 @@ real browser."""
 import json
 import re
 import shutil
-from html.parser import HTMLParser
+from types import SimpleNamespace
 from urllib.parse import unquote
 
 import numpy as np
@@ -56,39 +56,21 @@ def page(runs):
     return path
 
 
-class Parsed(HTMLParser):
+def read_page(path):
     """Links, addresses that are loaded, text outside of scripts, and the data of a page."""
-
-    def __init__(self, path) -> None:
-        super().__init__()
-        self.links, self.loaded, self.inside = [], [], []
-        self.said, self.json = [], ""
-        self.feed(path.read_text())
-        self.text = " ".join(" ".join(self.said).split())
-        self.data = json.loads(self.json)
-
-    def handle_starttag(self, tag, attrs):
-        values = dict(attrs)
-        self.inside.append((tag, values.get("id")))
-        if tag == "a":
-            self.links.append(values["href"])
-        elif address := values.get("src") or (tag == "link" and values["href"]):
-            self.loaded.append(address)
-
-    def handle_endtag(self, tag):
-        while self.inside and self.inside.pop()[0] != tag:
-            pass
-
-    def handle_data(self, data):
-        tag, name = self.inside[-1] if self.inside else ("", None)
-        if name == "data":
-            self.json += data
-        elif tag not in ("script", "style"):
-            self.said.append(data)
+    page = path.read_text()
+    data = re.search(r'<script[^>]* id="data"[^>]*>(.*?)</script>', page, re.DOTALL)
+    tags = re.sub(r"(<(script|style)\b[^>]*>).*?</\2>", r"\1", page, flags=re.DOTALL)
+    return SimpleNamespace(
+        links=re.findall(r'<a [^>]*href="([^"]*)"', tags),
+        loaded=re.findall(r'<(?:link\b[^>]* href|\w+\b[^>]* src)="([^"]*)"', tags),
+        text=" ".join(re.sub(r"<[^>]*>", " ", tags).split()),
+        data=json.loads(data[1]),
+    )
 
 
 def test_the_page_says_what_the_files_say(page, runs):
-    parsed, metrics = Parsed(page), read_json(runs[0] / "metrics.json")
+    parsed, metrics = read_page(page), read_json(runs[0] / "metrics.json")
     data = parsed.data
     assert parsed.loaded == ["data:,"]
     for group in ("all", "held_out"):
@@ -120,7 +102,7 @@ def test_the_page_says_what_the_files_say(page, runs):
 
 
 def test_links_lead_to_the_files(page, runs):
-    links = Parsed(page).links
+    links = read_page(page).links
     assert all((page.parent / unquote(link)).is_file() for link in links)
     names = {link.rsplit("/", 1)[-1] for link in links}
     assert names >= {"gaussians.ply", "kf_0001.exr", "config.json", "metrics.json"}
@@ -188,13 +170,13 @@ def test_what_is_not_there_is_left_out(runs, tmp_path):
     metrics = read_json(run / "metrics.json")
     write_json(run / "metrics.json", metrics | {"images": 5})
     write_page(tmp_path / "with.html", [run])
-    data = Parsed(tmp_path / "with.html").data
+    data = read_page(tmp_path / "with.html").data
     assert data["pictures"]
     captions = [view["pictures"][1]["caption"] for view in data["runs"][0]["views"]]
     assert set(captions) == {"render"}
     (run / "gaussians.ply").unlink()
     write_page(tmp_path / "without.html", [run])
-    parsed = Parsed(tmp_path / "without.html")
+    parsed = read_page(tmp_path / "without.html")
     assert parsed.data["pictures"] == {}
     assert parsed.data["compared"] == []
     assert "metrics.json is of 5 images, the model of 6" in parsed.text
@@ -210,7 +192,7 @@ def test_test_views_are_compared_and_their_metrics_shown(runs, tmp_path):
     mean = metrics["test"]["psnr"]
     typical = min(metrics["test_views"], key=lambda view: abs(view["psnr"] - mean))
     write_page(tmp_path / "page.html", runs[:1])
-    parsed = Parsed(tmp_path / "page.html")
+    parsed = read_page(tmp_path / "page.html")
     compared = parsed.data["compared"]
     tests = [one["view"] for one in compared if one["view"].startswith("test/")]
     assert sorted(tests) == ["test/kf_0000", "test/kf_0001", "test/kf_0002"]

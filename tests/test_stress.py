@@ -84,23 +84,20 @@ def lab(root):
 @pytest.mark.parametrize("name", faults.IMAGE_FAULTS)
 def test_a_fault_of_images_is_a_pure_function_that_grows_with_its_size(root, name):
     frame = faults.captured(load_dataset(root / "dataset").frames[0])
-    arrays = ("pixels", "rgba", "z", "rock")
     function, sizes, _ = faults.IMAGE_FAULTS[name]
-    before = [getattr(frame, one).copy() for one in arrays]
-    changes = []
+
+    def arrays(of):
+        return [of.pixels, of.rgba, of.z, of.rock, of.camera.world_to_camera]
+
+    before, changes = [array.copy() for array in arrays(frame)], []
     for size in sizes:
-        spoiled, again = (function(frame, size, np.random.default_rng(3)) for _ in range(2))
-        for one in arrays:
-            assert np.array_equal(getattr(spoiled, one), getattr(again, one))
-            assert getattr(spoiled, one).shape == getattr(frame, one).shape
-            assert np.isfinite(getattr(spoiled, one)).all()
-        moved = np.abs(spoiled.camera.world_to_camera - frame.camera.world_to_camera).sum()
-        pairs = ((spoiled.rgba, frame.rgba), (spoiled.z, frame.z))
-        changes.append(moved + sum(np.abs(a.astype(float) - b).sum() for a, b in pairs))
+        spoiled, again = (arrays(function(frame, size, np.random.default_rng(3))) for _ in range(2))
+        pairs = list(zip(spoiled, before, strict=True))
+        assert all(map(np.array_equal, spoiled, again))
+        assert all(a.shape == b.shape and np.isfinite(a).all() for a, b in pairs)
+        changes.append(sum(np.abs(a.astype(float) - b).sum() for a, b in pairs))
     assert 0 < changes[0] < changes[1] < changes[2]
-    assert all(
-        np.array_equal(a, getattr(frame, one)) for a, one in zip(before, arrays, strict=True)
-    )
+    assert all(map(np.array_equal, arrays(frame), before))
 
 
 @pytest.mark.parametrize("name", faults.PRIOR_FAULTS)

@@ -110,32 +110,30 @@ def test_what_the_kernel_draws(run):
 def test_a_world_of_large_numbers_is_shown_smaller(run):
     """Depth in a browser ends at 160: with 1,000 times the lengths of a run all would be behind
     that."""
-    subject = read_subject(run)
-    assert subject.scale == 1
+    subject, factor = read_subject(run), 1000
     assert scaled(subject) is subject
-
-    g, factor = subject.gaussians, 1000
-    larger = g.log_scales + np.float32(np.log(factor))
+    g, mesh = subject.gaussians, subject.mesh
     views = [
         replace(view, frame=replace(view.frame, camera=view.frame.camera.scaled(factor)))
         for view in subject.views
     ]
+    larger = replace(
+        g, means=factor * g.means, log_scales=g.log_scales + np.float32(np.log(factor))
+    )
     large = replace(
         subject,
-        gaussians=replace(g, means=factor * g.means, log_scales=larger),
+        gaussians=larger,
         views=views,
-        mesh=replace(subject.mesh, vertices=factor * subject.mesh.vertices),
+        mesh=replace(mesh, vertices=factor * mesh.vertices),
     )
     shown = scaled(large)
     assert np.ptp(shown.mesh.vertices) == pytest.approx(shown.scale * np.ptp(large.mesh.vertices))
-    for layer in ("colour", "depth", "uncertainty"):
-        cameras = shown.views[1].frame.camera, subject.views[1].frame.camera
-        picture, depth, ends = layers.kernel_image(shown, cameras[0], layer)
-        expected, _, true_ends = layers.kernel_image(subject, cameras[1], layer)
-        np.testing.assert_allclose(picture, expected, atol=2)
-        assert depth[depth < layers.FAR].max() < 2.5 * 40
-        scale = factor if layer == "depth" else 1
-        assert ends == pytest.approx(tuple(scale * end for end in true_ends), rel=1e-4)
+    camera, shown_camera = (one.views[1].frame.camera for one in (subject, shown))
+    picture, depth, ends = layers.kernel_image(shown, shown_camera, "depth")
+    expected, _, true_ends = layers.kernel_image(subject, camera, "depth")
+    np.testing.assert_allclose(picture, expected, atol=2)
+    assert depth[depth < layers.FAR].max() < 2.5 * 40
+    assert ends == pytest.approx((factor * true_ends[0], factor * true_ends[1]), rel=1e-4)
 
 
 def test_covariances_have_the_scales_and_the_axes(run):
