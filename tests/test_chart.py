@@ -7,7 +7,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import tiny
 import typer
@@ -17,7 +16,6 @@ from refusals import refused
 from mgs.cli.app import app
 from mgs.errors import InputError
 from mgs.fit.settings import ALPHA_WEIGHT, COLOURS_ALONE, TrainSettings
-from mgs.prior.settings import PriorSettings
 from mgs.run.nbv import run_nbv, start_run
 from mgs.run.settings import PRESETS, NbvSettings, with_defaults
 from mgs.study import case, chart, photographs, timing
@@ -121,18 +119,6 @@ def test_a_run_with_a_preset_writes_what_it_came_to(dataset, prior, tmp_path, mo
             start_run(dataset, tmp_path / "built", seeds=3, **options)
     density = PRESETS["accurate"].density
     assert [(given.density, given.gaussians) for given in asked] == [(density, None), (density, 50)]
-
-
-def test_the_density_of_a_prior_is_samples_for_each_pixel():
-    from mgs.data.meshes import Mesh
-    from mgs.prior.build import _samples
-
-    corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    square = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.ones(2, bool))
-    counts = [len(_samples(square, PriorSettings(density=d), None, 0.05)[0]) for d in (1, 4)]
-    assert counts[1] / counts[0] == pytest.approx(4, rel=0.05)
-    with pytest.raises(InputError, match="density 0 must be positive"):
-        PriorSettings(density=0)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from mgs.camera import Camera, look_at
 from mgs.data.meshes import Mesh
 from mgs.errors import InputError
 from mgs.policy.criteria import PIXEL_NOISE
-from mgs.prior.build import build_prior, prior_from_mesh
+from mgs.prior.build import _samples, build_prior, prior_from_mesh
 from mgs.prior.resolution import PIXELS_OF_PHOTOGRAPHS, PIXELS_PER_SAMPLE, resolution
 from mgs.prior.settings import PriorSettings
 from mgs.study import case, parsimony
@@ -43,6 +43,15 @@ def test_a_flat_square_asks_for_one_sample_in_so_many_pixels(height, focal):
     assert found.spacing == pytest.approx(PIXELS_PER_SAMPLE * found.pixel)
     assert found.area == pytest.approx(1)
     assert found.samples == round((1 / (PIXELS_PER_SAMPLE * height / focal)) ** 2)
+
+
+def test_a_density_is_samples_for_each_pixel():
+    once, four = (
+        len(_samples(square(), PriorSettings(density=density), None, 0.05)[0]) for density in (1, 4)
+    )
+    assert four / once == pytest.approx(4, rel=0.05)
+    with pytest.raises(InputError, match="density 0 must be positive"):
+        PriorSettings(density=0)
 
 
 def test_only_cameras_count_that_see_the_face():
