@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 from urllib.parse import unquote
 
 import numpy as np
@@ -114,22 +115,17 @@ def test_the_page_is_the_same_every_time(page, runs):
     assert (page.parent / "again.html").read_bytes() == page.read_bytes()
 
 
-def test_uncertainty_falls_with_every_view(runs, monkeypatch):
+def test_uncertainty_falls_with_every_view(runs):
     """The maps before and after a view are those of the exact information of the views until then,
     as written out here."""
     from mgs.policy.criteria import regularisation
     from mgs.splat import fisher, groups
 
-    run, shown = open_run(runs[0]), {}
-    monkeypatch.setattr(
-        page_pictures.Album,
-        "add_uncertainty",
-        lambda self, name, values, alpha: shown.update({name: values}),
-    )
+    run, album = open_run(runs[0]), MagicMock()
     frames, model = run.taken, run.state.gaussians
-    album = page_pictures.new_album(frames, 10)
     noise = run.settings.pixel_noise, run.settings.prior_std
     page_pictures.draw_taken(album, "a", model, frames, noise, lambda: None)
+    shown = {name: values for (name, values, _), _ in album.add_uncertainty.call_args_list}
     lam = regularisation(groups(0), *noise)
     H = np.zeros((tiny.POINTS, 11))
     for frame in frames:
