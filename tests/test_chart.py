@@ -124,7 +124,7 @@ def test_a_run_with_a_preset_writes_what_it_came_to(dataset, prior, tmp_path, mo
 @pytest.fixture
 def small(dataset, monkeypatch):
     """A size of few points on the tiny dataset, with a prior that is there already and a reference
-    that costs nothing."""
+    that costs little."""
     tiny.write_dataset(dataset / "test", frames=3)
     size = replace(chart.SIZES["quick"], densities=(1 / 8,), passes=(2,), seeds=3, count=4)
     point = chart.Point(4, passes=2)
@@ -132,7 +132,9 @@ def small(dataset, monkeypatch):
     some = {"both": [point, replace(point, passes=1)], "preset": presets}
     monkeypatch.setitem(chart.SIZES, "quick", size)
     monkeypatch.setattr(chart, "factors", lambda size: some)
-    monkeypatch.setattr(timing, "_reference", lambda: lambda: sum(range(1000)))
+    monkeypatch.setattr(timing, "_reference", timing._reference.__wrapped__)  # without its cache
+    monkeypatch.setattr(timing, "REFERENCE_GAUSSIANS", 100)
+    monkeypatch.setattr(timing, "REFERENCE_SIZE", (32, 24))
 
     def made(root, out, dataset, density):
         if not (out / "prior").exists():

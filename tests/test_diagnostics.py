@@ -88,11 +88,14 @@ def test_a_pixel_is_unobserved_where_most_of_its_weight_is(near):
     assert maps["unobserved"][12, 16] == near
 
 
-def test_maps_of_an_empty_view_are_zero():
+def test_maps_of_an_empty_view_are_zero(tmp_path):
     gaussians, camera = two_in_a_row()
     away = Camera(camera.K, 33, 25, look_at((0, -2, 0), (0, -3, 0)))
-    maps = diagnostics.view_maps(gaussians, away, {"information": np.ones(2)})
+    scalars = {name: np.ones(2) for name in diagnostics.PANELS if name != "Z"}
+    maps = diagnostics.view_maps(gaussians, away, scalars)
     assert all((values == 0).all() for values in maps.values())
+    diagnostics.write_preview(tmp_path / "empty.png", maps, "empty")
+    assert (tmp_path / "empty.png").is_file()
 
 
 @pytest.fixture(scope="module")
