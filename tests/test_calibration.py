@@ -58,20 +58,13 @@ def test_residual_variance_is_the_weighted_mean_over_pixels(tmp_path):
     write_png(tmp_path / "truth.png", truth)
     frame = Frame("truth", camera, 0.0, tmp_path / "truth.png", None, None)
     found = predicted_error.residual_variance(gaussians, [frame, frame])
-    weights = np.stack(  # of each Gaussian: the image in which it alone is white, by the oracle
-        [reference.render(one_white(gaussians, j), camera)["rgb"][..., 0] for j in range(5)]
-    )
+    # Weights of a Gaussian: the oracle's image in which it alone is white.
+    white = [predicted_error._coloured(gaussians, one) for one in np.eye(5)]
+    weights = np.stack([reference.render(one, camera)["rgb"][..., 0] for one in white])
     rendered = reference.render(gaussians, camera)["rgb"]
     error = np.square(rendered - frame.target()[0][..., :3]).mean(-1)
     expected = (weights * error).sum((1, 2)) / weights.sum((1, 2))
     np.testing.assert_allclose(found, expected, rtol=1e-4)
-
-
-def one_white(gaussians, j):
-    """All others black, j white."""
-    grey = np.zeros(len(gaussians))
-    grey[j] = 1
-    return predicted_error._coloured(gaussians, grey)
 
 
 def judge(errors, sigma):

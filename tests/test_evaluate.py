@@ -19,15 +19,7 @@ from mgs.colour import srgb_from_linear
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr, write_png
-from mgs.metrics import (
-    METRICS,
-    OPAQUE,
-    PSNR_LIMIT,
-    SURFACE_METRICS,
-    compare_surface,
-    psnr,
-    ssim,
-)
+from mgs.metrics import METRICS, OPAQUE, PSNR_LIMIT, SURFACE_METRICS, compare_surface, psnr, ssim
 from mgs.report import evaluation
 from mgs.report.evaluation import evaluate_model, evaluate_run, read_comparison, write_comparison
 from mgs.run.folder import read_checkpoint
