@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 import synthetic
+import trimesh
 from program import command
 
 from mgs.camera import Camera, look_at
@@ -20,15 +21,13 @@ from mgs.study.case import Size
 from mgs.study.verdict import judged
 
 
-def square(side=20):
+def square():
     """The unit square in the plane z = 0, made of triangles that face upwards."""
-    x, y = (grid.ravel() / side - 0.5 for grid in np.mgrid[: side + 1, : side + 1])
-    i, j = (grid.ravel() for grid in np.mgrid[:side, :side])
-    a = i * (side + 1) + j
-    faces = np.concatenate(
-        [np.stack([a, a + side + 1, a + 1], 1), np.stack([a + 1, a + side + 1, a + side + 2], 1)]
-    )
-    return Mesh(np.stack([x, y, 0 * x], 1), faces, np.ones(len(faces), bool))
+    corners = [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]]
+    mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]])
+    for _ in range(4):
+        mesh = mesh.subdivide()
+    return Mesh(mesh.vertices, mesh.faces, np.ones(len(mesh.faces), bool))
 
 
 def camera_above(height, focal=100.0, size=400, x=0.0):
