@@ -102,7 +102,7 @@ def test_the_page_says_what_the_files_say(page, runs):
     assert not trained & {view["view"] for view in data["compared"]}
 
 
-def test_links_lead_to_the_files(page, runs):
+def test_links_lead_to_the_files(page):
     links = read_page(page).links
     assert all((page.parent / unquote(link)).is_file() for link in links)
     names = {link.rsplit("/", 1)[-1] for link in links}

@@ -91,7 +91,7 @@ def test_surfaces_from_photographs_have_fewer_samples(data):
     assert numbers["spacing"] == pytest.approx(PIXELS_OF_PHOTOGRAPHS * pixel, rel=0.01)
 
 
-def test_a_given_mesh_takes_its_number_from_the_pixels_too(data, tmp_path, capsys):
+def test_a_given_mesh_takes_its_number_from_the_pixels_too(data, tmp_path):
     synthetic.rock_mesh().export(tmp_path / "rock.ply")
     command("prior", data.root, "--out", tmp_path / "p", "--mesh", tmp_path / "rock.ply")
     assert "resolution" in json.loads((tmp_path / "p/prior.json").read_text())

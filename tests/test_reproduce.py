@@ -399,7 +399,7 @@ def test_an_oracle_that_sees_the_truth_is_best_in_its_first_choice(quick, tmp_pa
     assert "| rank correlation of the score with the gain | ring |" in text
 
 
-def test_scores_equal_to_the_gains_foretell_them(monkeypatch):
+def test_scores_equal_to_the_gains_foretell_them():
     psnr = [20.0, 22.0, 21.0]
     scores = {"right": psnr, "wrong": [3, 1, 2], "same": [1, 1, 1]}
 

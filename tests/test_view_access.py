@@ -89,7 +89,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("name", "value"), [(k, v) for k, values in BAD.items() for v in values])
-def test_a_camera_that_is_none_is_not_drawn(viewer, name, value):
+def test_a_camera_that_is_none_is_not_drawn(name, value):
     good = {"fov": 1.0, "image_width": 32, "image_height": 24}
     good |= {"wxyz": np.array([1.0, 0, 0, 0]), "position": np.zeros(3)}
     assert window_camera(SimpleNamespace(**good)) is not None
