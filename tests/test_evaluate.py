@@ -5,6 +5,7 @@ import math
 import threading
 import time
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from PIL import Image
 from refusals import listing
 from synthetic import orbit_cameras, write_dataset
 
-from mgs.colour import srgb_from_linear
+from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr, write_png
@@ -343,3 +344,17 @@ def test_convergence_needs_the_prior(dataset, prior, tmp_path):
     prior.rename(tmp_path / "elsewhere")
     with pytest.raises(InputError, match="prior"):
         evaluate_run(run, pictures=False, convergence=True)
+
+
+def test_srgb_models_are_measured_as_they_blend():
+    ours, camera = tiny.initial([]), tiny.orbit()[0]
+    blended = evaluation.render_view(ours, camera)[0]
+    found = evaluation.render_view(replace(ours, linear=False), camera)[0]
+    assert blended.max() > 0.2
+    np.testing.assert_array_equal(found, linear_from_srgb(np.clip(blended, 0, 1)))
+
+
+def test_a_run_is_measured_on_its_own_dataset(dataset, prior, tmp_path):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    with pytest.raises(InputError, match="is a run, with its own dataset"):
+        evaluation.evaluate(run, dataset)

@@ -17,9 +17,9 @@ from test_splat_ply import assert_close
 from mgs.colour import srgb_from_linear
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
-from mgs.report.exporting import Model, in_srgb, to_y_up
+from mgs.report.exporting import in_srgb, to_y_up
 from mgs.splat.reference import sh_basis
-from mgs.splat_files import FORMATS, Y_UP_SH, gaussians_and_space, load_gaussians, write_gaussians
+from mgs.splat_files import FORMATS, Y_UP_SH, load_gaussians, write_gaussians
 from mgs.splat_ply import write_ply
 
 TOLERANCES = {
@@ -36,9 +36,9 @@ def unit(quats: np.ndarray) -> np.ndarray:
     return quats * np.sign(largest) / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
-def written(tmp_path, kind: str, model: Gaussians, space: str = "srgb"):
+def written(tmp_path, kind: str, model: Gaussians):
     path = tmp_path / f"x{FORMATS[kind]}"
-    write_gaussians(path, model, kind, space, to_y_up((0, 0, 1)))
+    write_gaussians(path, model, kind, to_y_up((0, 0, 1)))
     return path
 
 
@@ -88,18 +88,18 @@ def test_a_compressed_ply_holds_the_same_gaussians(tmp_path, degree):
 @pytest.mark.parametrize("kind", FORMATS)
 def test_antialiasing_and_the_space_of_colours_are_kept_where_a_format_can(tmp_path, kind):
     pytest.importorskip("gsply_cpp")
-    for antialiased, space in ((True, "linear"), (False, "srgb")):
-        model = replace(gaussians(0), antialiased=antialiased)
-        read, found = gaussians_and_space(written(tmp_path, kind, model, space))
-        assert read.antialiased == (antialiased and kind != "spz")
-        assert found == (space if kind in ("ply", "glb") else "srgb")
+    for marked in (True, False):
+        model = replace(gaussians(0), antialiased=marked, linear=marked)
+        read = load_gaussians(written(tmp_path, kind, model))
+        assert read.antialiased == (marked and kind != "spz")
+        assert read.linear == (marked and kind in ("ply", "glb"))
 
 
 def test_colours_become_srgb(tmp_path):
     flat = gaussians(0)
-    shown = in_srgb(Model(flat, "linear")).gaussians
+    shown = in_srgb(flat)
     np.testing.assert_allclose(shown.rgb, srgb_from_linear(flat.rgb), atol=1e-5)
-    lifted = in_srgb(Model(flat.with_degree(3), "linear")).gaussians
+    lifted = in_srgb(flat.with_degree(3))
     np.testing.assert_allclose(lifted.rgb, shown.rgb, atol=1e-5)
     np.testing.assert_allclose(lifted.sh[:, 1:], 0, atol=1e-5)
 

@@ -16,6 +16,7 @@ from program import command, steps, timeless
 from refusals import refused
 from scipy.ndimage import gaussian_filter
 
+import mgs
 from mgs.camera import look_at, opengl_from_opencv
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError, Notice
@@ -337,3 +338,15 @@ def test_the_simulated_drone(tmp_path, capfd):
     assert (run / "gaussians.ply").read_bytes() == before
     command("eval", run)
     assert read_rgba(next((run / "dataset/images").iterdir())).shape == (48, 64, 4)
+
+
+def test_a_refused_picture_gets_the_next_number_whatever_lies_beside_it(tmp_path):
+    for name in ("kf.png", "kf.refused-1x.png", "kf.refused-2.png"):
+        (tmp_path / name).touch()
+    live._set_aside(tmp_path / "kf.png")
+    assert (tmp_path / "kf.refused-3.png").is_file()
+
+
+def test_a_scene_and_live_capture_exclude_each_other(tmp_path):
+    with pytest.raises(InputError, match=r"renders images, and .* awaits them"):
+        mgs.run_nbv(None, tmp_path / "run", capture="boulder", live=lambda pose, out: None)

@@ -85,7 +85,8 @@ def test_the_page_says_what_the_files_say(page, runs):
     gain, both = plots["Information gain of each chosen view (the paper's Fig. 2)"]
     assert gain["y"] == [step["information_gain"] for step in steps[1:]]
     assert len(both["y"]) == 1
-    assert plots["Surface coverage (Fig. 3)"][0]["y"] == [100 * step["coverage"] for step in steps]
+    covered = plots["Gaussians observed (coverage, Fig. 3)"][0]["y"]
+    assert covered == [100 * step["coverage"] for step in steps]
     views = data["runs"][0]["views"]
     taken = [*steps[0]["seed_names"], *(step["name"] for step in steps[1:])]
     assert [view["name"] for view in views] == taken
@@ -93,7 +94,7 @@ def test_the_page_says_what_the_files_say(page, runs):
     captions = [view["pictures"][1]["caption"] for view in views]
     assert captions == [f"render, {psnr[name]}" for name in taken]
     facts = {key for view in views for key in dict(view["facts"])}
-    assert facts >= {"information gain", "surface coverage", "PSNR (dB)"}
+    assert facts >= {"information gain", "Gaussians observed", "PSNR (dB)"}
     shown = [view for one in data["runs"] for view in one["views"]]
     for picture in (picture for view in shown for picture in view["pictures"]):
         assert picture["alt"]

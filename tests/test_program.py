@@ -6,6 +6,7 @@ import sys
 import tiny
 from program import command
 
+from mgs.cli.app import _hint
 from mgs.run.folder import read_checkpoint
 from mgs.splat_ply import read_ply
 
@@ -45,3 +46,11 @@ def test_a_damaged_model_is_restored_from_the_checkpoint(dataset, prior, tmp_pat
     assert read_ply(model) == read_checkpoint(run).gaussians
     command("eval", run, "--no-pictures")
     assert "restored" not in capsys.readouterr().err
+
+
+def test_the_hint_knows_options_with_an_equals_sign(tmp_path):
+    (tmp_path / "config.json").touch()
+    given = ["nbv", "data", f"--out={tmp_path}", "--capture-command=fly {pose}", "--seed", "3"]
+    again = f"; continue with: mgs nbv --resume {tmp_path} --capture-command 'fly {{pose}}'"
+    assert _hint(given) == again
+    assert _hint(["fit", "data", "--out", str(tmp_path)]) == again.partition(" --capture")[0]

@@ -285,9 +285,12 @@ def test_a_run_that_learns_means_is_refitted_too(run, tmp_path, means):
     assert held.mean() == pytest.approx(1 - found.lean.learned["mean"].mean())
 
 
-def test_a_prior_that_is_gone_is_one_line(run, tmp_path):
+def test_a_run_that_cannot_be_refitted_is_one_line(run, tmp_path):
     shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns(REFITTED))
     change_settings(tmp_path / "run", prior=str(tmp_path / "nowhere"))
     with pytest.raises(InputError, match="nowhere"):
+        refit_run(tmp_path / "run")
+    change_settings(tmp_path / "run", train={"density": "adaptive", "means": "free"})
+    with pytest.raises(InputError, match="needs a run with density fixed"):
         refit_run(tmp_path / "run")
     assert not (tmp_path / "run" / REFITTED).exists()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tiny
 from PIL import Image
-from program import command
+from program import change_settings, command
 from refusals import refused
 
 from mgs.report import story
@@ -60,17 +60,22 @@ def test_a_film_has_its_frames_and_their_lengths(tmp_path, ending):
     assert found == [(0, 200), (120, 200), (250, 600)]
 
 
-@pytest.mark.parametrize(("beside", "count"), [("uncertainty", 5), ("truth", tiny.FRAMES)])
-def test_the_command_draws_pictures_side_by_side(run, tmp_path, beside, count):
+@pytest.mark.parametrize(
+    ("beside", "count", "path"),
+    [("uncertainty", 5, ["--fps", 5, "--path", "cameras"]), ("truth", tiny.FRAMES, [])],
+)
+def test_the_command_draws_pictures_side_by_side(run, tmp_path, beside, count, path):
     out = tmp_path / "a.png"
-    command("video", run, "--out", out, "--seconds", 1, "--fps", 5, "--beside", beside)
+    command("video", run, "--out", out, "--seconds", 1, "--beside", beside, *path)
     with Image.open(out) as image:
         assert image.n_frames == count
         assert image.size == (2 * tiny.WIDTH + 4, tiny.HEIGHT)
 
 
 def test_the_story_has_a_frame_for_each_view(run, tmp_path, monkeypatch):
-    def models(run, progress):
+    change_settings(run, policy="python:mine.best")  # the story chooses nothing
+
+    def models(run, problem):
         for count in range(1, len(run.state.taken) + 1):
             yield replace(run.state, taken=run.state.taken[:count])
 
@@ -88,3 +93,6 @@ def test_refusals(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     line = refused(capsys, ["video", run, "--out", tmp_path / "a.mp4"], tmp_path)
     assert "`pip install imageio-ffmpeg`, or write a .gif" in line
+    for option, with_it in (("--fps", "--beside truth"), ("--width", "--story")):
+        given = ["video", run, "--out", tmp_path / "b.gif", option, 20, *with_it.split()]
+        assert f"{option}: is not used with {with_it}" in refused(capsys, given, tmp_path)

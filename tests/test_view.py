@@ -77,9 +77,10 @@ def test_a_ply_is_read(run, tmp_path, space):
     if space == "srgb":  # another tool's file does not say that its colours are linear
         path.write_bytes(re.sub(rb"comment [^\n]*\n", b"", path.read_bytes()))
     subject = read_subject(path)
-    assert (subject.space, subject.views, subject.mesh) == (space, [], None)
+    assert (subject.views, subject.mesh) == ([], None)
     assert layers.layers(subject) == ["colour", "alpha", "depth"]
     rgb = subject.gaussians.rgb
+    assert subject.gaussians.linear == (space == "linear")
     expected = srgb_from_linear(rgb) if space == "linear" else np.clip(rgb, 0, 1)
     colours = layers.gaussian_colours(subject, "colour")
     np.testing.assert_allclose(colours, 255 * expected, atol=0.51)
@@ -342,7 +343,7 @@ def test_the_viewer_in_a_browser(browser, run):
         np.testing.assert_allclose(shown.mean((0, 1)), frame.mean((0, 1)), atol=6)
         choose(tab, "View", chosen.frame.name)
         tab.get_by_text("chosen at step 1").wait_for()
-        tab.get_by_text("surface coverage then").wait_for()
+        tab.get_by_text("Gaussians observed then").wait_for()
 
         tab.get_by_text("Look from there").click()
         own = chosen.frame.camera
