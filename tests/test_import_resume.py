@@ -4,7 +4,6 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -52,14 +51,6 @@ def many(source: Path) -> list:
     return ["import", source, "--mesh", source / "rock.glb", "--out"]
 
 
-def ends_as_one_go(arguments: list, out: Path) -> None:
-    """Finish the import in `out`, and compare it with one that was not interrupted."""
-    whole = out.with_name("whole")
-    command(*arguments, out)
-    command(*arguments, whole)
-    assert listing(out) == listing(whole)
-
-
 def test_killed_in_the_middle_and_given_again(many, tmp_path, monkeypatch):
     """A real process, a real signal; then no finished frame is read again."""
     out = tmp_path / "out"
@@ -81,53 +72,37 @@ def test_killed_in_the_middle_and_given_again(many, tmp_path, monkeypatch):
     assert listing(out) == listing(tmp_path / "whole")
 
 
-def stopped(arguments: list, out: Path, monkeypatch) -> Path:
-    """The folder of an import that ended after two frames."""
-    write, calls = importers.write_png, []
-
-    def stop(path: Path, *rest: Any, **options: Any) -> None:
-        calls.append(path.parent.name)
-        if calls.count("images") == 3:
-            raise KeyboardInterrupt
-        write(path, *rest, **options)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(importers, "write_png", stop)
-        assert exit_code(*arguments, out) == 130
-    return out
+def unfinished(source: Path, arguments: list, out: Path, capsys) -> None:
+    """Import the four frames before a damaged image, and mend it."""
+    image = source / "images/kf_0004.png"
+    whole = image.read_bytes()
+    image.write_bytes(whole[:100])
+    assert exit_code(*arguments, out) == 2
+    assert "kf_0004.png: not a readable image" in said(capsys)[1]
+    assert len(list((out / "images").iterdir())) == 4
+    image.write_bytes(whole)
 
 
-def test_an_unfinished_import_of_something_else_is_refused(
-    source, many, tmp_path, monkeypatch, capsys
-):
-    out = stopped(many, tmp_path / "out", monkeypatch)
-    said(capsys)
+def test_an_unfinished_import_of_something_else_is_refused(source, many, tmp_path, capsys):
+    out = tmp_path / "out"
+    unfinished(source, many, out, capsys)
     other = synthetic.write_dataset(tmp_path / "other").root
     trimesh.creation.icosphere(subdivisions=2).export(tmp_path / "ball.ply")
     masks, ball = ["--masks", source / "masks"], ["--mesh", tmp_path / "ball.ply"]
     smaller = [source, "--mesh", source / "rock.glb", "--downscale", "2"]
-    for arguments in ([source], [other], [source, *masks], [source, *ball], smaller):
+    for arguments in ([other], [source, *masks], [source, *ball], smaller):
         line = refused(capsys, ["import", *arguments, "--out", out], out)
         assert "unfinished dataset of other settings or sources" in line
     write_json(source / "transforms.json", read_json(source / "transforms.json") | {"cx": 30.0})
     assert "unfinished dataset" in refused(capsys, [*many, out], out)
 
 
-def test_a_frame_whose_files_changed_is_made_again(source, many, tmp_path, monkeypatch):
-    out = stopped(many, tmp_path / "out", monkeypatch)
+def test_a_frame_whose_files_changed_is_made_again(source, many, tmp_path, capsys):
+    unfinished(source, many, tmp_path / "out", capsys)
     write_png(source / "images/kf_0000.png", np.full((48, 64, 3), 0.5))
-    ends_as_one_go(many, out)
-
-
-def test_a_damaged_image_in_the_middle_keeps_the_frames_before(source, many, tmp_path, capsys):
-    out, image = tmp_path / "out", source / "images/kf_0004.png"
-    whole = image.read_bytes()
-    image.write_bytes(whole[:100])
-    assert exit_code(*many, out) == 2
-    assert "kf_0004.png: not a readable image" in said(capsys)[1]
-    assert len(list((out / "images").iterdir())) == 4
-    image.write_bytes(whole)
-    ends_as_one_go(many, out)
+    command(*many, tmp_path / "out")
+    command(*many, tmp_path / "whole")
+    assert listing(tmp_path / "out") == listing(tmp_path / "whole")
 
 
 def test_killed_before_the_first_frame(many, tmp_path):
