@@ -20,7 +20,7 @@ from mgs.errors import InputError
 
 MOUNT = tracks.rigid((0.1, -0.2, 0.3), (0.5, -0.5, 0.5, -0.5))
 """Camera to body of the robot."""
-OPTICAL, DEPTH_UNIT = "camera_color_optical_frame", 1e-3
+OPTICAL = "camera_color_optical_frame"
 
 
 @pytest.fixture(scope="module")
@@ -28,29 +28,50 @@ def dataset(tmp_path_factory):
     return synthetic.write_dataset(tmp_path_factory.mktemp("recordings") / "data")
 
 
-def millimetres(frame) -> np.ndarray:
-    return np.round(frame.depth() / DEPTH_UNIT).astype(np.uint16)
+def opencv_K(camera) -> np.ndarray:
+    """K with pixel centres at whole numbers, as all of these programs have it."""
+    return camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+
+
+def quaternion(pose: np.ndarray) -> list[float]:
+    return Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+
+
+def pose_line(time: float, frame, *more: int) -> str:
+    """time x y z qx qy qz qw of a frame, and more."""
+    pose = frame.camera.camera_to_world
+    return " ".join(map(repr, [time, *pose[:3, 3].tolist(), *quaternion(pose), *more]))
+
+
+def copy_images(dataset, colour: Path, depth: Path, unit: float = 1e-3) -> None:
+    """Images of a dataset as 0.png, 1.png and so on, and depth as 16-bit PNG."""
+    colour.mkdir(parents=True)
+    depth.mkdir()
+    for k, frame in enumerate(dataset.frames):
+        shutil.copy(frame.image_path, colour / f"{k}.png")
+        steps = np.round(frame.depth() / unit).astype(np.uint16)
+        Image.fromarray(steps).save(depth / f"{k}.png")
 
 
 class Bag:
     """A bag in which a robot records the frames of a dataset, two a second."""
 
     def __init__(self, path: Path, version: int, storage: str = "SQLITE3") -> None:
+        pytest.importorskip("rosbags")
         from rosbags.rosbag1 import Writer as Writer1
         from rosbags.rosbag2 import StoragePlugin
         from rosbags.rosbag2 import Writer as Writer2
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         self.version, self.connections = version, {}
-        store = Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE
-        self.store = get_typestore(store)
         if version == 1:
+            self.store = get_typestore(Stores.ROS1_NOETIC)
             text = "geometry_msgs/TransformStamped[] transforms"
             self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
-        plugin = StoragePlugin[storage]
-        self.writer = (
-            Writer1(path) if version == 1 else Writer2(path, version=9, storage_plugin=plugin)
-        )
+            self.writer = Writer1(path)
+        else:
+            self.store = get_typestore(Stores.ROS2_HUMBLE)
+            self.writer = Writer2(path, version=9, storage_plugin=StoragePlugin[storage])
 
     def make(self, kind: str, *values):
         return self.store.types[kind](*values)
@@ -84,33 +105,27 @@ class Bag:
         self.write(topic, "sensor_msgs/msg/CompressedImage", time, head, form, data)
 
     def lens(self, topic: str, time: float, camera) -> None:
-        K = camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-        numbers = np.zeros(5), K.ravel(), np.eye(3).ravel(), np.eye(3, 4).ravel()
+        K = opencv_K(camera).ravel()
+        numbers = np.zeros(5), K, np.eye(3).ravel(), np.eye(3, 4).ravel()
         roi = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
         size = camera.height, camera.width, "plumb_bob"
         head = self.header(time, OPTICAL)
         self.write(topic, "sensor_msgs/msg/CameraInfo", time, head, *size, *numbers, 0, 0, roi)
 
-    def pose(self, pose: np.ndarray):
-        """(translation, quaternion) as values of messages."""
-        turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
-        return pose[:3, 3].tolist(), self.make("geometry_msgs/msg/Quaternion", *turn)
+    def pose(self, kind: str, place: str, pose: np.ndarray):
+        """A message of a place and a quaternion."""
+        at = self.make(f"geometry_msgs/msg/{place}", *pose[:3, 3].tolist())
+        turn = self.make("geometry_msgs/msg/Quaternion", *quaternion(pose))
+        return self.make(f"geometry_msgs/msg/{kind}", at, turn)
 
     def tf(self, topic: str, time: float, parent: str, child: str, pose: np.ndarray) -> None:
-        place, turn = self.pose(pose)
-        move = self.make("geometry_msgs/msg/Vector3", *place)
-        step = self.make("geometry_msgs/msg/Transform", move, turn)
-        head = self.header(time, parent)
+        head, step = self.header(time, parent), self.pose("Transform", "Vector3", pose)
         stamped = self.make("geometry_msgs/msg/TransformStamped", head, child, step)
         self.write(topic, "tf2_msgs/msg/TFMessage", time, [stamped])
 
     def stamped(self, topic: str, time: float, pose: np.ndarray) -> None:
-        place, turn = self.pose(pose)
-        made = self.make(
-            "geometry_msgs/msg/Pose", self.make("geometry_msgs/msg/Point", *place), turn
-        )
-        head = self.header(time, "map")
-        self.write(topic, "geometry_msgs/msg/PoseStamped", time, head, made)
+        made = self.pose("Pose", "Point", pose)
+        self.write(topic, "geometry_msgs/msg/PoseStamped", time, self.header(time, "map"), made)
 
 
 def write_bag(
@@ -145,74 +160,58 @@ def write_bag(
                 topic = f"{topic}/compressedDepth"
                 bag.compressed_depth(topic, time + 0.01, compressed, frame.depth())
             else:
-                bag.image(topic, time + 0.01, "16UC1", millimetres(frame))
+                millimetres = np.round(1000 * frame.depth()).astype(np.uint16)
+                bag.image(topic, time + 0.01, "16UC1", millimetres)
     return path
 
 
 def write_tum(root: Path, dataset) -> Path:
-    """Folder as of the benchmark, with poses between the images only."""
-    root.mkdir()
-    listed = {"rgb": [], "depth": [], "groundtruth": ["# timestamp tx ty tz qx qy qz qw"]}
-    for k, frame in enumerate(dataset.frames):
-        (root / "rgb").mkdir(exist_ok=True)
-        (root / "depth").mkdir(exist_ok=True)
-        shutil.copy(frame.image_path, root / f"rgb/{k}.png")
-        depth = np.round(frame.depth() * 5000).astype(np.uint16)
-        Image.fromarray(depth).save(root / f"depth/{k}.png")
-        listed["rgb"].append(f"{100 + k} rgb/{k}.png")
-        listed["depth"].append(f"{100.01 + k} depth/{k}.png")
-        pose = frame.camera.camera_to_world
-        turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
-        listed["groundtruth"].append(
-            " ".join(map(repr, [100.0 + k, *pose[:3, 3].tolist(), *turn.tolist()]))
-        )
+    """Folder as of the benchmark."""
+    copy_images(dataset, root / "rgb", root / "depth", unit=1 / 5000)
+    frames = list(enumerate(dataset.frames))
+    listed = {
+        "rgb": [f"{100 + k} rgb/{k}.png" for k, _ in frames],
+        "depth": [f"{100.01 + k} depth/{k}.png" for k, _ in frames],
+        "groundtruth": ["# timestamp tx ty tz qx qy qz qw"]
+        + [pose_line(100.0 + k, frame) for k, frame in frames],
+    }
     for kind, lines in listed.items():
         (root / f"{kind}.txt").write_text("\n".join(lines))
-    K = dataset.frames[0].camera.K
-    (root / "calibration.txt").write_text(f"{K[0, 0]} {K[1, 1]} {K[0, 2] - 0.5} {K[1, 2] - 0.5}")
+    K = opencv_K(dataset.frames[0].camera)
+    (root / "calibration.txt").write_text(f"{K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]}")
     return root
 
 
 def write_open3d(root: Path, dataset) -> Path:
     """Folder with color/, depth/, trajectory.log and camera_intrinsic.json."""
-    for kind in ("color", "depth"):
-        (root / kind).mkdir(parents=True)
+    copy_images(dataset, root / "color", root / "depth")
     text, camera = "", dataset.frames[0].camera
     for k, frame in enumerate(dataset.frames):
-        shutil.copy(frame.image_path, root / f"color/{k:06d}.png")
-        Image.fromarray(millimetres(frame)).save(root / f"depth/{k:06d}.png")
-        matrix = "\n".join(
-            " ".join(map(repr, row)) for row in frame.camera.camera_to_world.tolist()
-        )
-        text += f"{k} {k} {k + 1}\n{matrix}\n"
+        rows = [" ".join(map(repr, row)) for row in frame.camera.camera_to_world.tolist()]
+        text += "\n".join([f"{k} {k} {k + 1}", *rows, ""])
     (root / "trajectory.log").write_text(text)
-    K = camera.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     record = {"width": camera.width, "height": camera.height}
-    record["intrinsic_matrix"] = K.T.ravel().tolist()
+    record["intrinsic_matrix"] = opencv_K(camera).T.ravel().tolist()
     (root / "camera_intrinsic.json").write_text(json.dumps(record))
     return root
 
 
 def write_rtabmap(root: Path, dataset) -> Path:
     """Folder of `rtabmap-export`, with calibrations as OpenCV writes them."""
-    for kind in ("rgb", "depth", "calib"):
-        (root / f"rtabmap_{kind}").mkdir(parents=True)
+    copy_images(dataset, root / "rtabmap_rgb", root / "rtabmap_depth")
+    (root / "rtabmap_calib").mkdir()
     lines = ["#timestamp x y z qx qy qz qw id"]
-    for k, frame in enumerate(dataset.frames, 1):
-        shutil.copy(frame.image_path, root / f"rtabmap_rgb/{k}.png")
-        Image.fromarray(millimetres(frame)).save(root / f"rtabmap_depth/{k}.png")
+    for k, frame in enumerate(dataset.frames):
         file = cv2.FileStorage(str(root / f"rtabmap_calib/{k}.yaml"), cv2.FILE_STORAGE_WRITE)
-        file.write("camera_matrix", frame.camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        file.write("camera_matrix", opencv_K(frame.camera))
         file.write("distortion_coefficients", np.zeros((1, 5)))
         file.release()
-        pose = frame.camera.camera_to_world
-        turn = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
-        lines.append(" ".join(map(repr, [100.0 + k, *pose[:3, 3].tolist(), *turn, k])))
+        lines.append(pose_line(100.0 + k, frame, k))
     (root / "rtabmap_camera_poses.txt").write_text("\n".join(lines))
     return root
 
 
-def write_metashape(root: Path, dataset, more: str = "") -> Path:
+def write_metashape(root: Path, dataset) -> Path:
     """cameras.xml of half the scale, which its chunk states; images beside it."""
     shutil.copytree(dataset.root / "images", root / "images")
     camera, rows = dataset.frames[0].camera, ""
@@ -224,7 +223,7 @@ def write_metashape(root: Path, dataset, more: str = "") -> Path:
         rows += f"<transform>{words}</transform></camera>"
     rows += '<camera id="99" sensor_id="0" label="not_aligned"/>'
     size = f'<resolution width="{camera.width}" height="{camera.height}"/>'
-    inner = f"{size}<f>{camera.K[0, 0]}</f>{more}"
+    inner = f"{size}<f>{camera.K[0, 0]}</f>"
     lens = f'<calibration type="frame" class="adjusted">{inner}</calibration>'
     (root / "cameras.xml").write_text(
         '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="Chunk 1">'
@@ -236,11 +235,10 @@ def write_metashape(root: Path, dataset, more: str = "") -> Path:
 
 WRITERS = {
     "ROS bag 2": lambda root, data: write_bag(root / "bag", data),
-    "ROS bag MCAP": lambda root, data: write_bag(root / "bag", data, storage="MCAP"),
-    "ROS bag 1": lambda root, data: write_bag(root / "one.bag", data, 1),
-    "ROS bag poses": lambda root, data: write_bag(root / "bag", data, poses="stamped"),
-    "ROS bag 16UC1": lambda root, data: write_bag(root / "bag", data, compressed="16UC1"),
-    "ROS bag 32FC1": lambda root, data: write_bag(root / "one.bag", data, 1, compressed="32FC1"),
+    "ROS bag MCAP": lambda root, data: write_bag(
+        root / "bag", data, storage="MCAP", poses="stamped", compressed="16UC1"
+    ),
+    "ROS bag 1": lambda root, data: write_bag(root / "one.bag", data, 1, compressed="32FC1"),
     "TUM RGB-D": lambda root, data: write_tum(root / "tum", data),
     "Open3D": lambda root, data: write_open3d(root / "open3d", data),
     "RTAB-Map": lambda root, data: write_rtabmap(root / "rtabmap", data),
@@ -250,8 +248,6 @@ WRITERS = {
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_cameras_pixels_and_depth_are_those_recorded(dataset, tmp_path, capsys, kind):
-    if kind.startswith("ROS"):
-        pytest.importorskip("rosbags")
     source, out = WRITERS[kind](tmp_path, dataset), tmp_path / "out"
     command("import", source, "--out", out)
     printed, _ = said(capsys)
@@ -270,13 +266,11 @@ def test_cameras_pixels_and_depth_are_those_recorded(dataset, tmp_path, capsys, 
 
 def test_keyframes_by_distance(dataset, tmp_path):
     source = write_tum(tmp_path / "tum", dataset)
-    steps = np.linalg.norm(
-        np.diff([frame.camera.position for frame in dataset.frames], axis=0), axis=1
-    )
-    out = tmp_path / "out"
-    command("import", source, "--out", out, "--keyframes", f"{1.5 * steps[0]}m")
-    names = [frame.camera.position.tolist() for frame in load_dataset(out).frames]
-    assert np.allclose(names, [frame.camera.position for frame in dataset.frames[::2]], atol=1e-6)
+    eyes = np.array([frame.camera.position for frame in dataset.frames])
+    step = np.linalg.norm(eyes[1] - eyes[0])
+    command("import", source, "--out", tmp_path / "out", "--keyframes", f"{1.5 * step}m")
+    chosen = [frame.camera.position for frame in load_dataset(tmp_path / "out").frames]
+    assert np.allclose(chosen, eyes[::2], atol=1e-6)
 
 
 def test_poses_are_interpolated():
@@ -290,61 +284,51 @@ def test_poses_are_interpolated():
     assert tracks.Track.of([(1.0, end)]).at(9.0)[0, 3] == 2
 
 
-@pytest.mark.parametrize("text", ["", "0.5", "m", "-1s", "1 km", "nan s"])
+@pytest.mark.parametrize("text", ["", "0.5", "-1s", "1 km"])
 def test_bad_spacings(text):
     with pytest.raises(InputError, match="expected seconds or metres"):
         tracks.Spacing.parse(text)
 
 
-def damage(root: Path, name: str, old: str, new: str) -> None:
-    path = root / name
-    path.write_text(path.read_text().replace(old, new))
-
-
-BROKEN = {
-    "no tf": (lambda r, d: write_bag(r / "bag", d, leave_out="tf"), "record /tf and /tf_static"),
-    "no info": (
-        lambda r, d: write_bag(r / "bag", d, leave_out="camera_info"),
-        "has no camera_info",
-    ),
-    "no colour": (lambda r, d: write_bag(r / "bag", d, leave_out="colour"), "images are none"),
-    "no bag": (lambda r, d: _text(r / "x.bag", "no bag"), "not a readable ROS bag"),
-    "no calibration": (
-        lambda r, d: _without(write_tum(r / "t", d), "calibration.txt"),
-        "fx fy cx cy",
-    ),
-    "few columns": (lambda r, d: _line(write_tum(r / "t", d), "groundtruth.txt"), "fewer than 8"),
-    "no numbers": (lambda r, d: _line(write_tum(r / "t", d), "calibration.txt"), "not all numbers"),
-    "poses": (lambda r, d: _line(write_open3d(r / "o", d), "trajectory.log"), "fewer than 3"),
-    "not XML": (lambda r, d: _text(r / "x.xml", "<a"), "no XML of Metashape"),
-    "b2": (lambda r, d: write_metashape(r / "m", d, "<b2>1</b2>"), "b2 or k4"),
-    "yaml": (
-        lambda r, d: _text(write_rtabmap(r / "r", d) / "rtabmap_calib/3.yaml", "x").parent.parent,
-        "camera_matrix",
-    ),
+LEFT_OUT = {
+    "tf": "record /tf and /tf_static",
+    "camera_info": "has no camera_info",
+    "colour": "images are none",
 }
 
 
-def _text(path: Path, text: str) -> Path:
-    path.write_text(text)
-    return path
+@pytest.mark.parametrize("topic", LEFT_OUT)
+def test_a_bag_without_a_topic_is_one_line(dataset, tmp_path, capsys, topic):
+    source = write_bag(tmp_path / "bag", dataset, leave_out=topic)
+    line = refused(capsys, ["import", source, "--out", tmp_path / "out"], tmp_path)
+    assert LEFT_OUT[topic] in line
 
 
-def _without(root: Path, name: str) -> Path:
-    (root / name).unlink()
-    return root
+def nonsense(path: Path) -> None:
+    path.write_text(path.read_text() + "\nnonsense\n")
 
 
-def _line(root: Path, name: str) -> Path:
-    with open(root / name, "a") as file:
-        file.write("\nnonsense\n")
-    return root
+def halved(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-@pytest.mark.parametrize("case", BROKEN)
-def test_refusals_are_one_line(dataset, tmp_path, capsys, case):
-    if "bag" in case or case in ("no tf", "no info", "no colour"):
-        pytest.importorskip("rosbags")
-    make, message = BROKEN[case]
-    source = make(tmp_path, dataset)
+def b2(path: Path) -> None:
+    path.write_text(path.read_text().replace("</f>", "</f><b2>1</b2>"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "damage", "message"),
+    [
+        ("ROS bag 1", "one.bag", halved, "not a readable ROS bag"),
+        ("TUM RGB-D", "calibration.txt", Path.unlink, "fx fy cx cy"),
+        ("TUM RGB-D", "calibration.txt", nonsense, "not all numbers"),
+        ("TUM RGB-D", "groundtruth.txt", nonsense, "fewer than 8"),
+        ("Metashape", "cameras.xml", halved, "no XML of Metashape"),
+        ("Metashape", "cameras.xml", b2, "b2 or k4"),
+        ("RTAB-Map", "3.yaml", halved, "camera_matrix"),
+    ],
+)
+def test_damaged_recordings_are_one_line(dataset, tmp_path, capsys, kind, name, damage, message):
+    source = WRITERS[kind](tmp_path, dataset)
+    damage(next(tmp_path.rglob(name)))
     assert message in refused(capsys, ["import", source, "--out", tmp_path / "out"], tmp_path)
