@@ -135,15 +135,6 @@ def test_the_target_of_a_mask_has_no_weight_along_its_outline(folder):
     np.testing.assert_array_equal(boundary(mask), [[False, False, True, True, False, False]] * 5)
 
 
-def test_test_views_are_a_dataset_in_the_folder_test(folder):
-    assert load_dataset(folder).test_views() is None
-    _write(folder / "test", count=3)
-    views = load_dataset(folder).test_views()
-    assert len(views) == 3
-    assert views.frames[0].image_path == folder / "test/images/kf_0000.png"
-    assert len(load_dataset(folder)) == 6
-
-
 def test_a_camera_has_no_skew_and_whole_pixels():
     for entry in ((0, 1), (1, 0), (2, 0), (2, 1), (2, 2)):  # nothing else reads these entries
         skewed = K.copy()

@@ -13,7 +13,6 @@ from scipy.special import spence
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import Dataset
 from mgs.errors import InputError
-from mgs.gaussians import ARRAYS, Gaussians
 from mgs.images import write_png
 from mgs.prior.build import Prior, build_prior, load_prior, prior_from_mesh, save_prior
 from mgs.prior.initial import (
@@ -181,21 +180,20 @@ def test_behind_the_surface_lies_an_opaque_backing(dataset, backed):
     inward = np.einsum("nk,nk->n", surface.means[over] - backing.means, prior.normals[over])
     np.testing.assert_allclose(inward, prior.spacing, rtol=1e-3)
     np.testing.assert_array_equal(backing.sh, surface.sh[over])
-    both = prior.points, prior.points[over]
-    apart = [cKDTree(points).query(points, 2)[0][:, 1] for points in both]
+    apart = [
+        cKDTree(points).query(points, 2)[0][:, 1] for points in (prior.points, prior.points[over])
+    ]
     assert apart[1].min() > 1.1 * apart[0].mean()  # a random subset would have nearer neighbours
 
-    faded = replace(surface, logit_opacities=np.full(800, -3, np.float32))
+    opacities = np.full(800, -3, np.float32)
+    faded = replace(surface, logit_opacities=opacities)
+    opacities = np.concatenate([opacities, gaussians.logit_opacities[800:]])
+    both = replace(gaussians, logit_opacities=opacities)
     for frame in dataset.frames[:3]:
         inner = binary_erosion(frame.mask(), iterations=3)
-        models = faded, joined(faded, backing)
-        alpha, hidden = (np.asarray(render(g, frame.camera).alpha)[inner] for g in models)
+        alpha, hidden = (np.asarray(render(g, frame.camera).alpha)[inner] for g in (faded, both))
         assert alpha.mean() < 0.6
         assert hidden.min() > 0.9
-
-
-def joined(a: Gaussians, b: Gaussians) -> Gaussians:
-    return Gaussians(*(np.concatenate([getattr(a, name), getattr(b, name)]) for name in ARRAYS))
 
 
 def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(

@@ -40,7 +40,6 @@ end_header
 0 1 0
 {last}
 """
-NO_AREA = "none of its faces has an area"
 
 
 def ply(faces: int, last: str) -> str:
@@ -53,22 +52,16 @@ def obj(a: str, b: str, c: str) -> str:
 
 BAD_MESHES: dict[str, tuple[str, str | None, str]] = {
     "missing": ("a.ply", None, "no such mesh"),
-    "empty file, PLY": ("a.ply", "", "not a readable mesh"),
-    "empty file, OBJ": ("a.obj", "", "no faces"),
-    "empty file, GLB": ("a.glb", "", "not a readable mesh"),
     "damaged": ("a.ply", "ply\nformat nonsense", "not a readable mesh"),
     "unknown format": ("a.xyz9", "1 2 3", "not a readable mesh"),
     "point cloud, PLY": ("a.ply", ply(0, "0 0 1"), "has no faces"),
-    "point cloud, XYZ": ("a.xyz", "0 0 0\n1 1 1\n2 0 1\n", "not a readable mesh"),
     "lines": ("a.obj", f"{TRIANGLE}l 1 2 3\n", "has no faces"),
-    "NaN vertex": ("a.obj", obj("0 0 nan", "1 0 0", "0 1 0"), "vertex 0 is NaN"),
     "infinite vertex": ("a.obj", obj("0 0 0", "inf 0 0", "0 1 0"), "vertex 1 is NaN or infinite"),
     "NaN vertex of no face": ("a.ply", ply(1, "nan 0 0\n3 0 1 2"), "vertex 3 is NaN"),
     "vertex too far": ("a.obj", obj("0 0 0", "1e200 0 0", "0 1e200 0"), "further than"),
     "vertex that is not there": ("a.ply", ply(1, "0 0 1\n3 0 1 9"), "names vertex 9 of 4"),
     "negative vertex": ("a.ply", ply(1, "0 0 1\n3 0 1 -1"), "names vertex -1 of 4"),
-    "no area": ("a.obj", obj("0 0 0", "1 0 0", "2 0 0"), NO_AREA),
-    "all one point": ("a.obj", obj("1 1 1", "1 1 1", "1 1 1"), NO_AREA),
+    "no area": ("a.obj", obj("0 0 0", "1 0 0", "2 0 0"), "none of its faces has an area"),
 }
 
 
@@ -138,7 +131,6 @@ def _spoilt() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     no_area = [[0, 0, 0], [3, 3, 5], [0, 1, n]]
     both = np.concatenate
     return {
-        "faces twice": (v, both([f, f[some[:, 0]]])),
         "faces twice, the second time inside out": (v, both([f, turned])),
         "all of it twice, with vertices of its own": (both([v, v]), both([f, turned + n])),
         "faces without area": (both([v, (v[:1] + v[1:2]) / 2]), both([no_area, f])),
@@ -184,11 +176,3 @@ def test_a_single_triangle_and_a_fold_are_sampled(dataset, tmp_path):
     corners, faces = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 1]])
     normals = sample_surface(Mesh(corners, faces, np.ones(2, bool)), 0, count=40)[1]
     assert np.allclose(np.abs(normals), [0, 0, 1])
-
-
-def test_a_mesh_with_holes_is_sampled(tmp_path):
-    mesh = synthetic.rock_mesh()
-    mesh.update_faces(np.random.default_rng(0).random(len(mesh.faces)) > 0.2)
-    mesh.export(tmp_path / "holes.ply")
-    prior = prior_from_mesh(tmp_path / "holes.ply", PriorSettings(gaussians=200, backing=0))
-    assert len(prior.points) == 200

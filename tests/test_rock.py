@@ -38,9 +38,7 @@ def test_rock_stands_in_the_ground_at_its_size():
 
 def test_rock_is_a_function_of_the_seed():
     a, b, c = (make_rock(COARSE, generator(seed, "rock")) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(a.vertices, b.vertices)
-    textures = [rock.visual.material.baseColorTexture.tobytes() for rock in (a, b)]
-    assert textures[0] == textures[1]
+    assert to_glb(a) == to_glb(b)
     assert len(a.vertices) != len(c.vertices) or not np.allclose(a.vertices, c.vertices)
 
 
@@ -126,5 +124,3 @@ def test_leaving_out_a_face_keeps_the_normals_and_uv_of_the_file(tmp_path):
     np.testing.assert_array_equal(mended.visual.uv, good.visual.uv)
     assert set(good.faces[0]) == {0, 1, 2}  # of no other face
     np.testing.assert_array_equal(mended.vertex_normals[3:], good.vertex_normals[3:])
-    new = np.tile(good.face_normals[1], (3, 1))
-    assert not np.array_equal(good.vertex_normals[3:6], new)
