@@ -8,7 +8,6 @@ import pytest
 import synthetic
 from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
-from scipy.special import spence
 
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import Dataset
@@ -105,19 +104,6 @@ def test_outlines_are_where_they_are_in_the_images(dataset, prior, antialiased):
         return float(np.mean(shares)) - 1
 
     assert excess(0) > 2 * abs(excess(None))
-
-
-def test_one_layer_hides_what_is_behind_it():
-    """The mean log-transmittance of INITIAL_OPACITY, in closed form and over a lattice."""
-    dilogarithm = spence(1 - INITIAL_OPACITY)
-    closed = -2 * np.pi * IN_PLANE_SCALE**2 * dilogarithm
-    x = np.arange(-8, 8) + 0.0
-    lattice = np.stack(np.meshgrid(x, x), -1).reshape(-1, 2)
-    at = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 2))
-    square = ((at[:, None] - lattice) ** 2).sum(-1)
-    summed = np.log1p(-INITIAL_OPACITY * np.exp(-square / (2 * IN_PLANE_SCALE**2))).sum(1).mean()
-    assert closed == pytest.approx(summed, rel=0.01)
-    assert np.exp(closed) < 0.04
 
 
 def test_colours_are_those_of_the_seen_surface(prior, dataset):

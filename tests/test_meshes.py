@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import synthetic
 import trimesh
-from program import command, said
+from program import command
 from refusals import refused
 
 from mgs.data import meshes
@@ -108,17 +108,6 @@ def test_a_mesh_that_is_small_and_far_away_is_one_line(tmp_path):
     (tmp_path / "a.obj").write_text(obj("1e6 0 0", "1000001 0 0", "1e6 1 0"))
     with pytest.raises(InputError, match="float32 does not resolve"):
         prior_from_mesh(tmp_path / "a.obj", PriorSettings(gaussians=100))
-
-
-def test_the_record_of_a_given_mesh_says_what_was_done(dataset, tmp_path, capsys):
-    options = ["--mesh", dataset.root / "rock.glb", "--gaussians", 100, "--random-seed", 3]
-    command("prior", dataset.root, *options, "--out", tmp_path / "p")
-    used = {"gaussians": 100, "spacing": None, "seed": 3, "backing": 0.5}
-    prior = load_prior(tmp_path / "p")
-    assert prior.numbers["settings"] == used
-    assert np.abs(synthetic.level(prior.points)).max() < 0.01
-    assert (tmp_path / "p/prior.png").is_file()
-    assert "some frame saw" not in said(capsys)[0]
 
 
 def _spoilt() -> dict[str, tuple[np.ndarray, np.ndarray]]:

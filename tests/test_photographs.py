@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import photographs
 import pytest
 import synthetic
 import trimesh
@@ -18,6 +17,7 @@ from program import command, exit_code, said
 from refusals import refused
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from mgs.camera import Camera, look_at
 from mgs.data.check import check_dataset
@@ -25,7 +25,6 @@ from mgs.data.clouds import SparseCloud, read_cloud, views_of, write_cloud
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.data.frames import Frame
 from mgs.data.importers import import_source
-from mgs.data.lens import shrunk
 from mgs.data.masks import make_masks
 from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.sources import read_source
@@ -42,6 +41,7 @@ from mgs.prior.points import _grown, main_cluster, on_surface, reliable
 from mgs.prior.scattered import scattered
 from mgs.prior.settings import PriorSettings
 from mgs.splat_files import load_gaussians
+from mgs.synth.orbit import perturb
 
 
 @pytest.fixture(autouse=True)
@@ -57,12 +57,52 @@ def exact(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return synthetic.write_dataset(root, synthetic.orbit_cameras(24, 96, 72))
 
 
+SCALE, SHIFT = 0.37, np.array([2.0, -1.0, 0.5])
+TURN = Rotation.from_rotvec([1.9, -0.7, 0.4]).as_matrix()
+"""Similarity from the orbit to the world of its COLMAP model: SCALE * TURN @ x + SHIFT."""
+
+
 @pytest.fixture(scope="module")
 def colmap(exact: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """COLMAP's data of the orbit."""
-    folder = tmp_path_factory.mktemp("colmap") / "data"
-    photographs.make(exact, folder)
+    """The orbit and a COLMAP model of it, with errors of poses and points, in another world."""
+    import pycolmap
+
+    folder, rng = tmp_path_factory.mktemp("colmap") / "data", np.random.default_rng(0)
+    cameras = perturb([frame.camera for frame in exact.frames], 0.0015, 0.03, rng)
+    frames = [replace(f, camera=c) for f, c in zip(exact.frames, cameras, strict=True)]
+    synthetic.write_colmap(replace(exact, frames=tuple(frames)), folder, True)
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    spoil_points(model, rng)
+    model.transform(pycolmap.Sim3d(SCALE, pycolmap.Rotation3d(TURN), SHIFT))
+    model.write_binary(folder / "sparse/0")
     return folder
+
+
+def spoil_points(model, rng: np.random.Generator) -> None:
+    """Keep a fifth of the points with noise of 0.7 pixels; one in ten is a wrong match.
+
+    A wrong match lies elsewhere on a ray, and has a short track and a large error.
+    """
+    eyes = {number: image.projection_center() for number, image in model.images.items()}
+    for number, point in list(model.points3D.items()):
+        views = [(view.image_id, view.point2D_idx) for view in point.track.elements]
+        rays = np.stack([point.xyz - eyes[image] for image, _ in views])
+        away = np.linalg.norm(rays, axis=1)
+        owner = rng.integers(len(views))
+        near = rays @ rays[owner] > np.cos(np.radians(45)) * away * away[owner]
+        matched = near & (rng.random(len(views)) < 0.7)
+        if matched.sum() < 2 or rng.random() > 0.2:
+            model.delete_point3D(number)
+            continue
+        wrong = rng.random() < 0.1
+        if wrong:
+            matched[np.flatnonzero(matched)[rng.integers(2, 4) :]] = False
+        stretch = rng.uniform(0.6, 1.6) if wrong else 1
+        noise = 0.7 * away[owner] / model.cameras[1].params[0] * rng.standard_normal(3)
+        point.xyz = eyes[views[owner][0]] + stretch * rays[owner] + noise
+        point.error = rng.uniform(1, 3.9) if wrong else rng.uniform(0.3, 0.8)
+        for k in np.flatnonzero(~matched):
+            model.delete_observation(*views[k])
 
 
 def lattice(count: int, radius: float = 3.0) -> list[Camera]:
@@ -129,15 +169,15 @@ def test_masks_that_do_not_fit_are_one_line_that_names_a_frame(tmp_path):
 
 
 @pytest.mark.parametrize("masks", [True, False])
-def test_real_clouds_give_the_rock(colmap, tmp_path, masks):
+def test_real_clouds_give_the_rock(exact, colmap, tmp_path, masks):
     source = read_source(colmap)
     up, _ = source.up_or_estimate()
-    folder = colmap / "masks" if masks else None
+    folder = exact.root / "masks" if masks else None
     dataset = import_source(source, tmp_path / "d", masks=folder, up=up)
     settings = PriorSettings(gaussians=600, backing=0)
     prior, cloud = prior_and_cloud(dataset, settings)
     rock = synthetic.rock_mesh()
-    points = (prior.points - photographs.SHIFT) @ photographs.TURN / photographs.SCALE
+    points = (prior.points - SHIFT) @ TURN / SCALE
     distance = distances_to_mesh(points, rock.vertices, rock.faces)
     assert prior.numbers["from"] == "points"
     assert ("hull_cell" in prior.numbers) == masks
@@ -145,7 +185,7 @@ def test_real_clouds_give_the_rock(colmap, tmp_path, masks):
     assert distance.mean() < (0.015 if masks else 0.025)
     assert np.quantile(distance, 0.9) < (0.035 if masks else 0.06)
     assert len(cloud.rock_points) > 150
-    assert degrees_between(prior.up, unit_up(photographs.TURN[:, 2])) < 3
+    assert degrees_between(prior.up, unit_up(TURN[:, 2])) < 3
     assert np.array_equal(prior.points, build_prior(dataset, settings).points)
 
     sparse = read_cloud(dataset.root / "sparse.ply")
@@ -306,28 +346,19 @@ def test_lengths_of_unknown_unit_are_not_called_metres(tmp_path, capsys):
 # Photographs of a phone
 
 
-def test_a_smaller_image_is_the_mean_of_its_blocks_and_rays_stay():
-    camera = Camera(np.array([[50.0, 0, 31.3], [0, 49.0, 22.9], [0, 0, 1]]), 65, 47, np.eye(4))
-    small, undo = shrunk(camera, 3)
-    pixels = np.random.default_rng(0).integers(0, 256, (47, 65, 4), np.uint8)
-    shown = undo(pixels, True)
-    assert (small.width, small.height) == (21, 15)
-    assert shown.dtype == np.uint8
-    assert np.abs(shown[4, 5] - pixels[12:15, 15:18].reshape(-1, 4).mean(0)).max() <= 0.5
-    assert np.array_equal(undo(pixels, False)[4, 5], pixels[13, 16])
+def test_a_smaller_image_is_the_mean_of_its_blocks_and_rays_stay(exact, tmp_path):
+    arguments = ["import", exact.root, "--out", tmp_path / "d", "--downscale"]
+    assert exit_code(*arguments, "100") == 2
+    command(*arguments, "5")
+    whole, small = exact.frames[0], load_dataset(tmp_path / "d").frames[0]
+    assert (small.camera.width, small.camera.height) == (19, 14)
+    pixels, reduced = (np.asarray(Image.open(f.image_path), float) for f in (whole, small))
+    assert np.abs(reduced[4, 6] - pixels[20:25, 30:35].mean((0, 1))).max() <= 0.5
+    assert small.depth()[4, 6] == whole.depth()[22, 32]
+    assert small.mask().shape == (14, 19)
     # The centre of a block is the middle of its pixels.
-    assert np.allclose(
-        small.unproject(np.ones((15, 21)))[4, 5], camera.unproject(np.ones((47, 65)))[13, 16]
-    )
-
-
-def test_downscaled_import(exact, tmp_path):
-    source = ["import", exact.root, "--out"]
-    command(*source, tmp_path / "d", "--downscale", "2")
-    frame = load_dataset(tmp_path / "d").frames[0]
-    assert frame.rgb().shape == (36, 48, 3)
-    assert frame.depth().shape == frame.mask().shape == (36, 48)
-    assert exit_code(*source, tmp_path / "none", "--downscale", "100") == 2
+    near, far = whole.camera.unproject(np.ones((72, 96))), small.camera.unproject(np.ones((14, 19)))
+    assert np.allclose(near[22, 32], far[4, 6])
 
 
 def test_a_phone_held_upright(exact, tmp_path):
@@ -352,13 +383,12 @@ def test_a_phone_held_upright(exact, tmp_path):
 # Masks of the prior
 
 
-def test_masks_are_made_of_the_prior(colmap, tmp_path):
-    true = import_source(read_source(colmap), tmp_path / "true", masks=colmap / "masks")
+def test_masks_are_made_of_the_prior(exact, colmap, tmp_path):
     command("import", colmap, "--out", tmp_path / "d")
     command("prior", tmp_path / "d", "--gaussians", "300")
     command("dataset", "masks", tmp_path / "d")
     made = load_dataset(tmp_path / "d")
-    pairs = [(a.mask(), b.mask()) for a, b in zip(made.frames, true.frames, strict=True)]
+    pairs = [(a.mask(), b.mask()) for a, b in zip(made.frames, exact.frames, strict=True)]
     assert np.mean([(a & b).sum() / (a | b).sum() for a, b in pairs]) > 0.85
     with Image.open(tmp_path / "d/masks.png") as sheet:
         assert sheet.size == (6 * 240, 4 * 180)
@@ -451,14 +481,13 @@ def test_poses_alone_are_fitted_from_random_points(tmp_path, capsys):
 def test_random_points_are_fewer_than_those_of_the_cameras(colmap, tmp_path, monkeypatch):
     """Unless these are few. Too many hide the scene."""
     dataset = import_source(read_source(colmap), tmp_path / "d")
-    few = scattered(dataset, PriorSettings())[4]
-    for constant, value in (("GAUSSIANS", 100), ("PIXELS", 1)):
-        monkeypatch.setattr(f"mgs.prior.scattered.{constant}", value)
+    monkeypatch.setattr("mgs.prior.scattered.PIXELS", 1)
+    assert scattered(dataset, PriorSettings())[4]["n"] == 10_000
+    monkeypatch.setattr("mgs.prior.scattered.GAUSSIANS", 100)
     many = scattered(dataset, PriorSettings())[4]
-    assert few["n"] == 10_000
-    assert many["n"] == round(1.5 * few["triangulated"])
+    assert many["n"] == round(1.5 * many["triangulated"])
     asked = scattered(dataset, PriorSettings(gaussians=5000))[4]
-    assert (asked["n"], asked["triangulated"]) == (5000, few["triangulated"])
+    assert (asked["n"], asked["triangulated"]) == (5000, many["triangulated"])
 
 
 def test_photographs_without_masks_are_fitted_whole_from_their_points(colmap, tmp_path, capsys):
