@@ -1,7 +1,10 @@
 """A small RGB-D dataset in closed form: an ellipsoid half buried in a plane."""
 
+import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -10,6 +13,7 @@ from mgs.camera import Camera, look_at
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.data.frames import Frame
 from mgs.data.meshes import to_glb
+from mgs.files import read_json
 from mgs.images import write_exr, write_png
 
 CENTRE = np.array([0.1, -0.05, 0.2])
@@ -91,6 +95,13 @@ def write_dataset(
         (root / "rock.glb").write_bytes(to_glb(rock_mesh(*rocks[0])))
     write_transforms(root, frames)
     return load_dataset(root)
+
+
+def edit(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change a dataset's transforms.json."""
+    data = read_json(root / "transforms.json")
+    change(data)
+    (root / "transforms.json").write_text(json.dumps(data))  # NaN, which write_json refuses, too
 
 
 def write_colmap(dataset: Dataset, root: Path, binary: bool) -> None:

@@ -30,12 +30,6 @@ def folder(tmp_path):
     return _write(tmp_path / "data").root
 
 
-def _edit(folder, change):
-    data = json.loads((folder / "transforms.json").read_text())
-    change(data)
-    (folder / "transforms.json").write_text(json.dumps(data))
-
-
 def test_round_trip_keeps_cameras_and_pixels(folder):
     first = load_dataset(folder)
     write_transforms(folder, first.frames)
@@ -69,7 +63,7 @@ def test_frames_come_in_order_of_time_and_may_have_their_own_intrinsics(folder):
         data["frames"].reverse()
         data["frames"][0]["fl_x"] = 99.0
 
-    _edit(folder, change)
+    synthetic.edit(folder, change)
     frames = load_dataset(folder).frames
     assert [frame.timestamp for frame in frames] == sorted(frame.timestamp for frame in frames)
     assert frames[-1].camera.K[0, 0] == 99.0
@@ -174,7 +168,7 @@ def test_check_finds_wrong_depth_units_and_wrong_axes(tmp_path):
         for frame in data["frames"]:
             frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ flip).tolist()
 
-    _edit(folder, change)
+    synthetic.edit(folder, change)
     problems = check_dataset(load_dataset(folder)).problems
     assert any("share no point" in problem for problem in problems)
 
@@ -185,7 +179,7 @@ def test_check_lists_every_problem(folder):
     write_png(frames[1].mask_path, np.zeros((H, W), bool))
     write_exr(frames[2].depth_path, {"Z": np.zeros((H, W), np.float32)})
     pose = json.loads((folder / "transforms.json").read_text())["frames"][3]["transform_matrix"]
-    _edit(folder, lambda d: d["frames"][4].update(transform_matrix=pose))
+    synthetic.edit(folder, lambda d: d["frames"][4].update(transform_matrix=pose))
     problems = "\n".join(check_dataset(load_dataset(folder)).problems)
     for expected in ("not a readable image", "mask is empty", "same pose as kf_0003"):
         assert expected in problems

@@ -191,14 +191,11 @@ def test_the_alarm_of_exposure_is_silent_where_gains_explain_it(runs):
 
 
 def test_an_interrupted_run_goes_on_bit_for_bit(varied, runs, tmp_path):
-    class Killed(Exception):
-        pass
-
     def kill(state: State) -> None:
         if len(state.steps) == 2:
-            raise Killed
+            raise KeyboardInterrupt
 
-    with pytest.raises(Killed):
+    with pytest.raises(KeyboardInterrupt):
         run_nbv(varied, tmp_path / "run", exposure=True, evaluate_every=5, on_step=kill, **RUN)
     resume_nbv(tmp_path / "run")
     one, other = read_checkpoint(runs["with"][1]), read_checkpoint(tmp_path / "run")

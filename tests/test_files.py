@@ -31,10 +31,6 @@ from mgs.files import (
 from mgs.images import read_exr, read_mask, read_png, read_rgba, read_values, write_exr, write_png
 
 
-class Stop(BaseException):
-    """Like KeyboardInterrupt."""
-
-
 def test_what_the_disk_says_is_one_line(tmp_path):
     (tmp_path / "a.txt").write_text("before")
 
@@ -136,9 +132,9 @@ def test_a_folder_that_fails_leaves_all_as_it_was(tmp_path, there):
             (made / "sub").mkdir()
             (made / "sub/file").touch()
             (made / "file").touch()
-            raise Stop
+            raise KeyboardInterrupt
 
-    with pytest.raises(Stop):
+    with pytest.raises(KeyboardInterrupt):
         fill()
     assert list(tmp_path.rglob("*")) == before
 

@@ -1,6 +1,5 @@
 """Imports: cameras to 1e-9, the same pixels, distortion undone, bad input in one line."""
 
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,7 +25,7 @@ from mgs.data.frames import Frame
 from mgs.data.importers import import_source
 from mgs.data.lens import undistorter
 from mgs.data.sources import read_source
-from mgs.files import read_json, write_json
+from mgs.files import write_json
 from mgs.images import write_png
 
 DISTORTION = np.array([-0.15, 0.04, 0.002, -0.003, 0.0])
@@ -36,13 +35,6 @@ LENS = dict(zip(("k1", "k2", "p1", "p2"), DISTORTION.tolist(), strict=False))
 def _import(source: Path, out: Path, **options: Any) -> Dataset:
     out.mkdir(parents=True)
     return import_source(read_source(source), out, **options)
-
-
-def edit(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Change a dataset's transforms.json."""
-    data = read_json(root / "transforms.json")
-    change(data)
-    (root / "transforms.json").write_text(json.dumps(data))
 
 
 def without_masks(data: dict[str, Any]) -> None:
@@ -68,7 +60,7 @@ def dataset(tmp_path: Path) -> Dataset:
 def test_a_dataset_imports_as_itself(dataset, tmp_path):
     points = synthetic.rock_mesh().vertices
     write_cloud(dataset.root / "cloud.ply", SparseCloud(points))
-    edit(dataset.root, lambda data: data.update(ply_file_path="cloud.ply"))
+    synthetic.edit(dataset.root, lambda data: data.update(ply_file_path="cloud.ply"))
     copy = _import(dataset.root, tmp_path / "copy")
     same_cameras(dataset, copy)
     assert np.allclose(read_cloud(copy.root / "sparse.ply").points, points, atol=1e-6)
@@ -131,7 +123,7 @@ def _soft(mask: np.ndarray, full: int) -> np.ndarray:
 
 def _with_alpha(dataset: Dataset, kind: str) -> list[np.ndarray]:
     """Give the images of a dataset an alpha and take its masks away; returns the pixels."""
-    edit(dataset.root, without_masks)
+    synthetic.edit(dataset.root, without_masks)
     images = []
     for frame in dataset.frames:
         full = 65535 if kind == "16 bit" else 255
@@ -181,7 +173,7 @@ def test_without_a_soft_alpha_that_gives_the_mask_there_are_no_images_of_the_roc
 
 def test_a_soft_alpha_is_undistorted_without_a_fringe(dataset, tmp_path):
     """A grey rock over transparent black: resampled straight, its rim would turn dark."""
-    edit(dataset.root, lambda data: (without_masks(data), data.update(LENS)))
+    synthetic.edit(dataset.root, lambda data: (without_masks(data), data.update(LENS)))
     for frame in dataset.frames:
         alpha = _soft(frame.mask(), 255)
         grey = np.where(alpha > 0, np.uint8(128), np.uint8(0))
@@ -235,7 +227,7 @@ def test_distortion_is_undone(tmp_path):
     assert keep(undone, True) is undone
 
     source = synthetic.write_dataset(tmp_path / "src").frames[0]
-    edit(tmp_path / "src", lambda data: data.update(LENS))
+    synthetic.edit(tmp_path / "src", lambda data: data.update(LENS))
     copy = _import(tmp_path / "src", tmp_path / "copy").frames[0]
     assert np.allclose(copy.camera.K, undistorter(source.camera, DISTORTION)[0].K)
     assert np.isin(copy.depth(), source.depth()).all()  # never blended
@@ -265,7 +257,7 @@ def test_only_an_image_that_stays_as_it_is_is_copied(dataset, tmp_path, kind):
     else:
         pixels.save(path, compress_level=9)  # other bytes than ours would be
     if kind == "distorted":
-        edit(dataset.root, lambda data: data.update(k1=-0.1))
+        synthetic.edit(dataset.root, lambda data: data.update(k1=-0.1))
     copy = _import(dataset.root, tmp_path / "copy").frames[0]
     assert (copy.image_path.read_bytes() == path.read_bytes()) == (kind == "plain")
     assert np.array_equal(copy.rgb(), replace(copy, image_path=path).rgb()) == (kind != "distorted")
@@ -274,7 +266,7 @@ def test_only_an_image_that_stays_as_it_is_is_copied(dataset, tmp_path, kind):
 def test_what_is_missing_is_skipped_and_said(dataset, tmp_path, capsys):
     for frame in dataset.frames[:3]:
         frame.image_path.unlink()
-    edit(dataset.root, lambda data: data.update(ply_file_path="sparse_pc.ply"))
+    synthetic.edit(dataset.root, lambda data: data.update(ply_file_path="sparse_pc.ply"))
     command("import", dataset.root, "--out", tmp_path / "copy")
     out, err = said(capsys)
     assert len(load_dataset(tmp_path / "copy")) == 5
@@ -332,11 +324,15 @@ Spoil = Callable[[Path], Path | None]
 
 
 def changed(**values: Any) -> Spoil:
-    return lambda root: edit(root, lambda data: data.update(values))
+    return lambda root: synthetic.edit(root, lambda data: data.update(values))
 
 
 def first(key: str, value: Any) -> Spoil:
-    return lambda root: edit(root, lambda data: data["frames"][0].update({key: value}))
+    return lambda root: synthetic.edit(root, lambda data: data["frames"][0].update({key: value}))
+
+
+def no_angle_of_view(root: Path) -> None:
+    synthetic.edit(root, lambda data: (data.pop("fl_x"), data.update(camera_angle_x=0)))
 
 
 def corrupt_jpeg(root: Path) -> None:
@@ -352,22 +348,13 @@ def points_in_one_place(root: Path) -> None:
     changed(ply_file_path="points.ply")(root)
 
 
-def nothing(root: Path) -> None:
-    pass
-
-
 MASKS = ["--masks", "{source}/masks"]
-NAN = float("nan")
 BAD: dict[str, tuple[Spoil, list[str], str]] = {
     "missing": (lambda root: root / "nowhere", [], "no such file or folder"),
-    "angle of view of 0": (
-        lambda root: edit(root, lambda data: (data.pop("fl_x"), data.update(camera_angle_x=0))),
-        [],
-        "no usable intrinsics",
-    ),
+    "angle of view of 0": (no_angle_of_view, [], "no usable intrinsics"),
     "fisheye": (changed(camera_model="OPENCV_FISHEYE"), [], "not supported"),
     "k4": (changed(k4=0.1), [], "has k4"),
-    "nan distortion": (changed(k1=NAN), [], "not finite"),
+    "nan distortion": (changed(k1=float("nan")), [], "not finite"),
     "duplicate frames": (first("file_path", "images/kf_0001.png"), [], "more than once"),
     "wrong size": (changed(w=100), [], "is 64x48, but its camera is 100x48"),
     "no depth file": (first("depth_file_path", "depth/none.exr"), [], "no such EXR"),
@@ -385,8 +372,8 @@ BAD: dict[str, tuple[Spoil, list[str], str]] = {
         MASKS,
         "kf_0000.png: is 32x24, but its camera is 64x48",
     ),
-    "no mask folder": (nothing, ["--masks", "none"], "none: no such folder"),
-    "both masks": (nothing, ["--mesh", "a.glb", "--masks", "b"], "give one of them"),
+    "no mask folder": (changed(), ["--masks", "none"], "none: no such folder"),
+    "both masks": (changed(), ["--mesh", "a.glb", "--masks", "b"], "give one of them"),
 }  # fmt: skip
 
 

@@ -13,7 +13,6 @@ from program import command, exit_code, said
 from refusals import listing, refused
 
 from mgs.data import importers
-from mgs.files import read_json, write_json
 from mgs.images import write_png
 
 STRUCK = """
@@ -40,8 +39,7 @@ image."""
 def source(tmp_path: Path) -> Path:
     """Eight distorted frames with depth."""
     root = synthetic.write_dataset(tmp_path / "data").root
-    path = root / "transforms.json"
-    write_json(path, read_json(path) | {"k1": -0.15, "k2": 0.04, "p1": 0.002})
+    synthetic.edit(root, lambda data: data.update(k1=-0.15, k2=0.04, p1=0.002))
     return root
 
 
@@ -93,7 +91,7 @@ def test_an_unfinished_import_of_something_else_is_refused(source, many, tmp_pat
     for arguments in ([other], [source, *masks], [source, *ball], smaller):
         line = refused(capsys, ["import", *arguments, "--out", out], out)
         assert "unfinished dataset of other settings or sources" in line
-    write_json(source / "transforms.json", read_json(source / "transforms.json") | {"cx": 30.0})
+    synthetic.edit(source, lambda data: data.update(cx=30.0))
     assert "unfinished dataset" in refused(capsys, [*many, out], out)
 
 

@@ -25,7 +25,6 @@ from mgs.survey.depth_sensor import (
     depth_noise,
     filter_depth,
     noisy_depth,
-    normals_from_depth,
 )
 from mgs.survey.flight import SurveySettings, fly, survey_numbers, trajectory_error
 from mgs.survey.folder import write_survey
@@ -98,19 +97,6 @@ def test_grazing_returns_are_lost(degrees, least, most):
     centre = np.s_[200:280, 300:340]
     lost = (noisy_depth(depth, camera, np.random.default_rng(0)) == 0)[centre].mean()
     assert least <= lost <= most
-
-
-def test_normals_from_depth_of_the_ground_and_the_rock():
-    camera = synthetic.orbit_cameras(1, 160, 120)[0]
-    depth, mask, points = synthetic.cast(camera, [(synthetic.CENTRE, synthetic.AXES)])
-    normals = normals_from_depth(depth, camera)
-    near = np.linalg.norm(points - synthetic.CENTRE, axis=-1) < 1.5
-    ground = ~mask & near & (normals[..., 2] > 0)
-    assert np.median(normals[ground][:, 2]) > 0.9999
-    analytic = (points - synthetic.CENTRE) / synthetic.AXES**2
-    analytic /= np.linalg.norm(analytic, axis=-1, keepdims=True)
-    agreement = np.einsum("hwk,hwk->hw", analytic, normals)[mask]
-    assert np.median(agreement) > 0.999
 
 
 def test_noise_is_measured_and_filtered_without_blurring_edges():

@@ -25,16 +25,12 @@ ONE = RenderPreset(width=32, height=24, frames=1, spp=1)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=20))
 
 
-class Stop(Exception):
-    pass
-
-
 def stop_at(view: int):
     """A progress callback that interrupts the rendering after so many views."""
 
     def progress(done, total):
         if done == view:
-            raise Stop
+            raise KeyboardInterrupt
 
     return progress
 
@@ -89,7 +85,7 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise_and_test_views(dataset, 
     out, made = tmp_path / "again", {"scene": SCENE, "preset": TINY, "seed": 3, "test_views": 4}
     made |= {"pose_noise": PoseNoise(0.01, 0.1)}
     for views, unwritten in ((2, "transforms.json"), (7, "test/transforms.json")):
-        with pytest.raises(Stop):
+        with pytest.raises(KeyboardInterrupt):
             synthesise(out, **made, progress=stop_at(views))
         assert not (out / unwritten).exists()
     written = {path: path.stat().st_mtime_ns for path in out.rglob("*_0*.*")}
@@ -143,7 +139,7 @@ def test_another_mesh_of_the_same_name_is_not_gone_on_with(tmp_path):
     path = tmp_path / "rock.ply"
     made = {"scene": SCENE, "preset": ONE, "mesh": path}
     trimesh.creation.icosphere(subdivisions=2).export(path)
-    with pytest.raises(Stop):
+    with pytest.raises(KeyboardInterrupt):
         synthesise(tmp_path / "out", **made, progress=stop_at(1))
     trimesh.creation.icosphere(subdivisions=3).export(path)
     with pytest.raises(InputError, match="other settings"):
