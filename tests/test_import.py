@@ -33,7 +33,6 @@ LENS = dict(zip(("k1", "k2", "p1", "p2"), DISTORTION.tolist(), strict=False))
 
 
 def _import(source: Path, out: Path, **options: Any) -> Dataset:
-    out.mkdir(parents=True)
     return import_source(read_source(source), out, **options)
 
 

@@ -22,7 +22,7 @@ from mgs.prior.segmentation import Plane, degrade, ground_plane, rock_cluster
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import poisson_mesh, sample_surface
 from mgs.prior.truth import error_to_truth
-from mgs.survey.fusion import Cloud, focus, fuse_frames
+from mgs.survey.fusion import Cloud, focus
 
 X, Y, Z = np.eye(3)
 
@@ -38,9 +38,8 @@ def built(dataset: Dataset):
     return prior_and_cloud(dataset, PriorSettings(gaussians=1500, backing=0))
 
 
-def _ball(centre=(0.0, 0.0, 0.5), radius=0.5) -> Mesh:
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=radius)
-    return as_mesh(ball, centre)
+def _ball() -> Mesh:
+    return as_mesh(trimesh.creation.icosphere(4, 0.5), (0, 0, 0.5))
 
 
 def as_mesh(mesh: trimesh.Trimesh, offset=0.0) -> Mesh:
@@ -48,21 +47,10 @@ def as_mesh(mesh: trimesh.Trimesh, offset=0.0) -> Mesh:
     return Mesh(vertices, faces, np.ones(len(faces), bool))
 
 
-def test_fused_cloud_lies_on_the_surfaces(dataset):
-    cloud = fuse_frames(dataset.frames)
-    off_rock = np.abs(synthetic.level(cloud.points)) * synthetic.AXES.min()
-    distance = np.minimum(np.abs(cloud.points[:, 2]), off_rock)
-    # A voxel averages points of a curved patch, or of ground and rock where they meet.
-    assert np.quantile(distance, 0.99) < 0.2 * cloud.voxel
-    assert distance.max() < cloud.voxel
-    assert np.allclose(np.linalg.norm(cloud.views, axis=1), 1)
-    assert (cloud.views[:, 2] > 0).all()  # every camera is above
+def test_the_focus_is_what_all_cameras_look_at(dataset):
     found = focus(dataset.frames)
     assert np.allclose(found.point, synthetic.CENTRE, atol=1e-9)
     assert found.distance == pytest.approx(np.hypot(2.6, 1.3), rel=0.05)
-    plane = ground_plane(cloud, dataset.frames, seed=1)
-    assert plane.normal[2] > np.cos(np.radians(0.1))
-    assert abs(plane.offset) < 1e-3
 
 
 def test_ground_plane_of_a_tilted_noisy_floor(dataset):

@@ -38,32 +38,6 @@ def test_known_point_lands_on_its_pixel():
     np.testing.assert_allclose(centroid, camera.project(point[None])[0][0], atol=0.05)
 
 
-def red_ball(subdivisions: int) -> trimesh.Trimesh:
-    """A red ball of radius 0.7 around (0.1, 0, 0.5)."""
-    rock = trimesh.creation.icosphere(subdivisions, 0.7)
-    rock.apply_translation([0.1, 0, 0.5])
-    colours = np.tile([255, 0, 0, 255], (len(rock.vertices), 1))
-    rock.visual = trimesh.visual.ColorVisuals(rock, vertex_colors=colours)
-    return rock
-
-
-GREY_GROUND = SceneFile(arena=Arena(colour=(0.3, 0.3, 0.3), stones=0))
-
-
-def test_colour_and_depth_agree_on_the_silhouette():
-    """Mitsuba's sensor and the depth rays (NumPy camera) see the same rock after a move."""
-    eyes = [3, 0, 1.5], [-1, 2.5, 2.0]
-    cameras = [Camera(K, 64, 48, look_at(eye, [0, 0, 0.6])) for eye in eyes]
-    scene = MitsubaScene(GREY_GROUND, red_ball(3), cameras[0], seed=0)
-    for index, camera in enumerate(cameras):
-        rendered = scene.render(camera, spp=16, seed=index, denoise=False)
-        redness = rendered.rgb[..., 0] / np.maximum(rendered.rgb.sum(-1), 1e-6)
-        assert np.mean((redness > 0.7) == rendered.mask) > 0.985
-        middle, z = camera.project(np.array([[0.1, 0, 0.5]]))
-        u, v = middle[0].astype(int)
-        assert rendered.depth[v, u] == pytest.approx(z[0] - 0.7, abs=0.01)
-
-
 def test_texture_lies_on_the_rock_as_in_the_mesh(monkeypatch):
     """Mitsuba's albedo is the colour of the exported mesh there; a flipped v would be noise."""
     monkeypatch.setattr(arena, "ROWS", 60)  # the ground is not looked at
@@ -82,8 +56,26 @@ def test_texture_lies_on_the_rock_as_in_the_mesh(monkeypatch):
 
 @pytest.fixture(scope="module")
 def ball():
+    """A red ball of radius 0.7 around (0.1, 0, 0.5) on grey ground, and a camera."""
+    rock = trimesh.creation.icosphere(5, 0.7)
+    rock.apply_translation([0.1, 0, 0.5])
+    colours = np.tile([255, 0, 0, 255], (len(rock.vertices), 1))
+    rock.visual = trimesh.visual.ColorVisuals(rock, vertex_colors=colours)
+    settings = SceneFile(arena=Arena(colour=(0.3, 0.3, 0.3), stones=0))
     camera = Camera(K, 64, 48, look_at([3, 0, 1.5], [0, 0, 0.6]))
-    return MitsubaScene(GREY_GROUND, red_ball(5), camera, seed=0), camera
+    return MitsubaScene(settings, rock, camera, seed=0), camera
+
+
+def test_colour_and_depth_agree_on_the_silhouette(ball):
+    """Mitsuba's sensor and the depth rays (NumPy camera) see the same rock after a move."""
+    scene, first = ball
+    for camera in (first, Camera(K, 64, 48, look_at([-1, 2.5, 2.0], [0, 0, 0.6]))):
+        rendered = scene.render(camera, spp=16, seed=0, denoise=False)
+        redness = rendered.rgb[..., 0] / np.maximum(rendered.rgb.sum(-1), 1e-6)
+        assert np.mean((redness > 0.7) == rendered.mask) > 0.985
+        middle, z = camera.project(np.array([[0.1, 0, 0.5]]))
+        u, v = middle[0].astype(int)
+        assert rendered.depth[v, u] == pytest.approx(z[0] - 0.7, abs=0.01)
 
 
 def test_the_image_is_that_of_the_inner_integrator_and_the_rock_a_part_of_it(ball):

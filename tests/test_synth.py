@@ -5,15 +5,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial import cKDTree
 
 from mgs.camera import opencv_from_opengl
 from mgs.colour import srgb_from_linear
 from mgs.data.check import check_dataset
+from mgs.data.meshes import distances_to_mesh, read_mesh
 from mgs.errors import InputError
 from mgs.files import locked, read_json
 from mgs.resources import resource_folder
-from mgs.rotation import WORLD_FROM_GLTF
 from mgs.seeds import generator
 from mgs.synth.orbit import evaluation_cameras, rock_cameras
 from mgs.synth.rendering import ROCK_EXPOSURE, PoseNoise, RenderPreset, _meter, rock_of, synthesise
@@ -45,23 +44,14 @@ def dataset(tmp_path_factory):
 
 def test_depth_inside_the_mask_lies_on_the_rock(dataset):
     """Proves camera convention, z-depth (not ray distance) and mask at once, over all azimuths."""
-    rock = trimesh.load(dataset.root / "rock.glb", force="mesh")
-    rock.apply_transform(WORLD_FROM_GLTF)
+    rock = read_mesh(dataset.root / "rock.glb")
     for frame in dataset.frames:
         points = frame.camera.unproject(frame.depth())[frame.mask()]
         assert len(points) > 200
-        assert _distance(rock, points).max() < 1e-4
+        assert distances_to_mesh(points, rock.vertices, rock.faces).max() < 1e-4
         rows, columns = np.where(frame.mask())
         assert 0.35 < np.ptp(rows) / frame.camera.height < 0.75
         assert min(rows.min(), columns.min(), frame.camera.width - 1 - columns.max()) > 0
-
-
-def _distance(mesh, points):
-    """Exact distance to the nearest of the 40 triangles whose centroids are nearest."""
-    near = cKDTree(mesh.triangles_center).query(points, 40)[1]
-    triangles = mesh.triangles[near].reshape(-1, 3, 3)
-    closest = trimesh.triangles.closest_point(triangles, np.repeat(points, 40, axis=0))
-    return np.linalg.norm(closest.reshape(-1, 40, 3) - points[:, None], axis=-1).min(1)
 
 
 def test_the_rock_alone_agrees_with_image_and_mask(dataset):
