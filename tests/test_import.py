@@ -199,6 +199,7 @@ def test_nerf_synthetic_with_alpha(dataset, tmp_path):
     angle = 2 * np.arctan(camera.width / 2 / camera.K[0, 0])
     write_json(root / "transforms_train.json", {"camera_angle_x": angle, "frames": records})
     assert read_source(root).kind == "NeRF-synthetic"
+    assert read_source(root).up_or_estimate()[0] == (0, 0, 1)
     copy = _import(root, tmp_path / "copy")
     named = tuple(replace(frame, name=f"train_{frame.name}") for frame in dataset.frames)
     same_cameras(replace(dataset, frames=named), copy)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import synthetic
 import trimesh
-from program import command
+from program import command, said
 from refusals import refused
 
 from mgs.data import meshes
@@ -55,7 +55,7 @@ BAD_MESHES: dict[str, tuple[str, str | None, str]] = {
     "damaged": ("a.ply", "ply\nformat nonsense", "not a readable mesh"),
     "unknown format": ("a.xyz9", "1 2 3", "not a readable mesh"),
     "point cloud, PLY": ("a.ply", ply(0, "0 0 1"), "has no faces"),
-    "lines": ("a.obj", f"{TRIANGLE}l 1 2 3\n", "has no faces"),
+    "empty file": ("a.obj", "", "has no faces"),
     "infinite vertex": ("a.obj", obj("0 0 0", "inf 0 0", "0 1 0"), "vertex 1 is NaN or infinite"),
     "NaN vertex of no face": ("a.ply", ply(1, "nan 0 0\n3 0 1 2"), "vertex 3 is NaN"),
     "vertex too far": ("a.obj", obj("0 0 0", "1e200 0 0", "0 1e200 0"), "further than"),
@@ -108,6 +108,13 @@ def test_a_mesh_that_is_small_and_far_away_is_one_line(tmp_path):
     (tmp_path / "a.obj").write_text(obj("1e6 0 0", "1000001 0 0", "1e6 1 0"))
     with pytest.raises(InputError, match="float32 does not resolve"):
         prior_from_mesh(tmp_path / "a.obj", PriorSettings(gaussians=100))
+
+
+def test_the_prior_of_a_glb_stands_upright(dataset, tmp_path, capsys):
+    options = ["--mesh", dataset.root / "rock.glb", "--gaussians", 100, "--out", tmp_path / "p"]
+    command("prior", dataset.root, *options)
+    assert "turned from +Y up" in said(capsys)[0]
+    assert np.abs(synthetic.level(load_prior(tmp_path / "p").points)).max() < 0.01
 
 
 def _spoilt() -> dict[str, tuple[np.ndarray, np.ndarray]]:
