@@ -55,7 +55,6 @@ BAD_MESHES: dict[str, tuple[str, str | None, str]] = {
     "damaged": ("a.ply", "ply\nformat nonsense", "not a readable mesh"),
     "unknown format": ("a.xyz9", "1 2 3", "not a readable mesh"),
     "point cloud, PLY": ("a.ply", ply(0, "0 0 1"), "has no faces"),
-    "empty file": ("a.obj", "", "has no faces"),
     "infinite vertex": ("a.obj", obj("0 0 0", "inf 0 0", "0 1 0"), "vertex 1 is NaN or infinite"),
     "NaN vertex of no face": ("a.ply", ply(1, "nan 0 0\n3 0 1 2"), "vertex 3 is NaN"),
     "vertex too far": ("a.obj", obj("0 0 0", "1e200 0 0", "0 1e200 0"), "further than"),
@@ -76,6 +75,12 @@ def test_bad_mesh_is_one_line(dataset, tmp_path, case, capsys):
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match=re.escape(message)):
         load_rock(tmp_path / name, Rock())
+
+
+def test_a_file_of_points_alone_is_one_line(tmp_path):
+    trimesh.PointCloud(np.eye(3)).export(tmp_path / "a.glb")
+    with pytest.raises(InputError, match="has no faces"):
+        read_mesh(tmp_path / "a.glb")
 
 
 def test_a_plain_ply_is_read_as_trimesh_reads_it(tmp_path, monkeypatch):
