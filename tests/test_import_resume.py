@@ -16,23 +16,23 @@ from mgs.data import importers
 from mgs.images import write_png
 
 STRUCK = """
-import os, signal
+import os, sys
 from mgs.data import importers
 from mgs.cli.app import main
 
-write, calls = importers.write_png, []
+write, calls, end = importers.write_png, [], int(sys.argv.pop())
 
 def strike(path, *arguments, **options):
     calls.append(path.parent.name)
     if calls.count("images") == 4:
-        os.kill(os.getpid(), signal.SIGKILL)
+        os.kill(os.getpid(), end)
     write(path, *arguments, **options)
 
 importers.write_png = strike
 main()
 """
-"""The program, which kills itself after three images and all of the fourth frame but its
-image."""
+"""The program, which sends itself the signal that is its last argument, after three images and all
+of the fourth frame but its image."""
 
 
 @pytest.fixture
@@ -49,12 +49,13 @@ def many(source: Path) -> list:
     return ["import", source, "--mesh", source / "rock.glb", "--out"]
 
 
-def test_killed_in_the_middle_and_given_again(many, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("end", "code"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)])
+def test_ended_in_the_middle_and_given_again(many, tmp_path, monkeypatch, end, code):
     """A real process, a real signal; then no finished frame is read again."""
     out = tmp_path / "out"
-    program = [sys.executable, "-c", STRUCK, *map(str, many), str(out)]
+    program = [sys.executable, "-c", STRUCK, *map(str, [*many, out, int(end)])]
     process = subprocess.run(program, capture_output=True, text=True)
-    assert process.returncode == -signal.SIGKILL, process.stderr
+    assert process.returncode == code, process.stderr
     assert not (out / "transforms.json").exists()
     assert len(list((out / "images").iterdir())) == 3
     (out / "images/.kf_0003.1.part.png").touch()  # as a kill in the middle of writing leaves it
