@@ -161,25 +161,23 @@ def test_what_a_killed_process_left_of_an_atomic_folder_is_removed(tmp_path):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["file"]
 
 
-def encode_png(samples, bits, colour, palette=None, transparent=None):
-    """Write a PNG of samples [H,W,C] by its specification. palette: [K,3]; transparent: tRNS."""
-    big = samples.reshape(len(samples), -1).astype(">u2")
-    if bits == 16:
-        rows = [row.tobytes() for row in big]
-    else:
-        digits = (big[..., None] >> np.arange(bits)[::-1]) & 1
-        packed = np.packbits(digits.reshape(len(big), -1).astype(bool), axis=1)
-        rows = [row.tobytes() for row in packed]
-    header = struct.pack(">IIBBBBB", samples.shape[1], samples.shape[0], bits, colour, 0, 0, 0)
-    chunks = [(b"IHDR", header)]
-    chunks += [] if palette is None else [(b"PLTE", palette.astype(np.uint8).tobytes())]
-    chunks += [] if transparent is None else [(b"tRNS", transparent)]
-    chunks += [(b"IDAT", zlib.compress(b"".join(b"\0" + row for row in rows))), (b"IEND", b"")]
-    parts = [
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in chunks
-    ]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+def encode_png(samples, bits, colour, palette=b"", transparent=b""):
+    """A PNG of samples [H,W,C] by its specification. palette: PLTE; transparent: tRNS."""
+    digits = (samples[..., None] >> np.arange(bits)[::-1]) & 1
+    rows = np.packbits(digits.reshape(len(samples), -1).astype(bool), axis=1)
+    chunks = {
+        b"IHDR": struct.pack(">IIBBBBB", samples.shape[1], len(samples), bits, colour, 0, 0, 0),
+        b"PLTE": palette,
+        b"tRNS": transparent,
+        b"IDAT": zlib.compress(b"".join(b"\0" + row.tobytes() for row in rows)),
+        b"IEND": b"",
+    }
+    data = b"\x89PNG\r\n\x1a\n"
+    for kind, content in chunks.items():
+        if content or kind == b"IEND":
+            checksum = struct.pack(">I", zlib.crc32(kind + content))
+            data += struct.pack(">I", len(content)) + kind + content + checksum
+    return data
 
 
 GREY, RGB, PALETTE, GREY_ALPHA, RGBA = 0, 2, 3, 4, 6
@@ -200,18 +198,18 @@ def test_every_kind_of_png(tmp_path, bits, colour, transparent):
     levels, full = 2**bits, 65535 if bits == 16 else 255
     samples = rng.integers(0, levels, (5, 7, CHANNELS[colour]))
     if colour == PALETTE:
-        palette = rng.integers(0, 256, (levels, 3))
+        palette = rng.integers(0, 256, (levels, 3), np.uint8)
         alphas = rng.integers(0, 256, levels) if transparent else np.full(levels, 255)
         expected = np.dstack([palette[samples[..., 0]], alphas[samples[..., 0]]])
-        key = bytes(alphas.tolist()) if transparent else None
-        data = encode_png(samples, bits, colour, palette, key)
+        key = bytes(alphas.tolist()) if transparent else b""
+        data = encode_png(samples, bits, colour, palette.tobytes(), key)
     else:
         scaled = samples * full // (levels - 1)
         rgb = scaled[..., :3] if colour in (RGB, RGBA) else np.repeat(scaled[..., :1], 3, axis=-1)
         alpha = scaled[..., -1] if colour in (GREY_ALPHA, RGBA) else np.full((5, 7), full)
         if transparent:
             alpha = np.where((samples == samples[2, 3]).all(-1), 0, full)
-        key = samples[2, 3].astype(">u2").tobytes() if transparent else None
+        key = samples[2, 3].astype(">u2").tobytes() if transparent else b""
         expected = np.dstack([rgb, alpha])
         data = encode_png(samples, bits, colour, transparent=key)
     (tmp_path / "a.png").write_bytes(data)
