@@ -1,8 +1,5 @@
-"""Every kind of bad input, through the real command line: one line that says what is wrong, exit
-code 2, nothing left over.
-
-A rule is tried by one command; that the other commands use the same check is tried once for each.
-"""
+"""Bad input through the real command line: one line that says what is wrong, exit code 2, nothing
+left over. Each check is tried by one command."""
 
 import json
 import shutil
@@ -15,7 +12,7 @@ import pytest
 import tiny
 from refusals import refused
 
-from mgs.images import write_exr, write_png
+from mgs.images import write_png
 
 Change = Callable[[Path], object]
 
@@ -44,10 +41,6 @@ def frame(**values) -> Change:
     return edit(lambda data: data["frames"][2].update(values))
 
 
-def numbers(**values) -> Change:
-    return edit(lambda data: data.update(values), "prior.json")
-
-
 def truncate(name: str) -> Change:
     """Cut a file in half, as a full disk does."""
 
@@ -62,57 +55,32 @@ def remove(name: str) -> Change:
     return lambda root: (root / name).unlink()
 
 
-def no_number(root: Path) -> None:
-    for path in (root / "depth").glob("*.exr"):
-        write_exr(path, {"Z": np.full((tiny.HEIGHT, tiny.WIDTH), np.nan)})
-
-
-def no_surface(data: dict) -> None:
-    for one in data["frames"]:
-        one.pop("depth_file_path")
-        one.pop("mask_path")
-
-
-def same_name(root: Path) -> None:
-    (root / "images/left").mkdir()
-    shutil.copy(root / "images/kf_0000.png", root / "images/left/kf_0000.png")
-    frame(file_path="images/left/kf_0000.png")(root)
-
-
+FAR = [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 DATASETS: dict[str, tuple[Change, str]] = {
     "no transforms.json": (remove("transforms.json"), "transforms.json"),
     "transforms.json of another shape": (
         lambda root: (root / "transforms.json").write_text("[1, 2]"),
         "no frames",
     ),
-    "no frames": (header(frames=[]), "no frames"),
     "pose of words": (frame(transform_matrix=[["a"] * 4] * 4), "frame 2"),
     "pose of NaN": (frame(transform_matrix=[[float("nan")] * 4] * 4), "not a finite 4x4"),
     "singular pose": (frame(transform_matrix=np.diag([1, 1, 0, 1]).tolist()), "singular"),
+    "pose far away": (frame(transform_matrix=FAR), "entries beyond 1e+08"),
     "no pose": (edit(lambda data: data["frames"][2].pop("transform_matrix")), "frame 2 lacks"),
     "no intrinsics": (edit(lambda data: data.pop("fl_x")), "intrinsics"),
     "width 0": (header(w=0), "image size"),
     "negative focal length": (header(fl_x=-1), "focal lengths"),
     "no image file": (frame(file_path="images/none.png"), "does not exist"),
-    "no rock file": (frame(rock_file_path="rock/none.png"), "rock/none.png does not exist"),
-    "rock_file_path a list": (frame(rock_file_path=["a"]), "rock_file_path that is no text"),
-    "width of a slip": (header(w=10**9), "1000000000x"),
-    "width without end": (header(w=float("inf")), "frame 0"),
+    "width of half a pixel": (header(w=16.5), "must be whole pixels"),
+    "width without end": (header(w=float("inf")), "must be whole pixels"),
     "focal length without end": (header(fl_x=float("inf")), "frame 0"),
-    "distortion": (header(k1=0.1), "mgs import"),
     "distortion of one frame": (frame(p2=-1e-3), "mgs import"),
-    "distortion that is no number": (header(k4="a"), "mgs import"),
     "fisheye": (header(camera_model="OPENCV_FISHEYE"), "mgs import"),
-    "camera model that is no text": (header(camera_model=[1]), "mgs import"),
-    "frame twice": (edit(lambda data: data["frames"].append(data["frames"][0])), "kf_0000"),
-    "name twice": (same_name, "kf_0000"),
-    "file_path that is a number": (frame(file_path=5), "frame 2"),
+    "name twice": (frame(file_path="images/../images/kf_0000.png"), "kf_0000"),
     "file_path with a null character": (frame(file_path="a\0b"), "frame 2"),
     "mask_path that is a list": (frame(mask_path=["a"]), "mask_path"),
-    "timestamp NaN": (frame(timestamp=float("nan")), "timestamp"),
     "timestamp of words": (frame(timestamp="noon"), "timestamp"),
     "missing depth": (remove("depth/kf_0003.exr"), "kf_0003.exr"),
-    "missing mask": (remove("masks/kf_0003.png"), "kf_0003.png"),
 }
 """Datasets that no command accepts."""
 
@@ -143,39 +111,17 @@ def test_broken_pixels(capsys, dataset, prior, tmp_path, given, named):
     assert not (tmp_path / "out/steps.jsonl").exists()
 
 
-@cases(
-    {
-        "neither depth nor masks": (edit(no_surface), "starts at random points"),
-        "NaN in every pixel": (no_number, "return"),
-    }
-)
-def test_survey_without_a_rock(capsys, dataset, tmp_path, given, named):
-    """Other faults are tried with `mgs prior`, which shares this step."""
-    given(dataset)
-    arguments = ["nbv", "--budget", 1, dataset, "--out", tmp_path / "out"]
-    assert named in refused(capsys, arguments, tmp_path / "out")
-
-
-UNDERGROUND = "[orbit]\nkind = 'rings'\nelevations = [-60, -20]"
 DUST = "[rock]\ndetail = 0.1\nburied = 0.999\n[orbit]\naltitude = 0\n[arena]\nstones = 0"
 
 
 @cases(
     {
-        "unknown section": ("[rok]", "description, rock, arena"),
         "unknown key of a lobe": ("[[rock.lobes]]\nradius = 1", "centre, radii"),
-        "no lobes": ("[rock]\nlobes = []", "rock.lobes"),
-        "rock wholly buried": ("[rock]\nburied = 1", "rock.buried"),
         "detail coarser than the rock": ("[rock]\ndetail = 2", "rock.detail"),
         "detail of a slip": ("[rock]\ndetail = 1e-9", "rock.detail"),
-        "cameras under the ground": (UNDERGROUND, "orbit.elevations"),
         "rock behind its dust": (DUST, "altitude"),
-        "unknown key": ("[rock]\nsiz = 1", "unknown key 'rock.siz'"),
         "negative size": ("[rock]\nsize = -1", "rock.size"),
-        "specular beyond 1": ("[rock]\nspecular = 2", "rock.specular"),
-        "roughness 0": ("[rock]\nroughness = 0", "rock.roughness"),
         "no TOML": ("[rock", "not valid TOML"),
-        "unknown orbit": ("[orbit]\nkind = 'figure-eight'", "orbit.kind"),
         "NaN": ("[sky]\nturbidity = nan", "sky.turbidity"),
     }
 )
@@ -190,8 +136,10 @@ def test_scene_files(capsys, tmp_path, given, named):
     {
         "missing": (shutil.rmtree, "mgs prior"),
         "truncated numbers": (truncate("prior.json"), "prior.json"),
-        "negative spacing": (numbers(spacing=-1), "prior.json"),
-        "NaN tolerance": (numbers(depth_tolerance=float("nan")), "prior.json"),
+        "negative spacing": (
+            edit(lambda data: data.update(spacing=-1), "prior.json"),
+            "must be positive metres",
+        ),
     }
 )
 def test_broken_prior(capsys, dataset, prior, tmp_path, given, named):
@@ -200,23 +148,10 @@ def test_broken_prior(capsys, dataset, prior, tmp_path, given, named):
     assert named in refused(capsys, arguments, tmp_path / "out")
 
 
-@cases(
-    {
-        "missing": (shutil.rmtree, "no such run folder or PLY file"),
-        "without config": (remove("config.json"), "holds no run"),
-        "truncated config": (truncate("config.json"), "config.json"),
-    }
-)
-def test_broken_run(capsys, dataset, prior, tmp_path, given, named):
-    run = tiny.write_run(tmp_path / "run", dataset, prior)
-    given(run)
-    assert named in refused(capsys, ["eval", run], run)
-
-
 @pytest.mark.parametrize(
     "command", [["nbv", "--resume"], ["eval"], ["diagnose"], ["prune"], ["refit"], ["view"]]
 )
-def test_broken_run_of_other_commands(capsys, dataset, prior, tmp_path, command):
+def test_broken_run(capsys, dataset, prior, tmp_path, command):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     dataset.rename(tmp_path / "elsewhere")
     assert "correct `dataset`" in refused(capsys, [*command, run], run)

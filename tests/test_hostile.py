@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import tiny
 import trimesh
-from PIL import Image, ImageFile
+from PIL import Image
 from program import command, said
 from refusals import refused
 from test_fuzz import colmap
@@ -26,7 +26,7 @@ from mgs.data.meshes import load_mesh
 from mgs.data.sources import read_source
 from mgs.errors import InputError
 from mgs.files import atomic_folder, folder_locked, read_json
-from mgs.images import image_size, read_exr, read_rgba, write_exr
+from mgs.images import image_size, read_exr, write_exr
 from mgs.run.folder import open_run
 from mgs.splat_ply import read_ply, write_ply
 from mgs.view.subject import read_subject
@@ -38,11 +38,8 @@ def change(dataset: Path, frame: dict | None = None, **header: object) -> None:
     (dataset / "transforms.json").write_text(json.dumps(data))
 
 
-def bomb(path: Path, side: int, kind: str = "PNG") -> Path:
-    """A black image of few bytes. Beyond 20,000 pixels only the header says so."""
-    if side <= 20_000:
-        Image.new("L", (side, side)).save(path, kind)
-        return path
+def bomb(path: Path, side: int) -> Path:
+    """A PNG file of few bytes whose header says this many pixels either way."""
     header = b"IHDR" + struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
     chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk + struct.pack(">I", 0) + b"IDAT" + b"\0" * 64)
@@ -60,22 +57,15 @@ def exr_bomb(path: Path) -> Path:
 
 
 def test_an_image_is_measured_by_its_header(capsys, dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr(ImageFile.ImageFile, "load", None)  # decoding would fail
-    image, out = dataset / "images/kf_0000.png", tmp_path / "out"
+    out = tmp_path / "out"
     for side in (4_000, 13_300, 200_000):
-        image.unlink()
-        bomb(image, side)
+        bomb(dataset / "images/kf_0000.png", side)
         with pytest.raises(InputError, match=f"kf_0000.png.*{side}x{side}"):
             load_dataset(dataset).frames[0].rgb()
         line = refused(capsys, ["import", dataset, "--out", out], out)
         assert f"{side}x{side}" in line
-
-
-def test_other_bombs(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="2097152x4 pixels"):
         read_exr(exr_bomb(tmp_path / "a.exr"))
-    with pytest.raises(InputError, match="13300x13300"):
-        read_rgba(bomb(tmp_path / "a.jpg", 13_300, "JPEG"))
     monkeypatch.setattr("mgs.memory.MEMORY_FILE", tmp_path / "meminfo")
     (tmp_path / "meminfo").write_text("MemAvailable: 1000 kB")
     with pytest.raises(InputError, match="GiB are free"):
@@ -125,18 +115,17 @@ def test_a_terminal_of_ascii_and_no_home():
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "1 m?\n", "")
 
 
-def sphere(path: Path, side: int = 4, **accessor: object) -> Path:
-    """A ball as GLB with a texture. accessor: changes of all its accessors; None removes a key."""
+def sphere(path: Path, side: int = 4, count: int | None = None) -> Path:
+    """A ball as GLB with a texture. count: numbers that each of its arrays is said to have."""
     ball = trimesh.creation.icosphere(subdivisions=1)
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.new("1", (side, side)))
     ball.visual = trimesh.visual.TextureVisuals(uv=ball.vertices[:, :2], material=material)
     data = ball.export(file_type="glb")
     size = struct.unpack("<I", data[12:16])[0]
     header = json.loads(data[20 : 20 + size])
-    for one in header["accessors"]:
-        known = [(key, value) for key, value in (one | accessor).items() if value is not None]
-        one.clear()
-        one.update(known)
+    for one in header["accessors"] if count else ():
+        del one["bufferView"]
+        one["count"] = count
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
     rest = data[20 + size :]
@@ -145,15 +134,14 @@ def sphere(path: Path, side: int = 4, **accessor: object) -> Path:
     return path
 
 
-ENDLESS = "element vertex 10000000000\nproperty float x\nproperty float y\nproperty float z\n"
-
-
 def test_bombs_of_geometry(tmp_path):
     with pytest.raises(InputError, match="13300x13300 pixels"):
         load_mesh(sphere(tmp_path / "a.glb", 13_300))
     with pytest.raises(InputError, match="GiB that are free"):
-        load_mesh(sphere(tmp_path / "b.glb", bufferView=None, count=10**11))
-    (tmp_path / "c.ply").write_text(f"ply\nformat ascii 1.0\n{ENDLESS}end_header\n0 0 0\n")
+        load_mesh(sphere(tmp_path / "b.glb", count=10**11))
+    columns = "".join(f"property float {name}\n" for name in "xyz")
+    head = f"ply\nformat ascii 1.0\nelement vertex 10000000000\n{columns}end_header\n"
+    (tmp_path / "c.ply").write_text(f"{head}0 0 0\n")
     for read in (read_cloud, read_ply):
         with pytest.raises(InputError, match="GiB that are free"):
             read(tmp_path / "c.ply")
@@ -194,17 +182,6 @@ def test_a_mesh_that_names_a_pipe(tmp_path):
 
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
-FAR = [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-ABSURD = {"w": {"w": 16.5}, "pose": {"frame": {"transform_matrix": FAR}}, "focal": {"fl_x": 1e300}}
-
-
-@pytest.mark.parametrize(
-    ("case", "command"), [("w", "import"), ("pose", "survey"), ("focal", "nbv")]
-)
-def test_absurd_cameras(capsys, dataset, tmp_path, case, command):
-    change(dataset, **ABSURD[case])
-    line = refused(capsys, [command, dataset, "--out", tmp_path / "out"], tmp_path / "out")
-    assert "must be whole pixels" in line or "entries beyond 1e+08" in line
 
 
 COLMAP = {"endless": lambda data: b"\xff" * 8 + data[8:], "cut off": lambda data: data[:-9]}
@@ -221,11 +198,9 @@ def test_a_colmap_file_of_another_length_than_it_says(tmp_path, name, damage):
 
 
 IMAGES = {
-    "id": (8, b"\xff" * 4),
     "no rotation": (12, b"\0" * 32),
     "position": (44, b"\0" * 6 + b"\xf0\x7f"),
     "camera": (68, b"\xff" * 4),
-    "name of no text": (72, b"\xff"),
     "name of two lines": (72, b"\n"),
 }
 """Damage of images.bin: place and bytes."""
@@ -341,17 +316,11 @@ CHECKPOINTS = {
     "endless shape": endless_shape,
     "no archive": lambda path: path.write_bytes(b"no archive"),
     "objects": members(H=np.array([{}], object)),
-    "integers": members(means=np.zeros((40, 3), int)),
-    "text": members(H=np.array("text")),
     "no H": members(H=None),
     "H of another shape": members(H=np.zeros((3, 11))),
-    "flat H": members(H=np.zeros(40)),
     "other Gaussians": members(quats=np.zeros((3, 4), np.float32)),
-    "no number": members(means=np.full((40, 3), np.nan, np.float32)),
-    "no JSON": members(json=np.array("{")),
     "deep JSON": members(json=np.array("[" * 100_000)),
     "other keys": record(evil=1),
-    "no steps": record(steps=[]),
     "steps of words": record(steps=["a", "b"]),
     "a frame beyond": record(taken=[0, 10**9]),
     "a frame beyond, twice": record(
