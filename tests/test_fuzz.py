@@ -1,9 +1,8 @@
 """Damaged files in every loader: it succeeds or raises an InputError of one line, prints nothing,
 and takes little memory and time.
 
-`pytest -m fuzz` makes them at random. FUZZ_SECONDS: CPU time for each loader, by default 20. The
-same command continues an interrupted pass; --cache-clear begins a new one. An input that fails is
-copied to the folder `corpus`, which the quick suite reads.
+`pytest -m fuzz` makes them at random. FUZZ_SECONDS: CPU time for each loader, by default 20. An
+input that fails is copied to the folder `corpus`, which the quick suite reads.
 """
 
 import faulthandler
@@ -57,7 +56,6 @@ from mgs.view.subject import read_subject
 
 CORPUS = Path(__file__).parent / "corpus"
 SECONDS = float(os.environ.get("FUZZ_SECONDS", "20"))
-BATCH = 100
 LONGEST = 60
 """Seconds after which reading a small file counts as endless, and ends the process."""
 MOST_GROWTH = 2 << 30
@@ -288,23 +286,12 @@ def begin_peak() -> int:
     return peak()
 
 
-def keep(name: str, path: Path) -> Path:
-    """Copy an input that failed to the corpus."""
-    data = path.read_bytes()
-    kept = CORPUS / name / hashlib.sha256(data).hexdigest()[:12]
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    kept.write_bytes(data)
-    return kept
-
-
-@pytest.mark.parametrize("name", LOADERS)
+@pytest.mark.parametrize("name", sorted(folder.name for folder in CORPUS.iterdir()))
 def test_inputs_that_once_failed(name, tmp_path, capfd):
     file, write, read = LOADERS[name]
-    kept = sorted((CORPUS / name).glob("*"))
-    if kept:
-        write(tmp_path / file)
-        read(tmp_path / file)
-    for path in kept:
+    write(tmp_path / file)
+    read(tmp_path / file)
+    for path in (CORPUS / name).iterdir():
         (tmp_path / file).write_bytes(path.read_bytes())
         before = begin_peak()
         harmless(name, tmp_path / file)
@@ -315,23 +302,14 @@ def test_inputs_that_once_failed(name, tmp_path, capfd):
 @pytest.mark.fuzz
 @pytest.mark.parametrize("name", LOADERS)
 def test_damaged_files(name, request, capfd):
-    """pytest's cache holds the batches and seconds of the loader so far, and whether it is running.
-    After the death of a process, the file that it read last is kept and read again."""
-    cache = request.config.cache
-    batches, spent = cache.get(f"fuzz/{name}", [0, 0.0])
-    folder, running = cache.mkdir("fuzz") / name, f"fuzz/running {name}"
+    """pytest's cache has the file that was read last, also after the death of the process."""
     file, write, read = LOADERS[name]
-    if cache.get(running, False):
-        kept = keep(name, folder / file)
-        harmless(name, folder / file)
-        kept.unlink()
+    folder = request.config.cache.mkdir("fuzz") / name
     shutil.rmtree(folder, ignore_errors=True)
-    if spent >= SECONDS:
-        pytest.skip(f"had its {SECONDS:g} s; begin a new pass with --cache-clear")
     folder.mkdir()
     write(folder / file)
-    sound, tree = (folder / file).read_bytes(), GRAMMARS.get(Path(file).suffix, damages)
     read(folder / file)
+    sound, tree = (folder / file).read_bytes(), GRAMMARS.get(Path(file).suffix, damages)
     before = begin_peak()
 
     def damaged(data: bytes) -> None:
@@ -341,20 +319,18 @@ def test_damaged_files(name, request, capfd):
         assert capfd.readouterr().err == ""
 
     options = settings(
-        max_examples=BATCH,
+        max_examples=100,
         phases=[Phase.generate, Phase.shrink],
         database=None,
         suppress_health_check=list(HealthCheck),
     )
-    while spent < SECONDS:
-        cache.set(running, True)
-        begun = time.process_time()
+    batch, end = 0, time.process_time() + SECONDS
+    while time.process_time() < end:
         try:
-            seed(batches)(options(given(damages(sound) | tree(sound))(damaged)))()
+            seed(batch)(options(given(damages(sound) | tree(sound))(damaged)))()
         except BaseException:
-            keep(name, folder / file)
+            data = (folder / file).read_bytes()
+            (CORPUS / name).mkdir(exist_ok=True)
+            (CORPUS / name / hashlib.sha256(data).hexdigest()[:12]).write_bytes(data)
             raise
-        finally:
-            batches, spent = batches + 1, spent + time.process_time() - begun
-            cache.set(f"fuzz/{name}", [batches, spent])
-            cache.set(running, False)
+        batch += 1

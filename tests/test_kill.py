@@ -1,8 +1,7 @@
 """Commands killed (SIGKILL) at random moments and run again: their files equal those of an
 uninterrupted run bit for bit. Two processes of every writing command. The memory of 1,000 steps.
 
-`pytest -m kill` runs them; KILLS: number of kills, by default 100. The same command continues an
-interrupted pass; --cache-clear begins a new one.
+`pytest -m kill` runs them; KILLS: number of kills, by default 100.
 """
 
 import faulthandler
@@ -73,8 +72,6 @@ WRITERS = {name: COMMANDS[name] for name in COMMANDS if name != "study"} | {
     "page": "report {out} --html {out}/page.html",
     "render": "render {run}/gaussians.ply --cameras {data} --out {out}",
 }
-LONG = {name: f"{name} {{out}}" for name in ("demo", "chart", "stress", "parsimony", "reproduce")}
-"""Commands whose winner is stopped when the loser has ended."""
 ON_RUNS = ("refit", "eval", "diagnose", "prune", "report", "page")
 LOST = "works on it|is finished already|is there already|has a mask already"
 """Pattern of the loser's line."""
@@ -103,7 +100,7 @@ def places(tmp_path_factory) -> dict[str, Path]:
 
 def started(name: str, places: dict[str, Path], **pipes: int) -> subprocess.Popen:
     """The process of a command; of a run that has begun, the one that resumes it."""
-    arguments = (COMMANDS | WRITERS | LONG)[name].format(**places).split()
+    arguments = (COMMANDS | WRITERS)[name].format(**places).split()
     if arguments[0] == "nbv" and (places["out"] / "config.json").is_file():
         arguments = ["nbv", "--resume", str(places["out"])]
     program = [sys.executable, "-c", CELL if name == "study" else PROGRAM, *arguments]
@@ -145,16 +142,11 @@ def contents(work: Path) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_killed_at_any_moment(name, places, request):
-    """pytest's cache holds the number of kills so far."""
-    cache, count = request.config.cache, -(-KILLS // len(COMMANDS))
-    done = cache.get(f"kill/{name}", 0)
-    if done >= count:
-        pytest.skip(f"had its {count} kills; begin a new pass with --cache-clear")
+def test_killed_at_any_moment(name, places):
     work, begun = cleared(name, places), time.monotonic()
     assert started(name, places).wait() == 0
     took, whole = time.monotonic() - begun, contents(work)
-    for moment in np.random.default_rng(0).uniform(0, took, count)[done:]:
+    for moment in np.random.default_rng(0).uniform(0, took, -(-KILLS // len(COMMANDS))):
         cleared(name, places)
         process = started(name, places)
         time.sleep(moment)
@@ -164,34 +156,23 @@ def test_killed_at_any_moment(name, places, request):
         after = contents(work)
         differ = [key for key in whole | after if whole.get(key) != after.get(key)]
         assert not differ, f"killed after {moment:.2f} s of {took:.2f}"
-        done += 1
-        cache.set(f"kill/{name}", done)
 
 
-@pytest.mark.parametrize("name", WRITERS | LONG)
+@pytest.mark.parametrize("name", WRITERS)
 def test_two_processes_of_a_command(name, places):
     """Both leave what one leaves alone, or one ends with code 2 and a line that says why."""
-    work, whole = cleared(name, places), None
-    if name not in LONG:
-        assert started(name, places).wait() == 0
-        whole = contents(work)
-        cleared(name, places)
+    work = cleared(name, places)
+    assert started(name, places).wait() == 0
+    whole = contents(work)
+    cleared(name, places)
     both = [started(name, places, stderr=subprocess.PIPE) for _ in range(2)]
-    if name in LONG:
-        while all(one.poll() is None for one in both):
-            time.sleep(0.1)
-        for one in both:
-            one.terminate()
     ends = [(one.communicate()[1], one.returncode) for one in both]
-    lost = [(said, code) for said, code in ends if code not in (0, -signal.SIGTERM)]
+    lost = [(said, code) for said, code in ends if code != 0]
     assert len(lost) < 2, ends
     for said, code in lost:
         assert (code, said.count("\n")) == (2, 1), said
         assert re.search(LOST, said), said
-    if name in LONG:
-        assert len(lost) == 1
-    else:
-        assert contents(work) == whole
+    assert contents(work) == whole
 
 
 def test_memory_of_1000_steps_is_flat(tmp_path):
