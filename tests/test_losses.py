@@ -9,7 +9,6 @@ from scipy.ndimage import correlate1d
 from mgs import runtime
 from mgs.bench import surface_camera, surface_gaussians
 from mgs.colour import srgb_from_linear
-from mgs.errors import InputError
 from mgs.fit.fitting import fit
 from mgs.fit.losses import LOSSES, similarity
 from mgs.fit.settings import TrainSettings
@@ -101,9 +100,3 @@ def test_a_fit_lowers_l1_and_dssim_and_repeats_bitwise(optimiser):
     assert one.losses[0] == pytest.approx(slow_loss(grey, rgb, np.ones_like(rgb)).mean(), rel=1e-4)
     assert one.losses[1] == pytest.approx(one.losses[0], rel=1e-5)
     assert one.loss < 0.9 * one.losses[0]
-
-
-def test_an_unknown_loss_is_refused():
-    model = surface_gaussians(4)
-    with pytest.raises(InputError, match="squared, l1-dssim"):
-        fit(model, [], [], TrainSettings(loss="dreams"))

@@ -180,8 +180,3 @@ def test_a_weight_for_alpha_needs_alpha():
         goal.phi(as_drjit(start))
     with_alpha = objective(start, [camera], [np.dstack([UNSEEN, UNSEEN[..., 0]])])
     assert with_alpha.photos[0].size == (24, 20, 3), "without a weight alpha is not read"
-
-
-def test_unusable_means_are_refused():
-    with pytest.raises(InputError, match="needs normals"):
-        objective(surface_gaussians(50), [], [], means="normal")

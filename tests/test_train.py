@@ -11,7 +11,7 @@ from mgs.camera import Camera, look_at
 from mgs.errors import InputError
 from mgs.fit.fitting import COLOUR_MIN, fit
 from mgs.fit.optimisers import ADAM_EPSILON
-from mgs.fit.settings import TrainSettings
+from mgs.fit.settings import RATES, TrainSettings
 from mgs.fit.stopping import LOSS_FLOOR, StopReason, stop_reason
 from mgs.gaussians import LEARNED, Gaussians
 from mgs.splat import ListCache, fisher, render
@@ -107,17 +107,29 @@ def test_one_step_is_adam_on_the_gradient_of_the_summed_squared_error(truth, cam
 
 def test_one_step_is_natural_on_the_gradient_of_the_objective(truth, cameras, targets):
     """The first step is minus a tenth of the gradient over four times the information, at most the
-    rate."""
-    start = grey(truth)
-    lam = {"colour": 0.05, "scale": 0.5, "rotation": 0.5, "opacity": 0.1}
-    settings = TrainSettings(passes=1, rates=rates_of(0.01))
-    found = fit(start, cameras[:1], targets[:1], settings, lam=lam)
-    steps = (found.gaussians.sh - start.sh)[:, 0]
-    step, information = steps[:, 0], fisher(start, cameras[0])[:, 0] + 0.05
+    rate. The loss is the objective over the number of pixel values."""
+    lam, start = {"colour": 0.3, "scale": 2.0, "rotation": 5.0, "opacity": 0.1}, grey(truth)
+    begun = replace(
+        truth,
+        log_scales=truth.log_scales + 0.1,
+        quats=truth.quats + 0.05,
+        logit_opacities=truth.logit_opacities - 0.3,
+        sh=np.full_like(truth.sh, 0.2),
+    )
+    settings, camera, target = TrainSettings(passes=1, rates=rates_of(0.01)), cameras[0], targets[0]
+    found = fit(begun, [camera], [target], settings, start=start, lam=lam)
+    prior = sum(
+        weight * ((getattr(begun, name) - getattr(start, name)) ** 2).sum()
+        for name, weight in zip(LEARNED, lam.values(), strict=True)
+    )
+    expected = mean_square(begun, [camera], [target]) + prior / target.size
+    assert found.losses == pytest.approx((expected, expected), rel=1e-4)  # the same, in the step
+    steps = (found.gaussians.sh - begun.sh)[:, 0]
+    step, information = steps[:, 0], fisher(begun, camera)[:, 0] + 0.3
     half_the_rate = np.argsort(np.abs(np.abs(step) - 0.005))[:3]
     longest = np.argsort(-np.abs(step))[:2]
     for i in (*half_the_rate, *longest):
-        g = derivative(start, cameras[0], targets[0], i)
+        g = derivative(begun, camera, target, i) + 0.3 * 0.2
         expected = np.clip(-0.1 * g / (4 * information[i]), -0.01, 0.01)
         assert step[i] == pytest.approx(expected, rel=1e-2)
     assert np.abs(steps).max() == pytest.approx(0.01, rel=1e-4)
@@ -189,21 +201,15 @@ def test_the_model_of_the_lowest_loss_is_kept(truth, cameras, targets):
         ([1, 0.5, 0.499], 40, None),  # needs two passes in a row
         ([1, 0.5, 0.499], 2, StopReason.PASS_LIMIT),
         ([1, 0.5, 0.49, 0.4895], 40, None),
-        ([1, 0.5, 0.6, 0.7], 40, None),
         ([1, 0.5, 0.504, 0.508], 40, None),  # small rises add up
         ([1, 0.5, 0.6, 0.598, 0.597], 40, None),  # flat, but above the lowest
-        ([1, 1.2, 1.2, 1.2, 1.2, 1.2], 40, None),  # flat above the start
-        ([1, 1.2, 1.2, 1.2, 1.2, 1.2], 5, StopReason.PASS_LIMIT),
         ([1, 1.03, 1.2, 1.28, 1.05, 1.05], 5, StopReason.PASS_LIMIT),  # a short fit, a new view
-        ([1, 1.04], 1, StopReason.PASS_LIMIT),
         ([1, 3, 1.4, 3, 3, 3, 3], 40, None),
         ([1, 3, 3, 3, 3], 40, None),
         ([1, 3, 3, 3, 3, 3], 40, StopReason.DIVERGED),
         ([1, 3, 3], 2, StopReason.DIVERGED),
-        ([1, *(2 * 0.9**k for k in range(6))], 40, None),  # falls below the factor in the end
         ([1, 0.1, 3, 4, 5, 6, 7], 40, StopReason.DIVERGED),
         ([1, 0.5, math.nan], 40, StopReason.DIVERGED),
-        ([1, math.inf], 40, StopReason.DIVERGED),
         ([0, *[LOSS_FLOOR] * 3], 40, StopReason.SETTLED),  # starts at the solution
     ],
 )
@@ -221,45 +227,6 @@ def test_what_is_refused_for_another_reason_than_its_numbers_is_no_divergence(
     monkeypatch.setattr("mgs.splat.blocks.MAX_PAIRS", 4)
     with pytest.raises(InputError, match="pairs"):
         fit(grey(truth), cameras, targets, TrainSettings(passes=1))
-
-
-def test_the_loss_is_the_objective_over_the_number_of_pixel_values(truth, cameras, targets):
-    lam, start = {"colour": 0.3, "scale": 2.0, "rotation": 5.0, "opacity": 0.1}, grey(truth)
-    begun = replace(
-        truth,
-        log_scales=truth.log_scales + 0.1,
-        quats=truth.quats + 0.05,
-        logit_opacities=truth.logit_opacities - 0.3,
-        sh=np.full_like(truth.sh, 0.2),
-    )
-    found = fit(begun, cameras, targets, TrainSettings(passes=1), start=start, lam=lam)
-    prior = sum(
-        weight * ((getattr(begun, name) - getattr(start, name)) ** 2).sum()
-        for name, weight in zip(LEARNED, lam.values(), strict=True)
-    )
-    expected = mean_square(begun, cameras, targets) + prior / sum(target.size for target in targets)
-    assert found.losses[0] == pytest.approx(expected, rel=1e-4)
-    # The loss of a pass of one image is measured before its step: that of the model given.
-    single = fit(begun, cameras[:1], targets[:1], TrainSettings(passes=1), start=start, lam=lam)
-    assert single.losses[1] == pytest.approx(single.losses[0], rel=1e-4)
-
-
-def test_the_gradient_of_the_prior_is_that_of_the_objective(truth, cameras, targets):
-    """One Adam step follows the sum of both gradients: the image's alone is found without prior,
-    the prior's by hand."""
-    settings = TrainSettings(optimiser="adam", passes=1, rates=rates_of(1e-3))
-    begun = replace(truth, sh=np.full_like(truth.sh, 0.3))
-    one = begun, cameras[:1], targets[:1], settings
-
-    def gradient(found):
-        move = (begun.sh.astype(np.float64) - found.gaussians.sh) / 1e-3
-        return move * ADAM_EPSILON / (1 - np.abs(move))
-
-    image = gradient(fit(*one))
-    both = gradient(fit(*one, start=grey(truth), lam={"colour": 0.002}))
-    small = np.abs(image) < 0.02  # elsewhere the step shows the sign only
-    assert small.sum() > 100
-    assert np.allclose((both - image)[small], 0.002 * 0.3, rtol=0.05, atol=2e-5)
 
 
 def test_colours_stay_above_zero_and_none_is_dead(truth, cameras, targets):
@@ -281,3 +248,19 @@ def test_a_start_of_another_shape_is_refused(truth, cameras, targets):
     richer = replace(truth, sh=np.zeros((len(truth), 4, 3)))
     with pytest.raises(InputError, match="start: has colours of shape"):
         fit(truth, cameras, targets, TrainSettings(passes=1), start=richer)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"optimiser": "dreams"}, "natural, adam"),
+        ({"loss": "dreams"}, "squared, l1-dssim"),
+        ({"density": "dreams"}, "fixed, relocate, adaptive"),
+        ({"density": "relocate"}, "free means"),
+        ({"means": "free"}, "no rate of mean"),
+        ({"means": "normal", "rates": RATES | {"mean": 1.0}}, "needs normals"),
+    ],
+)
+def test_unusable_settings_are_refused(truth, values, words):
+    with pytest.raises(InputError, match=words):
+        fit(truth, [], [], TrainSettings(**values))
