@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,6 @@ import pytest
 import synthetic
 import tiny
 
-from mgs.data.dataset import load_dataset, write_transforms
 from mgs.run.nbv import resume_nbv, start_run
 
 pytestmark = pytest.mark.kill
@@ -39,14 +37,7 @@ arena.ROWS, arena.TEXELS = 60, 64
 rendering.PRESETS[CAPTURE_PRESET] = rendering.RenderPreset(64, 48, 8, 2)
 main()
 """
-CELL = """
-import sys
-from pathlib import Path
-from mgs.study.sweep import Cell, run_cells
-given = {"data": sys.argv[2]}
-run_cells(Path(sys.argv[1]), [Cell("run", "test_sweep:real_run", given)], lambda *_: None)
-"""
-"""Programs: mgs, with a coarse ground and few pixels; a study of one cell, which is a run."""
+"""mgs, with a coarse ground and few pixels."""
 
 TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 20\n"
 UNEQUAL = rb'"(commit|\w*seconds\w*)":\s*(\{[^}]*\}|"[^"]*"|[-+.\de]+)'
@@ -57,14 +48,12 @@ COMMANDS = {
     "synth-orbit": "synth-orbit {out} --scene {scene} --frames 6 --size 64x48 --spp 2",
     "import": "import {data} --mesh {data}/rock.glb --out {out}",
     "refit": "refit {out}",
-    "study": "{out} {data}",
 }
 """Name -> arguments; those of ON_RUNS get a copy of {run}."""
 
-WRITERS = {name: COMMANDS[name] for name in COMMANDS if name != "study"} | {
+WRITERS = COMMANDS | {
     "prior": "prior {data} --mesh {data}/rock.glb --gaussians 150 --out {out}",
     "survey": "survey {data} --poses exact --out {out}",
-    "masks": "dataset masks {out} --prior {prior}",
     "eval": "eval {out}",
     "diagnose": "diagnose {out}",
     "prune": "prune {out}",
@@ -73,7 +62,7 @@ WRITERS = {name: COMMANDS[name] for name in COMMANDS if name != "study"} | {
     "render": "render {run}/gaussians.ply --cameras {data} --out {out}",
 }
 ON_RUNS = ("refit", "eval", "diagnose", "prune", "report", "page")
-LOST = "works on it|is finished already|is there already|has a mask already"
+LOST = "works on it|is finished already|is there already"
 """Pattern of the loser's line."""
 
 
@@ -100,12 +89,11 @@ def places(tmp_path_factory) -> dict[str, Path]:
 
 def started(name: str, places: dict[str, Path], **pipes: int) -> subprocess.Popen:
     """The process of a command; of a run that has begun, the one that resumes it."""
-    arguments = (COMMANDS | WRITERS)[name].format(**places).split()
+    arguments = WRITERS[name].format(**places).split()
     if arguments[0] == "nbv" and (places["out"] / "config.json").is_file():
         arguments = ["nbv", "--resume", str(places["out"])]
-    program = [sys.executable, "-c", CELL if name == "study" else PROGRAM, *arguments]
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), *sys.path])}
-    return subprocess.Popen(program, env=env, stdout=subprocess.DEVNULL, text=True, **pipes)
+    program = [sys.executable, "-c", PROGRAM, *arguments]
+    return subprocess.Popen(program, stdout=subprocess.DEVNULL, text=True, **pipes)
 
 
 def cleared(name: str, places: dict[str, Path]) -> Path:
@@ -118,11 +106,6 @@ def cleared(name: str, places: dict[str, Path]) -> Path:
     if name == "eval":
         (places["out"] / "metrics.json").unlink()
         shutil.rmtree(places["out"] / "renders")
-    if name == "masks":
-        shutil.copytree(places["data"], places["out"])
-        frames = [replace(frame, mask_path=None) for frame in load_dataset(places["out"]).frames]
-        write_transforms(places["out"], frames)
-        shutil.rmtree(places["out"] / "masks")
     return work
 
 
