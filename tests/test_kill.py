@@ -1,5 +1,5 @@
 """Commands killed (SIGKILL) at random moments and run again: their files equal those of an
-uninterrupted run bit for bit. Two processes of every writing command. The memory of 1,000 steps.
+uninterrupted run bit for bit. Two processes of each. The memory of 1,000 steps.
 
 `pytest -m kill` runs them; KILLS: number of kills, by default 100.
 """
@@ -49,19 +49,8 @@ COMMANDS = {
     "import": "import {data} --mesh {data}/rock.glb --out {out}",
     "refit": "refit {out}",
 }
-"""Name -> arguments; those of ON_RUNS get a copy of {run}."""
+"""Name -> arguments; refit gets a copy of {run}."""
 
-WRITERS = COMMANDS | {
-    "prior": "prior {data} --mesh {data}/rock.glb --gaussians 150 --out {out}",
-    "survey": "survey {data} --poses exact --out {out}",
-    "eval": "eval {out}",
-    "diagnose": "diagnose {out}",
-    "prune": "prune {out}",
-    "report": "report {out} --out {out}/report",
-    "page": "report {out} --html {out}/page.html",
-    "render": "render {run}/gaussians.ply --cameras {data} --out {out}",
-}
-ON_RUNS = ("refit", "eval", "diagnose", "prune", "report", "page")
 LOST = "works on it|is finished already|is there already"
 """Pattern of the loser's line."""
 
@@ -89,7 +78,7 @@ def places(tmp_path_factory) -> dict[str, Path]:
 
 def started(name: str, places: dict[str, Path], **pipes: int) -> subprocess.Popen:
     """The process of a command; of a run that has begun, the one that resumes it."""
-    arguments = WRITERS[name].format(**places).split()
+    arguments = COMMANDS[name].format(**places).split()
     if arguments[0] == "nbv" and (places["out"] / "config.json").is_file():
         arguments = ["nbv", "--resume", str(places["out"])]
     program = [sys.executable, "-c", PROGRAM, *arguments]
@@ -101,11 +90,8 @@ def cleared(name: str, places: dict[str, Path]) -> Path:
     work = places["out"].parent
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir()
-    if name in ON_RUNS:
+    if name == "refit":
         shutil.copytree(places["run"], places["out"])
-    if name == "eval":
-        (places["out"] / "metrics.json").unlink()
-        shutil.rmtree(places["out"] / "renders")
     return work
 
 
@@ -141,7 +127,7 @@ def test_killed_at_any_moment(name, places):
         assert not differ, f"killed after {moment:.2f} s of {took:.2f}"
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", COMMANDS)
 def test_two_processes_of_a_command(name, places):
     """Both leave what one leaves alone, or one ends with code 2 and a line that says why."""
     work = cleared(name, places)
