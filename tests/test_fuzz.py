@@ -138,9 +138,10 @@ def compressed(path: Path) -> None:
     path.write_bytes(f"ply\nformat binary_little_endian 1.0\n{head}".encode() + body)
 
 
-def mesh(path: Path) -> None:
+def mesh(path: Path, side: int = 4) -> None:
+    """A ball as GLB, with a texture of side x side pixels."""
     ball = trimesh.creation.icosphere(subdivisions=1)
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.new("RGB", (4, 4)))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.new("1", (side, side)))
     ball.visual = trimesh.visual.TextureVisuals(uv=ball.vertices[:, :2], material=material)
     path.write_bytes(ball.export(file_type="glb"))
 

@@ -18,7 +18,7 @@ import trimesh
 from PIL import Image
 from program import command, said
 from refusals import refused
-from test_fuzz import colmap
+from test_fuzz import colmap, mesh
 
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset
@@ -115,30 +115,28 @@ def test_a_terminal_of_ascii_and_no_home():
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "1 m?\n", "")
 
 
-def sphere(path: Path, side: int = 4, count: int | None = None) -> Path:
-    """A ball as GLB with a texture. count: numbers that each of its arrays is said to have."""
-    ball = trimesh.creation.icosphere(subdivisions=1)
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.new("1", (side, side)))
-    ball.visual = trimesh.visual.TextureVisuals(uv=ball.vertices[:, :2], material=material)
-    data = ball.export(file_type="glb")
+def endless_mesh(path: Path) -> None:
+    """A GLB file whose arrays are said to have 10^11 numbers."""
+    mesh(path)
+    data = path.read_bytes()
     size = struct.unpack("<I", data[12:16])[0]
-    header = json.loads(data[20 : 20 + size])
-    for one in header["accessors"] if count else ():
+    header, rest = json.loads(data[20 : 20 + size]), data[20 + size :]
+    for one in header["accessors"]:
         del one["bufferView"]
-        one["count"] = count
+        one["count"] = 10**11
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
-    rest = data[20 + size :]
     whole = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
     path.write_bytes(whole + text + rest)
-    return path
 
 
 def test_bombs_of_geometry(tmp_path):
+    mesh(tmp_path / "a.glb", 13_300)
     with pytest.raises(InputError, match="13300x13300 pixels"):
-        load_mesh(sphere(tmp_path / "a.glb", 13_300))
+        load_mesh(tmp_path / "a.glb")
+    endless_mesh(tmp_path / "b.glb")
     with pytest.raises(InputError, match="GiB that are free"):
-        load_mesh(sphere(tmp_path / "b.glb", count=10**11))
+        load_mesh(tmp_path / "b.glb")
     columns = "".join(f"property float {name}\n" for name in "xyz")
     head = f"ply\nformat ascii 1.0\nelement vertex 10000000000\n{columns}end_header\n"
     (tmp_path / "c.ply").write_text(f"{head}0 0 0\n")

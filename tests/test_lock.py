@@ -1,6 +1,5 @@
 """requirements.lock fits pyproject.toml."""
 
-import re
 import tomllib
 from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
@@ -23,8 +22,6 @@ def test_the_lock_pins_every_requirement_for_the_lowest_python():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     lines = (ROOT / "requirements.lock").read_text().splitlines()
     lines = [line for line in lines if not line.startswith("#")]
-    odd = [line for line in lines if not re.fullmatch(r"[\w.-]+==[\w.+!]+", line)]
-    assert odd == []
     locked = {canonicalize_name(name): pin for name, pin in (line.split("==") for line in lines)}
 
     groups, package = project["dependency-groups"], project["project"]

@@ -85,18 +85,17 @@ def test_similarity_is_that_of_scikit_image_inside_the_border(images):
     assert np.allclose(ours[5:-5, 5:-5], theirs[5:-5, 5:-5], atol=1e-5)
 
 
-@pytest.mark.parametrize("optimiser", ["adam", "natural"])
-def test_a_fit_lowers_l1_and_dssim_and_repeats_bitwise(optimiser):
+def test_a_fit_lowers_l1_and_dssim():
     model = surface_gaussians(300)
     model.log_scales += 0.7
     camera = surface_camera(model, 40, 32)
     rgb = np.asarray(render(model, camera).rgb)
     target = np.dstack([rgb, np.ones(rgb.shape[:2])]).astype(np.float32)
     model.sh[:] = 0
-    settings = TrainSettings(loss="l1-dssim", optimiser=optimiser, passes=8, tolerance=0)
-    one, two = (fit(model, [camera], [target], settings) for _ in range(2))
-    assert one.gaussians == two.gaussians
+    found = fit(model, [camera], [target], TrainSettings(loss="l1-dssim", passes=8, tolerance=0))
     grey = np.asarray(render(model, camera).rgb, np.float64)
-    assert one.losses[0] == pytest.approx(slow_loss(grey, rgb, np.ones_like(rgb)).mean(), rel=1e-4)
-    assert one.losses[1] == pytest.approx(one.losses[0], rel=1e-5)
-    assert one.loss < 0.9 * one.losses[0]
+    assert found.losses[0] == pytest.approx(
+        slow_loss(grey, rgb, np.ones_like(rgb)).mean(), rel=1e-4
+    )
+    assert found.losses[1] == pytest.approx(found.losses[0], rel=1e-5)
+    assert found.loss < 0.9 * found.losses[0]
