@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import tiny
 import trimesh
-from PIL import Image
 from program import command, said
 from refusals import refused
 from test_fuzz import colmap, mesh

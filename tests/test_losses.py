@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import correlate1d
 
-from mgs import runtime
 from mgs.bench import surface_camera, surface_gaussians
 from mgs.colour import srgb_from_linear
 from mgs.fit.fitting import fit
@@ -48,7 +47,6 @@ def slow_loss(drawn, pixels, weights):
 @pytest.fixture(scope="module", params=[3, 4])
 def images(request):
     """A render, an image and weights, [H,W,C]; some pixels are dark, unknown, or above 1."""
-    runtime.start()
     rng, shape = np.random.default_rng(0), (HEIGHT, WIDTH, request.param)
     pixels = rng.random(shape) ** 3
     drawn = np.clip(pixels + 0.1 * rng.normal(size=shape), 1e-4, None)
