@@ -64,6 +64,7 @@ OPTIONS: dict[str, list[tuple[str, str]]] = {
         ("--means free --policy paper", "--policy paper has no information about means"),
         ("--flight-length 9", "takes 15.2 m and 17 s; raise --flight-length"),
         ("--no-fly 4", "allow 0 of its 12 poses, fewer than 3 seeds"),
+        ("--clearance 30", "allow 0 of its 12 poses, fewer than 3 seeds"),
         ("--flight-length 30 --travel 2", "leave out --travel"),
     ],
     "synth-orbit {out}": [
