@@ -323,7 +323,7 @@ def b2(path: Path) -> None:
         ("TUM RGB-D", "calibration.txt", Path.unlink, "fx fy cx cy"),
         ("TUM RGB-D", "calibration.txt", nonsense, "not all numbers"),
         ("TUM RGB-D", "groundtruth.txt", nonsense, "fewer than 8"),
-        ("Metashape", "cameras.xml", halved, "no XML of Metashape"),
+        ("Metashape", "cameras.xml", halved, "not a readable XML of Metashape"),
         ("Metashape", "cameras.xml", b2, "b2 or k4"),
         ("RTAB-Map", "3.yaml", halved, "camera_matrix"),
     ],
