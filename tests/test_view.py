@@ -233,6 +233,25 @@ def test_a_run_is_followed_from_its_beginning(dataset, prior, tmp_path):
         viewer.close()
 
 
+def test_what_a_window_asks_for_during_a_failed_drawing_is_drawn(run, monkeypatch):
+    pytest.importorskip("viser", reason="viser is not installed")
+    viewer, drawn = Viewer(run, port=0), []
+
+    def draw(client):
+        drawn.append(client)
+        viewer._again()
+        raise ValueError
+
+    monkeypatch.setattr(viewer, "_draw", draw)
+    viewer.clients[0] = SimpleNamespace(moved=0.0, drawn=None)
+    try:
+        viewer.tick()
+        viewer.tick()
+        assert len(drawn) == 2
+    finally:
+        viewer.close()
+
+
 def of_viser(message) -> bool:
     """Whether an error on the console is one that viser 1.1.1 makes by itself, with any Gaussians:
     three.js reads past the end of the corners of its squares."""
@@ -302,6 +321,8 @@ def test_the_viewer_in_a_browser(browser, run):
     # Where nothing else is drawn.
     inside = (np.abs(u - centre[0]) < 60) & (np.abs(v - centre[1]) < 60)
 
+    expected = layers.kernel_image(subject, camera, "colour")[0].astype(int)
+
     def off(picture):
         return np.abs(picture - expected)[inside].mean()
 
@@ -310,6 +331,8 @@ def test_the_viewer_in_a_browser(browser, run):
         opened(browser, address, WIDTH, HEIGHT, known=of_viser) as (tab, wrong),
     ):
         tab.get_by_text(subject.title).wait_for()
+        # Before any click: one before the page listens is lost.
+        assert off(screen_becomes(tab, lambda picture: off(picture) < 1)) < 1
         tick(tab, "Cameras", False)
         for layer in ("uncertainty", "colour"):
             choose(tab, "Layer", layer)

@@ -143,12 +143,13 @@ class Viewer:
                 self.stamp, self.subject = stamp, read_subject(self.path, self.follow)
                 self._renew()
         for client in list(self.clients.values()):
-            due = client.drawn != (client.moved, self.version) and now >= client.moved + REST
+            asked = client.moved, self.version
+            due = client.drawn != asked and now >= client.moved + REST
             if due and self.subject.gaussians is not None:
                 try:
                     self._draw(client)
                 except Exception:  # whatever a window sent, the others go on
-                    client.drawn = (client.moved, self.version)
+                    client.drawn = asked  # but not what it asked for meanwhile
 
     def _stamp(self) -> list[int]:
         """Times of change of the files that a step or `mgs eval` writes."""
