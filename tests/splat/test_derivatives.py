@@ -143,16 +143,18 @@ def test_gradient_stops_where_a_scale_is_clamped():
     assert all(np.isfinite(g).all() for g in found.values())
 
 
+SCENE = {
+    "seed": st.integers(0, 2**31),
+    "degree": st.integers(0, 3),
+    "scale": st.floats(-5, -0.5),
+    "stretch": st.floats(0.1, 4),
+    "logit": st.floats(-2, 10),
+    "antialiased": st.booleans(),
+}
+
+
 @settings(derandomize=True, deadline=None, max_examples=10)
-@given(
-    seed=st.integers(0, 2**31),
-    degree=st.integers(0, 3),
-    scale=st.floats(-5, -0.5),
-    stretch=st.floats(0.1, 4),
-    logit=st.floats(-2, 10),
-    focal=st.floats(20, 80),
-    antialiased=st.booleans(),
-)
+@given(**SCENE, focal=st.floats(20, 80))
 def test_gradient_for_any_scene(seed, degree, scale, stretch, logit, focal, antialiased):
     camera, style = make_camera(focal=focal), {"antialiased": antialiased}
     style |= {"log_scales": (scale - stretch, scale), "logits": (logit - 4, logit)}
@@ -184,15 +186,7 @@ def test_all_images_change_as_differences_say(degree, names):
 
 
 @settings(derandomize=True, deadline=None, max_examples=20)
-@given(
-    seed=st.integers(0, 2**31),
-    degree=st.integers(0, 3),
-    scale=st.floats(-5, -0.5),
-    stretch=st.floats(0.1, 4),
-    logit=st.floats(-2, 10),
-    names=st.sets(st.sampled_from(ARRAYS), min_size=1),
-    antialiased=st.booleans(),
-)
+@given(**SCENE, names=st.sets(st.sampled_from(ARRAYS), min_size=1))
 def test_tangents_and_gradients_are_of_one_jacobian(
     seed, degree, scale, stretch, logit, names, antialiased
 ):
