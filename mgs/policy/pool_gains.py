@@ -159,10 +159,9 @@ class PoolGains:
         self.pool, self.degree, self.taken = pool, degree, list[int]()
         self.points = mi.Float64(padded(points, np.float64).ravel())
         self.positions = mi.Float64(padded(pool.positions, np.float64).ravel())
-        of, self.poses = np.nonzero(pool.seen.T)
-        self.of = mi.UInt32(padded(of, np.uint32))
-        self.by = mi.UInt32(padded(self.poses, np.uint32))
-        self.weights = mi.Float64(padded(pool.seen[self.poses, of], np.float64))
+        of, by = np.nonzero(pool.seen.T)
+        self.of, self.by = mi.UInt32(padded(of, np.uint32)), mi.UInt32(padded(by, np.uint32))
+        self.weights = mi.Float(padded(pool.seen[by, of]))
         variance = 1 / precision(degree, tau, lam)
         upper = _upper(len(variance))
         self.S = [
@@ -190,12 +189,13 @@ class PoolGains:
     @one_at_a_time
     def of_poses(self, poses: Sequence[int]) -> NDArray[np.float64]:
         """Gain of each of these poses [C]."""
-        explained = self.weights * self.g
+        weights = mi.Float64(self.weights)
+        explained = weights * self.g
         if self.q is None:
             of_pairs = 1.5 * np.log1p(explained)
         else:
-            of_pairs = self.weights * self.q / (1 + explained)
-        sums = np.bincount(self.poses, np.asarray(of_pairs), len(self.pool.positions))
+            of_pairs = weights * self.q / (1 + explained)
+        sums = np.bincount(np.asarray(self.by), np.asarray(of_pairs), len(self.pool.positions))
         return np.asarray(sums[list(poses)], np.float64)
 
     @one_at_a_time
