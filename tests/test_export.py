@@ -57,6 +57,18 @@ def test_a_model_comes_back(tmp_path, kind, degree):
     assert np.abs(read.sh - model.sh).max() <= colour
 
 
+def test_a_glb_says_how_far_its_positions_reach(tmp_path):
+    """As glTF requires."""
+    model = gaussians(0, n=30)
+    path = tmp_path / "x.glb"
+    write_gaussians(path, model, "glb", np.eye(3))
+    data = path.read_bytes()
+    document = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    position = document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
+    reach = [document["accessors"][position][name] for name in ("min", "max")]
+    assert np.array_equal(reach, [model.means.min(0), model.means.max(0)])
+
+
 def test_an_spz_is_y_up(tmp_path):
     codec = pytest.importorskip("gsply_cpp")
     model = gaussians(3, n=300)

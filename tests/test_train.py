@@ -146,6 +146,15 @@ def test_what_no_image_shows_stays_where_the_prior_put_it(truth, cameras, target
         assert not np.array_equal(after[~hidden], before[~hidden])
 
 
+@pytest.mark.parametrize("degree", range(3))
+def test_colours_learn_one_more_sh_degree_after_some_steps(truth, cameras, targets, degree):
+    """As in 3DGS; here after each pass."""
+    start = grey(truth).with_degree(2)
+    train = TrainSettings(passes=degree + 1, tolerance=0, sh_steps=len(cameras))
+    learned = (fit(start, cameras, targets, train).gaussians.sh != start.sh).any(axis=(0, 2))
+    assert np.array_equal(learned, np.arange(9) < (degree + 1) ** 2)
+
+
 def test_fit_repeats_bitwise_and_owes_nothing_to_a_used_cache(truth, cameras, targets):
     settings, cache = TrainSettings(passes=5), ListCache()
     first = fit(grey(truth), cameras, targets, settings, cache=cache)
