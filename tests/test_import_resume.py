@@ -16,10 +16,11 @@ from mgs.data import importers
 from mgs.images import write_png
 
 STRUCK = """
-import os, sys
+import os, signal, sys
 from mgs.data import importers
 from mgs.cli.app import main
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background may ignore it
 write, calls, end = importers.write_png, [], int(sys.argv.pop())
 
 def strike(path, *arguments, **options):
