@@ -165,7 +165,8 @@ def look_at(
 ) -> NDArray[np.float64]:
     """Return world_to_camera [4,4] of a camera at `eye` [3], metres, that looks at `target` [3].
 
-    up: direction [3] that points upwards in the image; +Y replaces it if the camera looks along it.
+    up: direction [3] that points upwards in the image; +Y replaces it if the camera looks along it,
+    +Z if that is +Y.
     Raises InputError if eye and target are the same point.
     """
     eye = np.asarray(eye, np.float64)
@@ -175,8 +176,9 @@ def look_at(
         raise InputError("look_at: eye and target are the same point")
     forward = forward / norm
     right: NDArray[np.float64] = np.cross(forward, np.asarray(up, np.float64))
-    if np.linalg.norm(right) < 1e-9:
-        right = np.cross(forward, [0.0, 1.0, 0.0])
+    for other in ([0.0, 1.0, 0.0], [0.0, 0.0, 1.0]):
+        if np.linalg.norm(right) < 1e-9:
+            right = np.cross(forward, other)
     right = right / np.linalg.norm(right)
     pose = np.eye(4, dtype=np.float64)
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])

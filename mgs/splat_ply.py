@@ -67,7 +67,7 @@ def write_ply(
     """
     g, n = gaussians, len(gaussians)
     names = _ply_names(g.sh.shape[1])
-    rest = np.transpose(g.sh[:, 1:, :], (0, 2, 1)).reshape(n, -1)
+    rest = np.transpose(g.sh[:, 1:, :], (0, 2, 1)).reshape(n, 3 * (g.sh.shape[1] - 1))
     opacity, normals = np.reshape(g.logit_opacities, (n, 1)), np.zeros((n, 3))
     parts = [g.means, normals, g.sh[:, 0, :], rest, opacity, g.log_scales, g.quats]
     columns = np.concatenate(parts, axis=1).astype(np.float32)

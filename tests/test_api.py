@@ -56,8 +56,10 @@ def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
     assert metrics["images"] == 5
     taken = [frame.name for frame in run.taken]
     same = mgs.evaluate(run.gaussians, loaded, trained=taken)
-    of_file = mgs.evaluate(tmp_path / "run/gaussians.ply")
-    for found in (same, of_file):
+    files = [mgs.evaluate(tmp_path / "run/gaussians.ply", given) for given in (None, dataset)]
+    with pytest.raises(mgs.InputError, match="has no frame typo"):
+        mgs.evaluate(run.gaussians, loaded, trained=[*taken, "typo"])
+    for found in (same, *files):
         assert found["held_out"].items() <= metrics["held_out"].items()
     information = mgs.fisher(run.gaussians, loaded.frames[0].camera)
     assert information.shape == (tiny.POINTS, 11)

@@ -27,6 +27,13 @@ def test_slices_masks_and_indices_give_gaussians():
     assert as_drjit(WHOLE)[3:7] == WHOLE[3:7]
 
 
+@pytest.mark.parametrize("axis", np.eye(3))
+def test_a_camera_that_looks_along_up_has_a_pose(axis):
+    turn = look_at([0, 0, 0], axis, up=axis)[:3, :3]
+    assert np.allclose(turn @ turn.T, np.eye(3))
+    assert np.allclose(turn[2], axis)
+
+
 @pytest.mark.parametrize("name", ARRAYS)
 def test_gaussians_are_equal_if_all_numbers_are(name):
     other = copy.deepcopy(WHOLE)

@@ -274,6 +274,12 @@ def test_a_watched_folder(flight, other, pristine, whole, tmp_path, monkeypatch)
         other.fly(transports.watched(1), folder=folder)
 
 
+@pytest.mark.parametrize("end", [".png", ".jpg", ".JPG", ".JPEG"])
+def test_a_picture_as_cameras_name_it(tmp_path, end):
+    (tmp_path / f"a{end}").touch()
+    assert transports.picture(tmp_path / "a.png") == tmp_path / f"a{end}"
+
+
 def test_nobody_comes(flight, tmp_path, monkeypatch):
     monkeypatch.setattr(transports, "POLL", 0.01)
     with pytest.raises(InputError, match=r"no picture after 1 tries .*nothing within 0.05 s"):

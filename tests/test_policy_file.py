@@ -58,6 +58,9 @@ def few(candidates):
     return [1.0]
 
 number = 3
+
+def words(F, unused=2):
+    return "a"
 """
 
 
@@ -123,6 +126,7 @@ def test_a_policy_that_cannot_be_loaded_is_one_line(dataset, file, tmp_path, nam
     [
         ("broken", r"line 38 of .*mine\.py failed: ZeroDivisionError: division by zero"),
         ("few", r"returned scores of shape \(1,\) for 9 candidates"),
+        ("words", r"returned no numbers \(.*'a'\); return one for each candidate"),
     ],
 )
 def test_a_policy_that_fails_keeps_the_steps_before(loaded, file, tmp_path, function, message):

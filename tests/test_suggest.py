@@ -141,7 +141,7 @@ def test_poses_of_a_csv(site, tmp_path):
     assert (east, number) == ("east", "pose_0001")
     assert first == Camera(site.like.K, 48, 36, look_at([3, 0, 1], [0, 0, 0]))
     np.testing.assert_allclose(second.world_to_camera[2, :3], [0, -1, 0], atol=1e-9)
-    path.write_text("x,y,z,qw,qx,qy,qz\n1,2,3,2,0,0,0\n")
+    path.write_text("\ufeffx,y,z,qw,qx,qy,qz\n1,2,3,2,0,0,0\n")  # as Excel saves it
     ((_, third),) = read_poses(path, site)
     np.testing.assert_allclose(
         third.camera_to_world[:3], np.eye(4)[:3] + [[0, 0, 0, k] for k in (1, 2, 3)]

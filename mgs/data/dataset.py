@@ -112,7 +112,9 @@ def load_dataset(root: str | Path, *, to_capture: bool = False) -> Dataset:
     root = Path(root)
     path = root / "transforms.json"
     if not root.is_dir():
-        raise InputError(f"{root}: no such dataset folder; make one with `mgs synth-orbit {root}`")
+        raise InputError(
+            f"{root}: no such dataset folder; make one with `mgs import` or `mgs synth-orbit`"
+        )
     data, records = read_records(path)
     frames = [_frame(path, data, i, record, to_capture) for i, record in enumerate(records)]
     for name, count in Counter(frame.name for frame in frames).items():

@@ -131,10 +131,14 @@ def by_parameter_name(name: str, function: Callable[..., Any], path: Path | None
     """Wrap a function as a policy; its arguments are passed by parameter name.
 
     path: its file, where the user named one: then its errors are InputError, with their line.
-    Raises InputError for an unknown parameter.
+    Raises InputError for an unknown parameter without a default.
     """
     known = [*CANDIDATE_ARGUMENTS, *CONTEXT_ARGUMENTS]
-    parameters = list(inspect.signature(function).parameters)
+    parameters = [
+        parameter.name
+        for parameter in inspect.signature(function).parameters.values()
+        if parameter.default is parameter.empty or parameter.name in known
+    ]
     if unknown := [parameter for parameter in parameters if parameter not in known]:
         raise InputError(
             f"--policy {name}: unknown parameter {unknown[0]}; choose from {', '.join(known)}"

@@ -34,7 +34,7 @@ from mgs.memory import KEPT_BYTES, release
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_surface
 from mgs.provenance import versions
 from mgs.report.runs import read_metrics
-from mgs.run.folder import Run, holds_run, open_run
+from mgs.run.folder import Run, holds_run, open_run, read_config
 from mgs.run.inputs import array_digest, camera_digest, frame_digests
 from mgs.splat_ply import read_ply
 
@@ -353,7 +353,7 @@ def evaluate(
     - trained: names of the frames that the model was trained on; in a run folder, the run's.
 
     Raises InputError as `evaluate_run`, `read_ply` and `load_dataset`, if a model comes without a
-    dataset, and if dataset or trained are given for a run.
+    dataset, if trained names no frame of it, and if dataset or trained are given for a run.
     """
     if isinstance(subject, Run) or (not isinstance(subject, Gaussians) and Path(subject).is_dir()):
         if dataset is not None or trained:
@@ -367,13 +367,19 @@ def evaluate(
         if not path.exists():
             raise InputError(f"{path}: no such run folder or PLY file")
         subject = read_ply(path)
-        if dataset is None and holds_run(path.parent):
-            run = open_run(path.parent)
-            dataset, trained = run.dataset, [frame.name for frame in run.taken]
+        if holds_run(path.parent):
+            given = dataset.root if isinstance(dataset, Dataset) else dataset
+            its = read_config(path.parent)["settings"]["dataset"]
+            if given is None or Path(given).resolve() == Path(its):
+                run = open_run(path.parent)
+                dataset = run.dataset
+                trained = list(trained) or [frame.name for frame in run.taken]
     if dataset is None:
         raise InputError(f"{path or 'the model'}: is in no run folder; give its --dataset")
     views = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     names, tests = list(trained), views.test_views()
+    if unknown := sorted(set(names) - {frame.name for frame in views.frames}):
+        raise InputError(f"{views.root}: has no frame {unknown[0]}, which `trained` names")
     metrics = evaluate_model(
         subject,
         views.with_images(names),

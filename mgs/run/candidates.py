@@ -81,7 +81,7 @@ def read_poses(path: str | Path, site: Site) -> list[Named]:
 
 
 def _read_csv(path: Path, site: Site) -> list[Named]:
-    with reading(path), open(path, newline="", encoding="utf-8", errors="replace") as file:
+    with reading(path), open(path, newline="", encoding="utf-8-sig", errors="replace") as file:
         table = csv.reader(file)
         columns = [name.strip().lower() for name in next(table, [])]
         lines = [(table.line_num, row) for row in table if any(cell.strip() for cell in row)]

@@ -41,9 +41,13 @@ def rated(
 ) -> list[tuple[int, float]]:
     """(frame, score) of the candidates by falling score / cost [C]; of equals, the farthest from
     the views taken comes first. Raises InputError as `choose`."""
-    scores = np.asarray(problem.policy(context), np.float64)
-    farthest = poses.farthest_pose(context.candidates, context.taken, context.centre, context.rng)
     where = f"policy {problem.settings.policy}: returned"
+    returned = problem.policy(context)
+    try:
+        scores = np.asarray(returned, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{where} no numbers ({error}); return one for each candidate") from None
+    farthest = poses.farthest_pose(context.candidates, context.taken, context.centre, context.rng)
     if scores.shape != (len(context.candidate_frames),):
         raise InputError(
             f"{where} scores of shape {scores.shape} for {len(context.candidate_frames)} "

@@ -24,7 +24,7 @@ from mgs.images import read_rgba
 
 Transport = Callable[[Path, Path], None]
 
-PICTURES = (".png", ".jpg", ".jpeg")
+PICTURES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 COMPANIONS = (".flown.json", ".depth.exr", ".depth.png", ".mask.png")
 """Ends of the names of a picture, and of what may come with it."""
 
