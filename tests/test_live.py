@@ -23,6 +23,7 @@ from mgs.errors import InputError, Notice
 from mgs.images import read_exr, read_rgba, write_png
 from mgs.prior.build import load_prior
 from mgs.run import live, transports
+from mgs.run.ending import why_ended
 from mgs.run.live import check_photograph
 
 SCRIPT = """
@@ -180,6 +181,34 @@ def test_a_run_ends_when_no_candidate_is_left(flight, pristine):
     assert len(flight.fly(copying(pristine, lose), tries=1)) == 8
     assert steps(flight.out)[-1]["ended"]["reason"] == "flight"
     assert flight.fly(copying(pristine, lose)) == []
+
+
+@pytest.mark.parametrize("pictures", [1, 4])
+def test_poses_given_up_in_an_outage_are_asked_for_again(
+    poses, prior, pristine, tmp_path, pictures
+):
+    """The outage comes before the seeds are complete, or after them."""
+    out, calls, working = tmp_path / "run", [], copying(pristine)
+    settings = {"prior": prior, "seeds": 3, "budget": 3, "train": {"passes": 1}}
+
+    def failing(pose, picture):
+        calls.append(picture.stem)
+        if len(calls) > pictures:
+            raise InputError("no link")
+        working(pose, picture)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Notice)
+        if pictures < 3:
+            with pytest.raises(InputError, match="10 were given up without a picture; mend"):
+                mgs.run_nbv(poses, out, live=live.Live(failing, tries=1), **settings)
+        else:
+            run = mgs.run_nbv(poses, out, live=live.Live(failing, tries=1), **settings)
+            assert "8 poses were given up" in why_ended(run.state.steps[-1]["ended"])
+            assert mgs.resume_nbv(out).state.taken == run.state.taken
+        run = mgs.resume_nbv(out, live=working)
+    assert run.state.steps[-1]["ended"]["reason"] == "budget"
+    assert len(run.state.taken) == 6
 
 
 def aside(pose: Path, out: Path) -> None:

@@ -66,12 +66,14 @@ def run_end(
     refused: Mapping[str, Any] | None,
     metres: float | None = None,
     predicted: float | None = None,
+    given_up: int = 0,
 ) -> dict[str, Any] | None:
     """`ended` of steps.jsonl where the run ends here: the `reason` and its numbers; else None.
 
     views: chosen so far. uncertainty: mean variance that is left, over that of the prior.
     refused: `name` and `information_gain` of the next view, where it is known. metres: length of
     the flight, where no pose is left in its reach. predicted: `mgs.run.checks.predicted_psnr`, dB.
+    given_up: number of poses of which no picture could be taken.
     """
     if views >= settings.budget:
         return {"reason": str(RunEnd.BUDGET), "views": views}
@@ -82,7 +84,8 @@ def run_end(
     if limit is not None and predicted is not None and predicted >= limit:
         return {"reason": str(RunEnd.PSNR), "views": views, "psnr": predicted, "limit": limit}
     if metres is not None:
-        return {"reason": str(RunEnd.FLIGHT), "views": views, "metres": metres}
+        lost = {"given_up": given_up} if given_up else {}
+        return {"reason": str(RunEnd.FLIGHT), "views": views, "metres": metres, **lost}
     gain = refused.get("information_gain", math.inf) if refused else math.inf
     if refused and settings.stop_gain is not None and gain < settings.stop_gain:
         view = {"name": refused["name"], "information_gain": gain}
@@ -102,6 +105,12 @@ def why_ended(ended: Mapping[str, Any]) -> str:
         return (
             f"the masked PSNR of the views not taken is predicted to be {ended['psnr']:.1f} dB "
             f"after {views}, no less than --stop-psnr {ended['limit']:g}"
+        )
+    if ended["reason"] == RunEnd.FLIGHT and (count := ended.get("given_up")):
+        lost = "1 pose was" if count == 1 else f"{count} poses were"
+        return (
+            f"no pose is left, {views}; {lost} given up without a picture: to ask for them again, "
+            "mend the capture and continue with --resume"
         )
     if ended["reason"] == RunEnd.FLIGHT:
         return (

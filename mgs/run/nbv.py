@@ -23,8 +23,18 @@ from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.photographs import source_of as source_of_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run import recording
-from mgs.run.folder import DATASET, FILES, POLICY_SOURCE, Run, holds_run, open_run, start
-from mgs.run.live import Live, begin
+from mgs.run.ending import RunEnd
+from mgs.run.folder import (
+    DATASET,
+    FILES,
+    POLICY_SOURCE,
+    Run,
+    holds_run,
+    open_run,
+    read_checkpoint,
+    start,
+)
+from mgs.run.live import Live, ask_again, begin
 from mgs.run.operations import operations_of
 from mgs.run.problem import Problem, Progress, no_progress
 from mgs.run.settings import (
@@ -288,7 +298,8 @@ def resume_nbv(
     - progress: called as progress(stage, done, total) during a step.
     - policy: FILE.py:FUNCTION, or the Python function, if the policy is your own. Code is never
       taken from the folder. A Run that was started in this process knows its policy.
-    - live: as in `start_run`; give it again if pictures are still to be captured.
+    - live: as in `start_run`; give it again if pictures are still to be captured. If no pose was
+      left, those that were given up are asked for again.
 
     A finished run is returned as it is. Raises InputError if the folder holds no run, its inputs
     are missing or changed, another process works on it, a fit diverged, or `policy` is not the
@@ -298,13 +309,22 @@ def resume_nbv(
     policy = policy or run.policy
     check_named(run, policy)
     live = live if live is None or isinstance(live, Live) else Live(live)
-    operations = operations_of(run.dataset, run.prior, run.settings, live)
+    dataset = run.dataset
+    if live is not None and _is_stuck(run):
+        dataset = ask_again(dataset)
+    operations = operations_of(dataset, run.prior, run.settings, live)
     scores = None if policy is None else policy_of(policy)
     state = recording.run(
-        run.folder, run.settings, run.dataset, operations, progress, on_step, policy=scores
+        run.folder, run.settings, dataset, operations, progress, on_step, policy=scores
     )
-    dataset = None if run.dataset.on_demand else run.dataset  # captured poses are in its files
-    return Run(run.folder, run.settings, dataset, run.prior, policy, state)
+    loaded = None if dataset.on_demand else dataset  # captured poses are in its files
+    return Run(run.folder, run.settings, loaded, run.prior, policy, state)
+
+
+def _is_stuck(run: Run) -> bool:
+    """Whether a run has no model yet, or ended because no pose was left."""
+    state = read_checkpoint(run.folder)
+    return state is None or state.steps[-1].get("ended", {}).get("reason") == RunEnd.FLIGHT
 
 
 def check_named(run: Run, policy: str | Callable[..., Any] | None) -> None:

@@ -289,9 +289,11 @@ class Problem:
             failed = next(i for i in self.seeds if self.frames[i].given_up)
             others = self.reachable(self.seeds)
             if not others:
+                count = sum(frame.given_up for frame in self.frames)
                 raise InputError(
-                    f"{self.dataset.root}: too few poses are left for the seeds; "
-                    "lower --seed-views, or give more poses"
+                    f"{self.dataset.root}: too few poses are left for the seeds, {count} were "
+                    "given up without a picture; mend the capture and continue with --resume, or "
+                    "start anew with a lower --seed-views or more poses"
                 )
             nearest = poses.nearest_poses(self.positions[others], self.positions[failed], 1)[0]
             self.seeds = [others[nearest] if i == failed else i for i in self.seeds]

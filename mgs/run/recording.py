@@ -138,7 +138,8 @@ def mark_end(problem: Problem, state: State, refused: Choice | None = None) -> S
     metres = problem.flight.metres(state.taken) if stuck else None
     predicted = last.get("prediction", {}).get("psnr")
     left = uncertainty(problem, state)
-    ended = run_end(problem.settings, views, left, next_view, metres, predicted)
+    given_up = sum(frame.given_up for frame in problem.frames)
+    ended = run_end(problem.settings, views, left, next_view, metres, predicted, given_up)
     return replace(state, steps=[*state.steps[:-1], last | ({"ended": ended} if ended else {})])
 
 
