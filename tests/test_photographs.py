@@ -28,7 +28,7 @@ from mgs.data.importers import import_source
 from mgs.data.masks import make_masks
 from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.sources import read_source
-from mgs.data.up import degrees_between, unit_up, up_of_cameras, upright
+from mgs.data.up import degrees_between, levelled, unit_up, up_of_cameras, upright
 from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.fit import density
@@ -300,6 +300,13 @@ def test_upright_is_the_rotation_that_turns_up_to_z(vector):
     assert np.linalg.det(turn) == pytest.approx(1)
     assert np.allclose(turn @ up, [0, 0, 1], atol=1e-9)
     assert np.array_equal(upright((0.0, 0.0, 1.0)), np.eye(3))
+    ahead = [0, 0, 1] if abs(up[1]) > np.sqrt(0.5) else [0, 1, 0]  # the bearing of a flight plan
+    turn = levelled(up)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(turn @ up, [0, 0, 1], atol=1e-9)
+    along = turn @ ahead
+    assert abs(along[0]) < 1e-9 < along[1]
+    assert np.array_equal(levelled((0.0, 0.0, 1.0)), np.eye(3))
 
 
 @settings(max_examples=25, deadline=None)

@@ -250,11 +250,11 @@ def _write_plan(path: Path, run: Run, found: Suggestion, place: Any, settings: A
     import numpy as np
 
     from mgs.data.flight_plan import Stop, write_flight_plan
-    from mgs.data.up import upright
+    from mgs.data.up import levelled
     from mgs.run.settings import NbvSettings
     from mgs.run.suggest import taken_in_order
 
-    turn = upright(run.prior.up)
+    turn = levelled(run.prior.up)
     pose = np.eye(4)
     pose[:3, :3] = turn.T
     home = turn @ taken_in_order(run)[0].camera.position

@@ -37,7 +37,8 @@ KML = "http://www.opengis.net/kml/2.2"
 
 @dataclass(frozen=True)
 class Origin:
-    """Place of the world's origin, degrees and metres; bearing of +Y, clockwise from north."""
+    """Place of the world's origin, degrees and metres; bearing of +Y, clockwise from north,
+    after `mgs.data.up.levelled`."""
 
     latitude: float
     longitude: float

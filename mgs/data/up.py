@@ -66,6 +66,15 @@ def upright(up: Up) -> np.ndarray:
     return np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [x, y, z]]) - across
 
 
+def levelled(up: Up) -> np.ndarray:
+    """Rotation [3,3] that turns `up` to +Z, and then the world's +Y, made level, to +Y: the world's
+    +Z in its place where +Y is nearer to the vertical than to the horizon."""
+    turn = upright(up)
+    ahead = turn[:, 2 if abs(up[1]) > np.sqrt(0.5) else 1]
+    x, y = ahead[:2] / np.hypot(*ahead[:2])
+    return np.array([[y, -x, 0.0], [x, y, 0.0], [0.0, 0.0, 1.0]]) @ turn
+
+
 def degrees_between(a: Up, b: Up) -> float:
     """Angle between two directions, degrees."""
     return float(np.degrees(np.arccos(np.clip(np.dot(a, b), -1, 1))))

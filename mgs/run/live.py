@@ -22,7 +22,7 @@ from mgs.data.dataset import FILES, Dataset, intrinsics, load_dataset, read_reco
 from mgs.data.frames import Frame, as_captured, capture_record
 from mgs.data.importers import import_shot, silhouette_of
 from mgs.data.sources import Shot, record_camera
-from mgs.data.up import upright
+from mgs.data.up import levelled
 from mgs.errors import InputError, Notice
 from mgs.files import read_json, write_json
 from mgs.prior.build import Prior
@@ -30,8 +30,8 @@ from mgs.run.transports import Transport, answers, picture
 
 CONVENTION = (
     "transform_matrix is camera-to-world, camera axes x right, y up, z backward (OpenGL, "
-    "nerfstudio); lengths in the unit; heading in degrees clockwise from +Y, pitch above the "
-    "horizon, seen with `up` upwards; pixels from the image's corner"
+    "nerfstudio); lengths in the unit; heading in degrees clockwise from +Y made level (+Z if +Y "
+    "is steep), pitch above the horizon, seen with `up` upwards; pixels from the image's corner"
 )
 
 SAME = 1e-9
@@ -143,7 +143,7 @@ def ask(folder: Path, frame: Frame, dataset: Dataset, attempt: int) -> tuple[Pat
 
     Raises InputError where an answer lies there already though this pose was never asked for.
     """
-    heading, pitch = heading_and_pitch(frame.camera, upright(dataset.up))
+    heading, pitch = heading_and_pitch(frame.camera, levelled(dataset.up))
     asked = {
         "name": frame.name,
         "convention": CONVENTION,
