@@ -165,9 +165,9 @@ def look_at(
 ) -> NDArray[np.float64]:
     """Return world_to_camera [4,4] of a camera at `eye` [3], metres, that looks at `target` [3].
 
-    up: direction [3] that points upwards in the image; +Y replaces it if the camera looks along it,
-    +Z if that is +Y.
-    Raises InputError if eye and target are the same point.
+    up: direction [3] that points upwards in the image. If the camera looks along it, +Y replaces
+    it, or +Z where the camera looks along +Y. Raises InputError if eye and target are the same
+    point.
     """
     eye = np.asarray(eye, np.float64)
     forward: NDArray[np.float64] = np.asarray(target, np.float64) - eye

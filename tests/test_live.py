@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import shutil
 import sys
 import threading
@@ -19,6 +20,7 @@ from scipy.ndimage import gaussian_filter
 import mgs
 from mgs.camera import look_at, opengl_from_opencv
 from mgs.data.dataset import load_dataset
+from mgs.data.up import unit_up
 from mgs.errors import InputError, Notice
 from mgs.images import read_exr, read_rgba, write_png
 from mgs.prior.build import load_prior
@@ -116,6 +118,15 @@ def test_the_run_of_a_command_is_that_on_the_complete_dataset(flight, pristine, 
     assert (asked["w"], asked["h"], asked["fl_x"]) == (16, 12, 16.0)
 
 
+def test_headings_are_clockwise_from_the_worlds_own_y(poses, tmp_path):
+    dataset = replace(load_dataset(poses, to_capture=True), up=unit_up((-0.6, 0.5, -0.4)))
+    up, frame = np.array(dataset.up), dataset.frames[4]
+    pose, _ = live.ask(tmp_path, frame, dataset, 1)
+    y, ahead = (v - (v @ up) * up for v in (np.eye(3)[1], frame.camera.world_to_camera[2, :3]))
+    heading = math.degrees(math.atan2(-np.cross(y, ahead) @ up, y @ ahead)) % 360
+    assert json.loads(pose.read_text())["heading"] == pytest.approx(heading)
+
+
 def far_away(out: Path) -> None:
     matrix = opengl_from_opencv(look_at((9, 9, 9), (0, 0, 0))).tolist()
     out.with_suffix(".flown.json").write_text(json.dumps({"transform_matrix": matrix}))
@@ -200,11 +211,13 @@ def test_poses_given_up_in_an_outage_are_asked_for_again(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Notice)
         if pictures < 3:
-            with pytest.raises(InputError, match="10 were given up without a picture; mend"):
+            with pytest.raises(InputError, match="10 gave no picture; mend"):
                 mgs.run_nbv(poses, out, live=live.Live(failing, tries=1), **settings)
         else:
             run = mgs.run_nbv(poses, out, live=live.Live(failing, tries=1), **settings)
-            assert "8 poses were given up" in why_ended(run.state.steps[-1]["ended"])
+            assert "8 poses gave no picture, --resume asks" in why_ended(
+                run.state.steps[-1]["ended"]
+            )
             assert mgs.resume_nbv(out).state.taken == run.state.taken
         run = mgs.resume_nbv(out, live=working)
     assert run.state.steps[-1]["ended"]["reason"] == "budget"

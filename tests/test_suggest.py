@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from xml.etree import ElementTree
 
 import numpy as np
@@ -120,6 +121,26 @@ def test_a_dataset_is_one_command_and_its_flight_plan_is_read_by_pymavlink(run, 
         [items[k - 1].param4 for k in stops], abs=1e-6
     )
     assert len(root.find(".//{*}LineString/{*}coordinates").text.split()) >= 5
+
+
+def test_a_plan_in_a_world_that_is_not_upright(run, tmp_path):
+    """+Y of the world, made level, is north."""
+    data, up = tmp_path / "data", np.array([-0.48, 0.6, 0.64])
+    shutil.copytree(open_run(run).dataset.root, data)
+    shutil.rmtree(data / "prior")
+    synthetic.edit(data, lambda content: content.update(up=up.tolist()))
+    command("prior", data, "--gaussians", 300)
+    path, plan = tmp_path / "poses.csv", tmp_path / "a.kml"
+    path.write_text("name,x,y,z\na,-1.5,-2,1\n")
+    command("suggest", data, "--poses", path, "--plan", plan, "--origin", "0,0,0")
+    place = ElementTree.parse(plan).getroot().find(".//{*}Camera")
+    longitude, latitude = (float(place.find(f"{{*}}{k}").text) for k in ("longitude", "latitude"))
+    found = np.radians([longitude * 6.378e6, latitude * 6.335e6])
+    north = np.array([0, 1, 0]) - up[1] * up
+    north /= np.linalg.norm(north)
+    position = np.array([-1.5, -2, 1])
+    expected = [position @ np.cross(north, up), position @ north]
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
 
 
 def test_a_plan_around_a_cylinder_does_not_cross_the_object(run, tmp_path, capsys):

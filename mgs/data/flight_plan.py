@@ -37,8 +37,10 @@ KML = "http://www.opengis.net/kml/2.2"
 
 @dataclass(frozen=True)
 class Origin:
-    """Place of the world's origin, degrees and metres; bearing of +Y, clockwise from north,
-    after `mgs.data.up.levelled`."""
+    """Place of the world's origin, degrees and metres.
+
+    bearing: of +Y, degrees clockwise from north. Positions are `mgs.data.up.levelled`.
+    """
 
     latitude: float
     longitude: float

@@ -67,8 +67,10 @@ def upright(up: Up) -> np.ndarray:
 
 
 def levelled(up: Up) -> np.ndarray:
-    """Rotation [3,3] that turns `up` to +Z, and then the world's +Y, made level, to +Y: the world's
-    +Z in its place where +Y is nearer to the vertical than to the horizon."""
+    """Rotation [3,3] that turns `up` to +Z, and the level part of the world's +Y to +Y.
+
+    The world's +Z takes the place of its +Y if that is less than 45 degrees from the vertical.
+    """
     turn = upright(up)
     ahead = turn[:, 2 if abs(up[1]) > np.sqrt(0.5) else 1]
     x, y = ahead[:2] / np.hypot(*ahead[:2])

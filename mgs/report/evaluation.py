@@ -350,7 +350,8 @@ def evaluate(
     - subject: a run or its folder, measured by `evaluate_run` with its options; or Gaussians, or a
       PLY file, whose metrics are written beside it as NAME.metrics.json.
     - dataset: of Gaussians or a PLY. Default for a PLY in a run folder: the run's.
-    - trained: names of the frames that the model was trained on; in a run folder, the run's.
+    - trained: names of the frames that the model was trained on. Default for a PLY in a run folder,
+      on the run's dataset: the views taken.
 
     Raises InputError as `evaluate_run`, `read_ply` and `load_dataset`, if a model comes without a
     dataset, if trained names no frame of it, and if dataset or trained are given for a run.
@@ -368,9 +369,9 @@ def evaluate(
             raise InputError(f"{path}: no such run folder or PLY file")
         subject = read_ply(path)
         if holds_run(path.parent):
-            given = dataset.root if isinstance(dataset, Dataset) else dataset
-            its = read_config(path.parent)["settings"]["dataset"]
-            if given is None or Path(given).resolve() == Path(its):
+            root = dataset.root if isinstance(dataset, Dataset) else dataset
+            of_run = Path(read_config(path.parent)["settings"]["dataset"])
+            if root is None or Path(root).resolve() == of_run:
                 run = open_run(path.parent)
                 dataset = run.dataset
                 trained = list(trained) or [frame.name for frame in run.taken]

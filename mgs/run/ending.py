@@ -106,17 +106,12 @@ def why_ended(ended: Mapping[str, Any]) -> str:
             f"the masked PSNR of the views not taken is predicted to be {ended['psnr']:.1f} dB "
             f"after {views}, no less than --stop-psnr {ended['limit']:g}"
         )
-    if ended["reason"] == RunEnd.FLIGHT and (count := ended.get("given_up")):
-        lost = "1 pose was" if count == 1 else f"{count} poses were"
-        return (
-            f"no pose is left, {views}; {lost} given up without a picture: to ask for them again, "
-            "mend the capture and continue with --resume"
-        )
     if ended["reason"] == RunEnd.FLIGHT:
-        return (
-            f"no pose is left that the flight's limits allow, {views}; "
-            f"the flight is {ended['metres']:.1f} m long with the way home"
-        )
+        way = f"the flight is {ended['metres']:.1f} m long with the way home"
+        if count := ended.get("given_up"):
+            lost = f"{count} pose{'' if count == 1 else 's'} gave no picture"
+            return f"no pose is left in reach, {views}; {lost}, --resume asks for them again; {way}"
+        return f"no pose is left that the flight's limits allow, {views}; {way}"
     gain, limit = (
         f"{ended['information_gain']:.4g} {GAIN_UNIT}",
         f"less than --stop-gain {ended['limit']:g}",

@@ -130,14 +130,6 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
     return capture
 
 
-def ask_again(dataset: Dataset) -> Dataset:
-    """The dataset with the poses that were given up as if they had never been asked for."""
-    lost = [frame for frame in dataset.frames if frame.given_up]
-    for frame in lost:
-        capture_record(frame).unlink(missing_ok=True)
-    return load_dataset(dataset.root) if lost else dataset
-
-
 def ask(folder: Path, frame: Frame, dataset: Dataset, attempt: int) -> tuple[Path, Path]:
     """Write the pose file of a frame; return its path, and that of the picture to come.
 

@@ -23,18 +23,8 @@ from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.photographs import source_of as source_of_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run import recording
-from mgs.run.ending import RunEnd
-from mgs.run.folder import (
-    DATASET,
-    FILES,
-    POLICY_SOURCE,
-    Run,
-    holds_run,
-    open_run,
-    read_checkpoint,
-    start,
-)
-from mgs.run.live import Live, ask_again, begin
+from mgs.run.folder import DATASET, FILES, POLICY_SOURCE, Run, holds_run, open_run, start
+from mgs.run.live import Live, begin
 from mgs.run.operations import operations_of
 from mgs.run.problem import Problem, Progress, no_progress
 from mgs.run.settings import (
@@ -309,22 +299,13 @@ def resume_nbv(
     policy = policy or run.policy
     check_named(run, policy)
     live = live if live is None or isinstance(live, Live) else Live(live)
-    dataset = run.dataset
-    if live is not None and _is_stuck(run):
-        dataset = ask_again(dataset)
-    operations = operations_of(dataset, run.prior, run.settings, live)
+    operations = operations_of(run.dataset, run.prior, run.settings, live)
     scores = None if policy is None else policy_of(policy)
     state = recording.run(
-        run.folder, run.settings, dataset, operations, progress, on_step, policy=scores
+        run.folder, run.settings, run.dataset, operations, progress, on_step, scores, bool(live)
     )
-    loaded = None if dataset.on_demand else dataset  # captured poses are in its files
-    return Run(run.folder, run.settings, loaded, run.prior, policy, state)
-
-
-def _is_stuck(run: Run) -> bool:
-    """Whether a run has no model yet, or ended because no pose was left."""
-    state = read_checkpoint(run.folder)
-    return state is None or state.steps[-1].get("ended", {}).get("reason") == RunEnd.FLIGHT
+    dataset = None if run.dataset.on_demand else run.dataset  # captured poses are in its files
+    return Run(run.folder, run.settings, dataset, run.prior, policy, state)
 
 
 def check_named(run: Run, policy: str | Callable[..., Any] | None) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, target_of
-from mgs.data.frames import Frame, as_asked
+from mgs.data.frames import Frame, as_asked, capture_record
 from mgs.data.up import PLUS_Z, Up, upright
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
@@ -280,6 +280,13 @@ class Problem:
                 return False
         return True
 
+    def retry(self) -> None:
+        """Make candidates again of the frames that were given up."""
+        for i, frame in enumerate(self.frames):
+            if frame.given_up:
+                capture_record(frame).unlink()
+                self.frames[i] = replace(frame, given_up=False)
+
     def make_seeds(self) -> None:
         """Make the images of the seeds; the nearest other pose replaces one that was given up.
 
@@ -291,9 +298,9 @@ class Problem:
             if not others:
                 count = sum(frame.given_up for frame in self.frames)
                 raise InputError(
-                    f"{self.dataset.root}: too few poses are left for the seeds, {count} were "
-                    "given up without a picture; mend the capture and continue with --resume, or "
-                    "start anew with a lower --seed-views or more poses"
+                    f"{self.dataset.root}: too few poses are left for the seeds, {count} gave no "
+                    "picture; mend the capture and continue with --resume, or start again with "
+                    "fewer --seed-views"
                 )
             nearest = poses.nearest_poses(self.positions[others], self.positions[failed], 1)[0]
             self.seeds = [others[nearest] if i == failed else i for i in self.seeds]

@@ -17,7 +17,7 @@ from mgs.policy import criteria
 from mgs.policy.context import Policy
 from mgs.run import inputs
 from mgs.run.checks import Checks
-from mgs.run.ending import FitDivergedError, diverged, run_end
+from mgs.run.ending import FitDivergedError, RunEnd, diverged, run_end
 from mgs.run.folder import check_settings, read_checkpoint, write_checkpoint, write_steps
 from mgs.run.loop import select_views, uncertainty
 from mgs.run.problem import Operations, Problem, Progress
@@ -44,12 +44,14 @@ def run(
     progress: Progress,
     on_step: Callable[[State], None] = lambda state: None,
     policy: Policy | None = None,
+    retry: bool = False,
 ) -> State:
     """Run or resume the loop in `out`, which has its config.json, to its end; give the last state.
 
     on_step(state): called after every step, or batch of steps, that is on disk. policy: in
-    place of that of the settings. Killed at any moment and called again, it takes the same views as
-    an uninterrupted run.
+    place of that of the settings. retry: ask again for poses that were given up, if the run has no
+    model yet or no pose left. Killed at any moment and called again, it takes the same views as an
+    uninterrupted run.
 
     Raises InputError as `check_settings`; where another process works on the folder; where the
     prior, a pose or a file of a frame taken has changed; where a frame it takes cannot be read or
@@ -63,6 +65,9 @@ def run(
         stopwatch = Stopwatch(progress)
         problem = Problem(dataset, settings, operations, stopwatch, policy)
         recorder = Recorder(problem, stopwatch)
+        ended = state.steps[-1].get("ended", {}) if state else {}
+        if retry and (state is None or ended.get("reason") == RunEnd.FLIGHT):
+            problem.retry()
         if state is not None:
             problem.resume(state.taken)
             check_model(out, problem, state)

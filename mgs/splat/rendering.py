@@ -264,7 +264,8 @@ def render(
     - background: linear RGB, one number or three, or a Dr.Jit colour, with or without gradient.
     - cache: pass the same one to all calls, to reuse the block lists of cameras.
 
-    Returns rgb [H,W,3] (linear), alpha [H,W] and depth [H,W] (expected z-depth, metres), TensorXf.
+    Returns rgb [H,W,3] (linear; sRGB if `gaussians.linear` is false), alpha [H,W] and depth [H,W]
+    (expected z-depth, metres), TensorXf.
 
     Differentiable by Dr.Jit in reverse mode (`dr.backward`) and forward mode (`dr.forward`, `jvp`).
     Not differentiated: the camera, the thresholds (ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN) and the
