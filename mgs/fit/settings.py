@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from mgs.errors import InputError
+from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD, regularisation
 
 RATES = {"colour": 0.02, "scale": 0.04, "rotation": 0.02, "opacity": 0.1}
 """Learning rates of the optimiser, about the longest step, in the unit of each kind of parameter:
@@ -86,6 +91,55 @@ class TrainSettings(BaseModel):
     """Seed of the order of images in each pass."""
 
     _every_kind = field_validator("rates", mode="before")(lambda given: complete(given, RATES))
+
+
+class ModelSettings(BaseModel):
+    """How a model is fitted to the views taken, and how its information is measured."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Seed of all random draws."""
+    estimator: str = "exact"
+    """Estimator of the Fisher information: exact, hutchinson, or loss-gradient (the paper's)."""
+    lam: Annotated[float, Field(ge=1e-30, le=1e30, allow_inf_nan=False)] | None = None
+    """One lambda for all parameters, as in the paper. Default: (pixel noise / prior std)^2."""
+    pixel_noise: Scale = PIXEL_NOISE
+    """Standard deviation of a pixel's residual, linear RGB; sets lambda, the regularisation."""
+    prior_std: dict[str, Scale] = PRIOR_STD
+    """Prior standard deviation by kind of parameter; `mean`, in metres, only if means move."""
+    warm_passes: Annotated[int, Field(ge=1)] = WARM_PASSES
+    """Most passes of each fit after the first; never more than `passes`."""
+    warm_rate: Positive = 1.0
+    """Factor on the learning rates of the fits after the first."""
+    exposure: bool = False
+    """Estimate a gain per image and channel, for images of unequal exposure or white balance."""
+    sh: Annotated[int, Field(ge=0, le=3)] = 0
+    """Degree of the spherical harmonics of colour: 0 (the same from all directions) to 3."""
+    train: TrainSettings = TrainSettings()
+    """Settings of each fit."""
+
+    _every_kind = field_validator("prior_std", mode="before")(
+        lambda given: complete(given, PRIOR_STD)
+    )
+
+    def train_at(self, step: int) -> TrainSettings:
+        """Settings of the fit of a step: `train` for step 0, with the warm values afterwards."""
+        if step == 0:
+            return self.train
+        rates = {kind: self.warm_rate * rate for kind, rate in self.train.rates.items()}
+        passes = min(self.warm_passes, self.train.passes)
+        return self.train.model_copy(update={"rates": rates, "passes": passes})
+
+    def regularisation(self, groups: dict[str, slice]) -> NDArray[np.float64]:
+        """lambda [P] of the columns of the Fisher information; groups: columns by kind.
+
+        Raises InputError where `prior_std` lacks one of these kinds.
+        """
+        if missing := [kind for kind in groups if kind not in self.prior_std]:
+            raise InputError(f"prior_std: has no number for {missing[0]}; give one, metres")
+        by_kind = regularisation(groups, self.pixel_noise, self.prior_std)
+        return by_kind if self.lam is None else np.full_like(by_kind, self.lam)
 
 
 def as_3dgs(extent: float) -> dict[str, Any]:

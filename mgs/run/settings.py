@@ -11,9 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mgs.errors import InputError, flag, row_named
 from mgs.files import read_json, reading
@@ -22,12 +20,12 @@ from mgs.fit.settings import (
     MEAN_RATE,
     PASSES,
     WARM_PASSES,
+    ModelSettings,
     Positive,
     Scale,
     TrainSettings,
-    complete,
 )
-from mgs.policy.criteria import MEAN_STD, PIXEL_NOISE, PRIOR_STD, regularisation
+from mgs.policy.criteria import MEAN_STD, PRIOR_STD
 from mgs.policy.registry import check_policy
 
 
@@ -51,17 +49,17 @@ PRESETS = {
 }
 
 
-class NbvSettings(BaseModel):
-    """Everything that decides what `mgs nbv` does: equal settings choose equal views."""
+class Mission(BaseModel):
+    """Limits of a run: how many views it takes, where the camera may go, and when it ends."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
-    dataset: Path
-    """Folder of the dataset."""
-    prior: Path
-    """Folder of the prior."""
-    policy: str = "directional-i"
-    """Policy that scores candidate views: a name, or FILE.py:FUNCTION of your own."""
+    seeds: Annotated[int, Field(ge=1)] = 4
+    """Number of seed views for the first fit, spread evenly over the directions of the poses."""
+    budget: Annotated[int, Field(ge=0)] = 50
+    """Most views to choose beyond the seed views. Default: 50, or all candidates if fewer."""
+    batch: Annotated[int, Field(ge=1)] = 1
+    """Views to choose before the next fit; the last batch may be smaller."""
     nearest: Annotated[int, Field(ge=1)] | None = None
     """Choose among this many candidates, the nearest to the last view. Default: all."""
     travel: Scale | None = None
@@ -78,67 +76,30 @@ class NbvSettings(BaseModel):
     """Radius in metres of an upright cylinder around the object that the flight must not enter."""
     clearance: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     """Lowest height of a pose above the object's lowest point, metres."""
-    estimator: str = "exact"
-    """Estimator of the Fisher information: exact, hutchinson, or loss-gradient (the paper's)."""
-    budget: Annotated[int, Field(ge=0)] = 50
-    """Most views to choose beyond the seed views. Default: 50, or all candidates if fewer."""
-    batch: Annotated[int, Field(ge=1)] = 1
-    """Views to choose before the next fit; the last batch may be smaller."""
     stop_gain: Positive | None = None
     """End the run if the chosen view's information gain (Eq. 7, ½ nat per parameter) is lower."""
     stop_uncertainty: Annotated[float, Field(gt=0, lt=1)] | None = None
     """End the run when at most this share (0 to 1) of the prior's variance is left."""
     stop_psnr: Annotated[float, Field(gt=0, le=80, allow_inf_nan=False)] | None = None
     """End the run when the masked PSNR of the views not taken is predicted to be this high, dB."""
-    seeds: Annotated[int, Field(ge=1)] = 4
-    """Number of seed views for the first fit, spread evenly over the directions of the poses."""
-    seed: Annotated[int, Field(ge=0)] = 0
-    """Seed of all random draws."""
-    lam: Annotated[float, Field(ge=1e-30, le=1e30, allow_inf_nan=False)] | None = None
-    """One lambda for all parameters, as in the paper. Default: (pixel noise / prior std)^2."""
-    pixel_noise: Scale = PIXEL_NOISE
-    """Standard deviation of a pixel's residual, linear RGB; sets lambda, the regularisation."""
-    prior_std: dict[str, Scale] = PRIOR_STD
-    """Prior standard deviation by kind of parameter; `mean`, in metres, only if means move."""
-    evaluate_every: Annotated[int, Field(ge=0)] = 0
-    """Measure PSNR each time after this many views; 0: only at the end. Does not affect choices."""
-    warm_passes: Annotated[int, Field(ge=1)] = WARM_PASSES
-    """Most passes of each fit after the first; never more than `passes`."""
-    warm_rate: Positive = 1.0
-    """Factor on the learning rates of the fits after the first."""
-    exposure: bool = False
-    """Estimate a gain per image and channel, for images of unequal exposure or white balance."""
-    sh: Annotated[int, Field(ge=0, le=3)] = 0
-    """Degree of the spherical harmonics of colour: 0 (the same from all directions) to 3."""
-    train: TrainSettings = TrainSettings()
-    """Settings of each fit."""
-
-    _every_kind = field_validator("prior_std", mode="before")(
-        lambda given: complete(given, PRIOR_STD)
-    )
 
     @property
     def flies(self) -> bool:
         """Whether the flight has a limit, so that views are planned as a tour."""
         return self.flight_length is not None or self.flight_time is not None
 
-    def train_at(self, step: int) -> TrainSettings:
-        """Settings of the fit of a step: `train` for step 0, with the warm values afterwards."""
-        if step == 0:
-            return self.train
-        rates = {kind: self.warm_rate * rate for kind, rate in self.train.rates.items()}
-        passes = min(self.warm_passes, self.train.passes)
-        return self.train.model_copy(update={"rates": rates, "passes": passes})
 
-    def regularisation(self, groups: dict[str, slice]) -> NDArray[np.float64]:
-        """lambda [P] of the columns of the Fisher information; groups: columns by kind.
+class NbvSettings(ModelSettings, Mission):
+    """Everything that decides what `mgs nbv` does: equal settings choose equal views."""
 
-        Raises InputError where `prior_std` lacks one of these kinds.
-        """
-        if missing := [kind for kind in groups if kind not in self.prior_std]:
-            raise InputError(f"prior_std: has no number for {missing[0]}; give one, metres")
-        by_kind = regularisation(groups, self.pixel_noise, self.prior_std)
-        return by_kind if self.lam is None else np.full_like(by_kind, self.lam)
+    dataset: Path
+    """Folder of the dataset."""
+    prior: Path
+    """Folder of the prior."""
+    policy: str = "directional-i"
+    """Policy that scores candidate views: a name, or FILE.py:FUNCTION of your own."""
+    evaluate_every: Annotated[int, Field(ge=0)] = 0
+    """Measure PSNR each time after this many views; 0: only at the end. Does not affect choices."""
 
     def with_spacing(self, spacing: float, loose: float = 1.0) -> NbvSettings:
         """The settings with a rate and a prior std of learned means, from the samples' spacing, m.
