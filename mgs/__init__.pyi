@@ -8,6 +8,7 @@ from .data.dataset import load_cameras as load_cameras
 from .data.dataset import load_dataset as load_dataset
 from .data.frames import Frame as Frame
 from .errors import InputError as InputError
+from .evaluation import evaluate_model as evaluate_model
 from .gaussians import Gaussians as Gaussians
 from .prior.build import Prior as Prior
 from .prior.build import build_prior as build_prior
@@ -17,7 +18,6 @@ from .prior.build import save_prior as save_prior
 from .prior.initial import initial_gaussians as initial_gaussians
 from .prior.settings import PriorSettings as PriorSettings
 from .report.evaluation import evaluate as evaluate
-from .report.evaluation import evaluate_model as evaluate_model
 from .report.evaluation import evaluate_run as evaluate_run
 from .report.page import write_page as write_page
 from .report.writing import write_report as write_report

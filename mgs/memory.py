@@ -164,9 +164,10 @@ def kept_within(
         if key in kept:
             return kept[key]
         value = make(key)
-        if held + size(value) <= budget:
+        needed = size(value)
+        if held + needed <= budget:
             kept[key] = value
-            held += size(value)
+            held += needed
         return value
 
     return get

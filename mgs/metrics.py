@@ -120,6 +120,28 @@ def _check_same_shape(a: np.ndarray, b: np.ndarray) -> None:
         )
 
 
+def compare_psnr(
+    image: np.ndarray,
+    rendered: np.ndarray,
+    known: np.ndarray,
+    rock: np.ndarray,
+    linear: np.ndarray | None = None,
+) -> dict[str, float]:
+    """PSNR of one view, dB: `psnr` over the known pixels, `psnr_mask` over the rock's.
+
+    image: [H,W,3], the truth, sRGB. rendered: [H,W,3] linear RGB. known, rock: [H,W] bool. With
+    linear, the truth as linear RGB, also `..._corrected` (`colour_corrected`). Raises InputError as
+    `psnr`.
+    """
+    masks = {"psnr": None if known.all() else known, "psnr_mask": rock}
+    shown = srgb_from_linear(rendered)
+    values = {name: psnr(image, shown, mask) for name, mask in masks.items()}
+    if linear is not None:
+        shown = srgb_from_linear(colour_corrected(linear, rendered, rock))
+        values |= {f"{name}_corrected": psnr(image, shown, mask) for name, mask in masks.items()}
+    return values
+
+
 def compare(
     truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray, weight: np.ndarray
 ) -> dict[str, float]:
@@ -130,18 +152,13 @@ def compare(
     (`mgs.data.frames.Frame.target`). Raises InputError as `psnr` and `ssim`.
     """
     a, b, known = srgb_from_linear(truth[..., :3]), srgb_from_linear(rendered), weight > 0
-    whole = None if known.all() else known
-    corrected = srgb_from_linear(colour_corrected(truth[..., :3], rendered, mask & known))
     similarity = _similarity(a, b)
-    return {
-        "psnr": psnr(a, b, whole),
-        "ssim": _mean_ssim(*similarity, whole),
-        "psnr_mask": psnr(a, b, mask & known),
+    values = compare_psnr(a, rendered, known, mask & known, truth[..., :3]) | {
+        "ssim": _mean_ssim(*similarity, None if known.all() else known),
         "ssim_mask": _mean_ssim(*similarity, mask & known),
         "psnr_inside": psnr(a, b, (truth[..., 3] >= 1) & known),
-        "psnr_corrected": psnr(a, corrected, whole),
-        "psnr_mask_corrected": psnr(a, corrected, mask & known),
     }
+    return {name: values[name] for name in METRICS}
 
 
 def compare_surface(

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from mgs.cli.nbv import resume_and_print
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset, target_of, write_transforms
+from mgs.evaluation import evaluate_model
 from mgs.images import write_png
 from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.report.evaluation import evaluate_model
 from mgs.report.page_facts import measured, read_shown
 from mgs.report.runs import read_run
 from mgs.run import folder as run_folder

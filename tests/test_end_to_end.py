@@ -12,12 +12,12 @@ from program import command, steps, timeless
 from mgs.cli import app, demo
 from mgs.cli.app import COMMANDS, main
 from mgs.data.dataset import load_dataset
+from mgs.evaluation import psnr_measure
 from mgs.images import read_exr
 from mgs.policy.registry import policy_names
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.report import predicted_error
-from mgs.run.operations import psnr_measure
 from mgs.splat import ListCache
 from mgs.splat_ply import read_ply
 from mgs.synth.rendering import write_contact_sheet

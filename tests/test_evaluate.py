@@ -16,13 +16,15 @@ from PIL import Image
 from refusals import listing
 from synthetic import orbit_cameras, write_dataset
 
+from mgs import evaluation
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.errors import InputError
+from mgs.evaluation import evaluate_model, read_comparison, write_comparison
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr, write_png
 from mgs.metrics import METRICS, OPAQUE, PSNR_LIMIT, SURFACE_METRICS, compare_surface, psnr, ssim
-from mgs.report import evaluation
-from mgs.report.evaluation import evaluate_model, evaluate_run, read_comparison, write_comparison
+from mgs.report import evaluation as measuring
+from mgs.report.evaluation import evaluate_run
 from mgs.run.folder import read_checkpoint
 from mgs.splat_ply import write_ply
 
@@ -98,12 +100,12 @@ def test_views_are_measured_beside_each_other_but_large_ones_alone(
             weakref.finalize(part, lambda: freed.append(threading.current_thread()))
         return drawn
 
-    def measured(frame, rendered, folder):
-        active.append(frame)
+    def measured(view, *rendered):
+        active.append(view)
         seen.append(len(active))
         time.sleep(0.02)
         active.pop()
-        return {"psnr": float(frame.name[-1])}
+        return {"psnr": float(view[0].name[-1])}
 
     monkeypatch.setattr(evaluation, "_measured", measured)
     monkeypatch.setattr(evaluation, "PIXELS_AT_ONCE", pixels)
@@ -252,6 +254,7 @@ def work(monkeypatch):
             return function(*given)
 
         monkeypatch.setattr(evaluation, name, counted)
+        monkeypatch.setattr(measuring, name, counted, raising=False)
 
     def done():
         counts = calls.count("compare"), calls.count("write_comparison")
@@ -315,8 +318,8 @@ CHANGES = {
 def test_another_commit_keeps_the_metrics_and_another_version_does_not(
     dataset, prior, tmp_path, work, monkeypatch
 ):
-    run, versions = tiny.write_run(tmp_path / "run", dataset, prior), evaluation.versions()
-    monkeypatch.setattr(evaluation, "versions", lambda: versions)
+    run, versions = tiny.write_run(tmp_path / "run", dataset, prior), measuring.versions()
+    monkeypatch.setattr(measuring, "versions", lambda: versions)
     for name, measured in (("mgs", VIEWS), ("commit", 0), ("mitsuba", VIEWS)):
         versions[name] = "1234567"
         evaluate_run(run)
@@ -357,4 +360,4 @@ def test_srgb_models_are_measured_as_they_blend():
 def test_a_run_is_measured_on_its_own_dataset(dataset, prior, tmp_path):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     with pytest.raises(InputError, match="is a run, with its own dataset"):
-        evaluation.evaluate(run, dataset)
+        measuring.evaluate(run, dataset)

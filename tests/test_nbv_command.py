@@ -16,6 +16,7 @@ from mgs.cli import nbv as nbv_command
 from mgs.cli.printing import print_run, step_line
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
+from mgs.evaluation import psnr_measure
 from mgs.files import write_json
 from mgs.fit.settings import ALPHA_WEIGHT
 from mgs.images import write_png
@@ -24,7 +25,6 @@ from mgs.prior.build import load_prior, save_prior
 from mgs.run import folder as run_folder
 from mgs.run import nbv
 from mgs.run.inputs import prior_digest
-from mgs.run.operations import psnr_measure
 from mgs.run.settings import NbvSettings
 from mgs.run.state import State
 from mgs.splat import ListCache, fisher

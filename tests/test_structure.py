@@ -14,7 +14,8 @@ ROOMS = [
     "errors", "seeds", "runtime", "resources", "provenance", "colour", "rotation", "memory",
     "notebook", "camera", "gaussians", "files", "images", "splat_ply", "splat_gltf", "splat_files",
     "metrics", "plotting",
-    "data", "synth", "survey", "prior", "splat", "policy", "fit", "run", "report", "view",
+    "data", "synth", "survey", "prior", "splat", "evaluation",
+    "policy", "fit", "run", "report", "view",
     "bench", "study", "cli", "__main__",
 ]  # fmt: skip
 """All rooms; each may import from those before it."""

@@ -194,7 +194,7 @@ def write_run(out: Path, root: Path, prior: Path) -> Path:
 
 def write_measured_run(out: Path, dataset: Dataset, grey: float, parts, **values) -> Path:
     """A finished run with pictures and metrics.json, as if every render were of one grey."""
-    from mgs.report.evaluation import evaluate_model
+    from mgs.evaluation import evaluate_model
 
     run(out, dataset, parts, **values)
     made, tests = run_folder.open_run(out), dataset.test_views()

@@ -1,210 +1,27 @@
-"""Quality of a model: its renders against the images of a dataset, as numbers (`mgs.metrics`) and
-pictures.
-
-The truth is `Frame.target`: the rock in front of black, which the model was trained on. PSNR and
-SSIM compare sRGB values in [0,1]. Over the full frame they flatter, because any model gets the
-black right; those inside the mask are over the rock's pixels only.
-
-Views come in three sets: all views of the dataset; held-out views, which are those the model was
-never trained on; and the test views (`Dataset.test_views`), the same for every model.
-"""
+"""Evaluation of runs and of models in files: metrics.json, and pictures beside it."""
 
 from __future__ import annotations
 
 import gc
 import json
-import math
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mgs.camera import Camera
-from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset
 from mgs.data.frames import Frame
 from mgs.errors import InputError
-from mgs.files import atomic_path, working_in, write_json
+from mgs.evaluation import Progress, evaluate_model, no_progress, render_view, write_comparison
+from mgs.files import working_in, write_json
 from mgs.gaussians import ARRAYS, Gaussians
-from mgs.images import PNG_LEVEL, read_png
 from mgs.memory import KEPT_BYTES, release
-from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_surface
 from mgs.provenance import versions
 from mgs.report.runs import read_metrics
 from mgs.run.folder import Run, holds_run, open_run, read_config
 from mgs.run.inputs import array_digest, camera_digest, frame_digests
 from mgs.splat_ply import read_ply
-
-Renderer = Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""(gaussians, camera) -> linear RGB [H,W,3], alpha [H,W], expected z-depth [H,W] in metres."""
-
-Progress = Callable[[int, int], None]
-"""Called as progress(views done, all)."""
-
-MEASURED_AT_ONCE = 4
-"""Most views that are measured at the same time, each in a thread."""
-
-PIXELS_AT_ONCE = 4_000_000
-"""Most pixels of all of these, which bounds the memory; a larger view is measured alone."""
-
-DIFFERENCE_GAIN = 4
-"""Factor by which differences are brightened in the pictures."""
-
-
-def no_progress(done: int, total: int) -> None:
-    """Default callback: does nothing."""
-
-
-def render_view(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Render on black: linear RGB [H,W,3], alpha [H,W], expected z-depth [H,W] in metres."""
-    from mgs.splat import render
-
-    image = render(gaussians, camera)
-    rgb = np.asarray(image.rgb)
-    linear = rgb if gaussians.linear else linear_from_srgb(np.clip(rgb, 0, 1))
-    return linear, np.asarray(image.alpha), np.asarray(image.depth)
-
-
-def evaluate_model(
-    gaussians: Gaussians,
-    frames: Sequence[Frame],
-    trained: Iterable[str],
-    *,
-    test_frames: Sequence[Frame] = (),
-    renderer: Renderer = render_view,
-    pictures: Path | None = None,
-    progress: Progress = no_progress,
-) -> dict[str, Any]:
-    """Compare a model with every frame of a dataset, and with its test views if it has some.
-
-    trained: names of the training frames; the others are held out. pictures: folder for the
-    comparisons (`write_comparison`), NAME.png of every frame and test/NAME.png of every test view.
-
-    Returns the contents of metrics.json, without the entries that are about a run:
-
-    - images: number of training frames.
-    - test (if there are test views), all, held_out: number of views ("count") and the mean of each
-      of METRICS, and of each of SURFACE_METRICS that the data has a truth for; None if no view has
-      it.
-    - views, test_views: for each view its "name", "trained" (bool) and its metrics, None if there
-      is no pixel to measure, as in an empty mask.
-
-    Raises InputError if a file of a frame cannot be read or a picture cannot be written.
-    """
-    trained = set(trained)
-    views: list[dict[str, Any]] = []
-    tests: list[dict[str, Any]] = []
-    work = [(views, frame, pictures) for frame in frames]
-    work += [(tests, frame, pictures and pictures / TEST_FOLDER) for frame in test_frames]
-    largest = max((frame.camera.width * frame.camera.height for _, frame, _ in work), default=1)
-    at_once = max(1, min(MEASURED_AT_ONCE, PIXELS_AT_ONCE // largest))
-    waiting: deque[Any] = deque()
-
-    def finish_first() -> None:
-        found, frame, future = waiting.popleft()
-        known = found is views and frame.name in trained
-        found.append({"name": frame.name, "trained": known} | future.result())
-        progress(len(views) + len(tests), len(work))
-
-    progress(0, len(work))
-    # Filters take most of the time, and run beside other threads.
-    with ThreadPoolExecutor(at_once) as pool:
-        for found, frame, folder in work:
-            if len(waiting) == at_once:
-                finish_first()
-            # Copies: memory of Dr.Jit must not be freed by another thread. That thread would wait
-            # for a lock of Dr.Jit while it holds Python's, and this one the other way round.
-            drawn = tuple(map(np.array, renderer(gaussians, frame.camera)))
-            waiting.append((found, frame, pool.submit(_measured, frame, drawn, folder)))
-        while waiting:
-            finish_first()
-    result: dict[str, Any] = {"images": len(trained)}
-    if tests:
-        result["test"] = _means(tests, tests)
-    result["all"] = _means(views, views)
-    result["held_out"] = _means([view for view in views if not view["trained"]], views)
-    result["views"] = [_without_nan(view) for view in views]
-    if tests:
-        result["test_views"] = [_without_nan(view) for view in tests]
-    return result
-
-
-def _measured(
-    frame: Frame, rendered: tuple[np.ndarray, ...], folder: Path | None
-) -> dict[str, float]:
-    """METRICS and SURFACE_METRICS of one view; writes its picture into the folder."""
-    (truth, weight), mask, (rgb, alpha, depth) = frame.target(), frame.mask(), rendered
-    true_depth = frame.depth() if frame.depth_path else None
-    shares = frame.rock_path is not None
-    found = compare(truth, rgb, mask, weight)
-    found |= compare_surface(
-        truth, alpha, depth, mask, weight, fractional=shares, true_depth=true_depth
-    )
-    if folder is not None:
-        write_comparison(folder / f"{frame.name}.png", truth[..., :3], rgb, found["psnr"])
-    return found
-
-
-def _means(views: list[dict[str, Any]], whole: list[dict[str, Any]]) -> dict[str, Any]:
-    """Number of views, and the mean of each metric over the views that have it, None without such a
-    view. whole: the set of the views; SURFACE_METRICS that none of it has are left out."""
-    surface = [name for name in SURFACE_METRICS if any(name in view for view in whole)]
-    means: dict[str, Any] = {"count": len(views)}
-    for name in (*METRICS, *surface):
-        values = [view[name] for view in views if not math.isnan(view.get(name, math.nan))]
-        means[name] = sum(values) / len(values) if values else None
-    return means
-
-
-def _without_nan(view: dict[str, Any]) -> dict[str, Any]:
-    """A view's numbers with None in place of NaN, which JSON cannot hold."""
-    return {
-        key: None if isinstance(value, float) and math.isnan(value) else value
-        for key, value in view.items()
-    }
-
-
-def write_comparison(
-    path: str | Path, truth: np.ndarray, rendered: np.ndarray, decibels: float
-) -> None:
-    """Write one PNG with three panels side by side: truth, render, and their absolute difference,
-    brightened. A strip above holds their captions.
-
-    truth, rendered: [H,W,3] linear RGB; decibels: the PSNR. Raises InputError if the file cannot be
-    written.
-    """
-    from PIL import Image, ImageDraw, ImageFont
-
-    a, b = srgb_from_linear(truth), srgb_from_linear(rendered)
-    panels = np.concatenate([a, b, np.clip(DIFFERENCE_GAIN * np.abs(a - b), 0, 1)], axis=1)
-    height, width = a.shape[:2]
-    size = max(10, height // 24)
-    picture = Image.new("RGB", (3 * width, height + 2 * size), (255, 255, 255))
-    picture.paste(Image.fromarray(np.round(panels * 255).astype(np.uint8)), (0, 2 * size))
-    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size)
-    captions = ("truth", f"render, {decibels:.2f} dB", f"|difference| x {DIFFERENCE_GAIN}")
-    for i, caption in enumerate(captions):
-        draw.text(((i + 0.5) * width, size), caption, fill=(0, 0, 0), font=font, anchor="mm")
-    with atomic_path(path) as temporary:
-        picture.save(temporary, format="PNG", compress_level=PNG_LEVEL)
-
-
-def read_comparison(path: str | Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Read truth and render, linear RGB [H,W,3], rounded to 8 bits, out of a picture of
-    `write_comparison`.
-
-    camera: of the view. Raises InputError if the picture is missing, damaged or not of this
-    camera's size.
-    """
-    pixels, (height, width) = read_png(path), (camera.height, camera.width)
-    if pixels.shape[0] <= height or pixels.shape[1] != 3 * width:
-        raise InputError(
-            f"{path}: is not a comparison of {width}x{height} views; write it again with `mgs eval`"
-        )
-    return pixels[-height:, :width], pixels[-height:, width : 2 * width]
 
 
 def evaluate_run(

@@ -72,7 +72,7 @@ class RunFiles:
     """Contents of the files of a run folder.
 
     policy: its name, or "fit". steps: the lines of steps.jsonl (`mgs.run.folder` lists their keys).
-    metrics: metrics.json (`mgs.report.evaluation.evaluate_model`), None if the run was not
+    metrics: metrics.json (`mgs.evaluation.evaluate_model`), None if the run was not
     evaluated. settings, versions: those in config.json.
     """
 

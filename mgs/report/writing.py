@@ -11,9 +11,9 @@ import numpy as np
 from mgs.data.dataset import TEST_FOLDER, Dataset
 from mgs.data.frames import Frame
 from mgs.errors import InputError
+from mgs.evaluation import read_comparison
 from mgs.files import atomic_path, write_json
 from mgs.report import figures
-from mgs.report.evaluation import read_comparison
 from mgs.report.runs import (
     Comparison,
     RunFiles,

@@ -1,22 +1,20 @@
-"""The operations of a run on the splat core, and the PSNR that a run measures."""
+"""The operations of a run on the splat core."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from mgs import runtime
 from mgs.camera import Camera
-from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import Dataset
-from mgs.data.frames import Frame, as_captured
+from mgs.data.frames import Frame
+from mgs.evaluation import psnr_measure
 from mgs.fit.fitting import Fit, fit
 from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, KEPT_BYTES, kept_within, release
-from mgs.metrics import colour_corrected, psnr
 from mgs.policy.criteria import lam_by_kind
 from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of
@@ -25,7 +23,7 @@ from mgs.run.inputs import prior_digest
 from mgs.run.live import Live, live_capture
 from mgs.run.problem import Operations
 from mgs.run.settings import NbvSettings
-from mgs.splat import ListCache, as_drjit, fisher, groups, render
+from mgs.splat import ListCache, fisher, groups, render
 
 
 def operations_of(
@@ -98,70 +96,3 @@ def _capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[[Fra
     from mgs.synth.capture import capture_of  # needs a variant, and only rendered datasets need it
 
     return capture_of(dataset)
-
-
-def psnr_measure(
-    dataset: Dataset, cache: ListCache, exposure: bool = False
-) -> Callable[[Gaussians, list[int]], dict[str, float]]:
-    """Returns measure(gaussians, frames taken) -> mean PSNR, dB, by the names of `psnr_over`.
-
-    `test_psnr...` over the test views. A dataset without test views: `psnr...` over all views that
-    have an image, `held_out_psnr...` over those not taken. A mean over no view is left out. Raises
-    InputError as `Dataset.test_views`.
-    """
-    tests = dataset.test_views()
-    frames = dataset.frames if tests is None else tests.frames
-    of = psnr_over(frames, cache, exposure)
-
-    def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
-        if tests is not None:
-            return _means(of(gaussians, range(len(frames))), "test_")
-        shown = [i for i, frame in enumerate(frames) if i in taken or not frame.on_demand]
-        views = of(gaussians, shown)
-        held_out = {key: v[[i not in taken for i in shown]] for key, v in views.items()}
-        return _means(views) | _means(held_out, "held_out_")
-
-    return measure
-
-
-def psnr_over(
-    frames: Sequence[Frame], cache: ListCache, exposure: bool = False
-) -> Callable[[Gaussians, Sequence[int]], dict[str, np.ndarray]]:
-    """Returns a function (gaussians, indices of frames) -> PSNR of each of these views, dB.
-
-    `psnr`; `psnr_mask`, in the rock mask. With `exposure` also `..._corrected`, of renders at the
-    exposure of the view (`mgs.metrics.colour_corrected`).
-    """
-    names = ("psnr", "psnr_mask", *(("psnr_corrected", "psnr_mask_corrected") if exposure else ()))
-
-    def read(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        rgba, weight = as_captured(frames[index]).target()
-        return srgb_from_linear(rgba[..., :3]), weight > 0, frames[index].mask() & (weight > 0)
-
-    truth = kept_within(IMAGE_BYTES, read, lambda parts: sum(part.nbytes for part in parts))
-
-    def compared(index: int, rendered: np.ndarray) -> list[float]:
-        image, known, rock = truth(index)
-        shown = [rendered]
-        if exposure:
-            shown.append(colour_corrected(linear_from_srgb(image), rendered, rock))
-        srgb = [srgb_from_linear(one) for one in shown]
-        return [psnr(one, image, mask) for one in srgb for mask in (known, rock)]
-
-    def measured(gaussians: Gaussians, chosen: Sequence[int]) -> dict[str, np.ndarray]:
-        model, rows = as_drjit(gaussians), []
-        with ThreadPoolExecutor(1) as beside:  # compares a view while the next one is rendered
-            for i in chosen:
-                drawn = render(model, as_captured(frames[i]).camera, cache=cache).rgb
-                # A copy: another thread must not free memory of Dr.Jit (`evaluate_model`).
-                rows.append(beside.submit(compared, i, np.array(drawn)))
-        table = np.array([row.result() for row in rows]).reshape(-1, len(names))
-        return dict(zip(names, table.T, strict=True))
-
-    return measured
-
-
-def _means(values: Mapping[str, np.ndarray], prefix: str = "") -> dict[str, float]:
-    """Mean of each array over the views that have it, if there are some; names with a prefix."""
-    known = {key: column[~np.isnan(column)] for key, column in values.items()}
-    return {prefix + key: float(column.mean()) for key, column in known.items() if len(column)}

@@ -57,7 +57,7 @@ class Operations:
     estimate(gaussians, camera, estimator) -> the same by any row of `mgs.splat.ESTIMATORS`.
     exact(gaussians, camera) -> exact information [N,P]; None: as `fisher`.
     render(gaussians, camera) -> linear RGB [H,W,3] and alpha [H,W]; None: no detectors.
-    measure(gaussians, taken) -> entries of steps.jsonl (`mgs.run.operations.psnr_measure`).
+    measure(gaussians, taken) -> entries of steps.jsonl (`mgs.evaluation.psnr_measure`).
     capture(frame) -> the frame once its images exist, which this makes where they do not; its
     camera is that of the picture. `given_up` where there is none to be had.
     """

@@ -17,12 +17,13 @@ from typing import Any
 from mgs import runtime
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError
+from mgs.evaluation import evaluate_model
 from mgs.files import atomic_folder
 from mgs.fit.settings import COLOURS_ALONE
 from mgs.gaussians import Gaussians
 from mgs.prior.build import build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.report.evaluation import evaluate_model, evaluate_run
+from mgs.report.evaluation import evaluate_run
 from mgs.run.folder import Run, open_run
 from mgs.run.nbv import resume_nbv, start_run
 from mgs.study.sweep import CELLS, Cell
@@ -208,7 +209,7 @@ def test_views_of(dataset: Dataset) -> Dataset:
 
 
 def judge(model: Gaussians, dataset: Dataset) -> dict[str, float]:
-    """Mean metrics of a model over the test views of a dataset (`mgs.report.evaluation`)."""
+    """Mean metrics of a model over the test views of a dataset (`mgs.evaluation`)."""
     return dict(evaluate_model(model, (), (), test_frames=test_views_of(dataset).frames)["test"])
 
 

@@ -17,6 +17,7 @@ from typing import Any
 
 from mgs.camera import extent_of
 from mgs.data.dataset import load_dataset, target_of
+from mgs.evaluation import evaluate_model
 from mgs.fit.fitting import fit
 from mgs.fit.settings import TrainSettings, as_3dgs
 from mgs.memory import IMAGE_BYTES, Deferred, kept_within
@@ -24,7 +25,6 @@ from mgs.prior.build import load_prior
 from mgs.prior.initial import round_gaussians
 from mgs.prior.scattered import scattered
 from mgs.prior.settings import PriorSettings
-from mgs.report.evaluation import evaluate_model
 from mgs.study.case import in_new_process, peak_megabytes, test_views_of
 
 PASSES = 150

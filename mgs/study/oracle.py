@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from mgs.data.dataset import Dataset
+from mgs.evaluation import psnr_measure
 from mgs.run.loop import Chooser, fit_views
-from mgs.run.operations import psnr_measure
 from mgs.run.problem import Problem
 from mgs.run.state import Fitted
 from mgs.splat import ListCache

@@ -19,13 +19,14 @@ import numpy as np
 
 from mgs.data.dataset import load_dataset
 from mgs.data.frames import Frame
+from mgs.evaluation import psnr_over
 from mgs.policy import from_file as policy_file
 from mgs.policy.poses import path_length
 from mgs.policy.registry import needs_model
 from mgs.prior.build import load_prior
 from mgs.run.inputs import policy_record
 from mgs.run.loop import choose, finished, fit_views, learn, select_views
-from mgs.run.operations import operations_of, psnr_over
+from mgs.run.operations import operations_of
 from mgs.run.planning import surface_information, with_view
 from mgs.run.problem import Problem
 from mgs.run.settings import NbvSettings, with_defaults
@@ -237,7 +238,7 @@ def _from_poses(problem: Problem) -> list[int]:
 
 
 Measure = Callable[..., dict[str, np.ndarray]]
-"""(model, indices of frames; default: all) -> as `mgs.run.operations.psnr_over`."""
+"""(model, indices of frames; default: all) -> as `mgs.evaluation.psnr_over`."""
 
 
 @lru_cache(maxsize=1)

@@ -1,0 +1,276 @@
+"""Quality of a model: its renders against the images of a dataset, as numbers (`mgs.metrics`) and
+pictures.
+
+The truth is `Frame.target`: the rock in front of black, which the model was trained on. PSNR and
+SSIM compare sRGB values in [0,1]. Over the full frame they flatter, because any model gets the
+black right; those inside the mask are over the rock's pixels only.
+
+Views come in three sets: all views of the dataset; held-out views, which are those the model was
+never trained on; and the test views (`Dataset.test_views`), the same for every model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mgs.camera import Camera
+from mgs.colour import linear_from_srgb, srgb_from_linear
+from mgs.data.dataset import TEST_FOLDER, Dataset
+from mgs.data.frames import Frame, as_captured
+from mgs.errors import InputError
+from mgs.files import atomic_path
+from mgs.gaussians import Gaussians
+from mgs.images import PNG_LEVEL, read_png
+from mgs.memory import IMAGE_BYTES, kept_within
+from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_psnr, compare_surface
+
+if TYPE_CHECKING:
+    from mgs.splat import ListCache
+
+Renderer = Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""(gaussians, camera) -> linear RGB [H,W,3], alpha [H,W], expected z-depth [H,W] in metres."""
+
+Progress = Callable[[int, int], None]
+"""Called as progress(views done, all)."""
+
+MEASURED_AT_ONCE = 4
+"""Most views that are measured at the same time, each in a thread."""
+
+PIXELS_AT_ONCE = 4_000_000
+"""Most pixels of all of these, which bounds the memory; a larger view is measured alone."""
+
+DIFFERENCE_GAIN = 4
+"""Factor by which differences are brightened in the pictures."""
+
+
+def no_progress(done: int, total: int) -> None:
+    """Default callback: does nothing."""
+
+
+def render_view(
+    gaussians: Gaussians, camera: Camera, cache: ListCache | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Render on black: linear RGB [H,W,3], alpha [H,W], expected z-depth [H,W] in metres."""
+    from mgs.splat import render
+
+    image = render(gaussians, camera, cache=cache)
+    rgb = np.asarray(image.rgb)
+    linear = rgb if gaussians.linear else linear_from_srgb(np.clip(rgb, 0, 1))
+    return linear, np.asarray(image.alpha), np.asarray(image.depth)
+
+
+def psnr_measure(
+    dataset: Dataset, cache: ListCache, exposure: bool = False
+) -> Callable[[Gaussians, list[int]], dict[str, float]]:
+    """Returns measure(gaussians, frames taken) -> mean PSNR, dB, by the names of `psnr_over`.
+
+    `test_psnr...` over the test views. A dataset without test views: `psnr...` over all views that
+    have an image, `held_out_psnr...` over those not taken. A mean over no view is left out. Raises
+    InputError as `Dataset.test_views`.
+    """
+    tests = dataset.test_views()
+    frames = dataset.frames if tests is None else tests.frames
+    of = psnr_over(frames, cache, exposure)
+
+    def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
+        if tests is not None:
+            return _psnr_means(of(gaussians, range(len(frames))), "test_")
+        shown = [i for i, frame in enumerate(frames) if i in taken or not frame.on_demand]
+        views = of(gaussians, shown)
+        held_out = {key: v[[i not in taken for i in shown]] for key, v in views.items()}
+        return _psnr_means(views) | _psnr_means(held_out, "held_out_")
+
+    return measure
+
+
+def psnr_over(
+    frames: Sequence[Frame], cache: ListCache, exposure: bool = False
+) -> Callable[[Gaussians, Sequence[int]], dict[str, np.ndarray]]:
+    """Returns a function (gaussians, indices of frames) -> PSNR of each of these views, dB.
+
+    Keys: those of `mgs.metrics.compare_psnr`, `..._corrected` only with `exposure`. Images are kept
+    for the next call.
+    """
+    names = ("psnr", "psnr_mask", *(("psnr_corrected", "psnr_mask_corrected") if exposure else ()))
+
+    def read(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rgba, weight = as_captured(frames[index]).target()
+        return srgb_from_linear(rgba[..., :3]), weight > 0, frames[index].mask() & (weight > 0)
+
+    truth = kept_within(IMAGE_BYTES, read, lambda parts: sum(part.nbytes for part in parts))
+
+    def compared(index: int, rendered: np.ndarray, *_: np.ndarray) -> dict[str, float]:
+        image, known, rock = truth(index)
+        linear = linear_from_srgb(image) if exposure else None
+        return compare_psnr(image, rendered, known, rock, linear)
+
+    def measured(gaussians: Gaussians, chosen: Sequence[int]) -> dict[str, np.ndarray]:
+        from mgs.splat import as_drjit
+
+        model = as_drjit(gaussians)
+        drawn = ((i, render_view(model, as_captured(frames[i]).camera, cache)) for i in chosen)
+        rows = list(_compared(drawn, compared, 2))
+        return {name: np.array([row[name] for row in rows], float) for name in names}
+
+    return measured
+
+
+def _psnr_means(values: Mapping[str, np.ndarray], prefix: str = "") -> dict[str, float]:
+    """Mean of each array over the views that have it, if there are some; names with a prefix."""
+    known = {key: column[~np.isnan(column)] for key, column in values.items()}
+    return {prefix + key: float(column.mean()) for key, column in known.items() if len(column)}
+
+
+def _compared(
+    drawn: Iterable[tuple[Any, tuple[np.ndarray, ...]]],
+    compare: Callable[..., dict[str, float]],
+    at_once: int,
+) -> Iterator[dict[str, float]]:
+    """Yield compare(view, *arrays) of each pair of a view and its rendered arrays, in their order.
+
+    Up to `at_once` views are compared in threads, all but one while the next view is rendered.
+    """
+    queue: deque[Future[dict[str, float]]] = deque()
+    with ThreadPoolExecutor(at_once) as pool:
+        for view, arrays in drawn:
+            # Copies: memory of Dr.Jit must not be freed by another thread. That thread would wait
+            # for a lock of Dr.Jit while it holds Python's, and this one the other way round.
+            queue.append(pool.submit(compare, view, *map(np.array, arrays)))
+            del arrays
+            if len(queue) == at_once:
+                yield queue.popleft().result()
+        while queue:
+            yield queue.popleft().result()
+
+
+def evaluate_model(
+    gaussians: Gaussians,
+    frames: Sequence[Frame],
+    trained: Iterable[str],
+    *,
+    test_frames: Sequence[Frame] = (),
+    renderer: Renderer = render_view,
+    pictures: Path | None = None,
+    progress: Progress = no_progress,
+) -> dict[str, Any]:
+    """Compare a model with every frame of a dataset, and with its test views if it has some.
+
+    trained: names of the training frames; the others are held out. pictures: folder for the
+    comparisons (`write_comparison`), NAME.png of every frame and test/NAME.png of every test view.
+
+    Returns the contents of metrics.json, without the entries that are about a run:
+
+    - images: number of training frames.
+    - test (if there are test views), all, held_out: number of views ("count") and the mean of each
+      of METRICS, and of each of SURFACE_METRICS that the data has a truth for; None if no view has
+      it.
+    - views, test_views: for each view its "name", "trained" (bool) and its metrics, None if there
+      is no pixel to measure, as in an empty mask.
+
+    Raises InputError if a file of a frame cannot be read or a picture cannot be written.
+    """
+    trained = set(trained)
+    work = [(frame, pictures) for frame in frames]
+    work += [(frame, pictures and pictures / TEST_FOLDER) for frame in test_frames]
+    largest = max((frame.camera.width * frame.camera.height for frame, _ in work), default=1)
+    at_once = max(1, min(MEASURED_AT_ONCE, PIXELS_AT_ONCE // largest))
+    drawn = ((view, renderer(gaussians, view[0].camera)) for view in work)
+    views: list[dict[str, Any]] = []
+    progress(0, len(work))
+    for (frame, _), metrics in zip(work, _compared(drawn, _measured, at_once), strict=True):
+        known = len(views) < len(frames) and frame.name in trained
+        views.append({"name": frame.name, "trained": known} | metrics)
+        progress(len(views), len(work))
+    views, tests = views[: len(frames)], views[len(frames) :]
+    result: dict[str, Any] = {"images": len(trained)}
+    if tests:
+        result["test"] = _means(tests, tests)
+    result["all"] = _means(views, views)
+    result["held_out"] = _means([view for view in views if not view["trained"]], views)
+    result["views"] = [_without_nan(view) for view in views]
+    if tests:
+        result["test_views"] = [_without_nan(view) for view in tests]
+    return result
+
+
+def _measured(
+    view: tuple[Frame, Path | None], rgb: np.ndarray, alpha: np.ndarray, depth: np.ndarray
+) -> dict[str, float]:
+    """METRICS and SURFACE_METRICS of one view; writes its picture into the folder."""
+    frame, folder = view
+    (truth, weight), mask = frame.target(), frame.mask()
+    true_depth = frame.depth() if frame.depth_path else None
+    shares = frame.rock_path is not None
+    found = compare(truth, rgb, mask, weight)
+    found |= compare_surface(
+        truth, alpha, depth, mask, weight, fractional=shares, true_depth=true_depth
+    )
+    if folder is not None:
+        write_comparison(folder / f"{frame.name}.png", truth[..., :3], rgb, found["psnr"])
+    return found
+
+
+def _means(views: list[dict[str, Any]], whole: list[dict[str, Any]]) -> dict[str, Any]:
+    """Number of views, and the mean of each metric over the views that have it, None without such a
+    view. whole: the set of the views; SURFACE_METRICS that none of it has are left out."""
+    surface = [name for name in SURFACE_METRICS if any(name in view for view in whole)]
+    means: dict[str, Any] = {"count": len(views)}
+    for name in (*METRICS, *surface):
+        values = [view[name] for view in views if not math.isnan(view.get(name, math.nan))]
+        means[name] = sum(values) / len(values) if values else None
+    return means
+
+
+def _without_nan(view: dict[str, Any]) -> dict[str, Any]:
+    """A view's numbers with None in place of NaN, which JSON cannot hold."""
+    return {
+        key: None if isinstance(value, float) and math.isnan(value) else value
+        for key, value in view.items()
+    }
+
+
+def write_comparison(
+    path: str | Path, truth: np.ndarray, rendered: np.ndarray, decibels: float
+) -> None:
+    """Write one PNG with three panels side by side: truth, render, and their absolute difference,
+    brightened. A strip above holds their captions.
+
+    truth, rendered: [H,W,3] linear RGB; decibels: the PSNR. Raises InputError if the file cannot be
+    written.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    a, b = srgb_from_linear(truth), srgb_from_linear(rendered)
+    panels = np.concatenate([a, b, np.clip(DIFFERENCE_GAIN * np.abs(a - b), 0, 1)], axis=1)
+    height, width = a.shape[:2]
+    size = max(10, height // 24)
+    picture = Image.new("RGB", (3 * width, height + 2 * size), (255, 255, 255))
+    picture.paste(Image.fromarray(np.round(panels * 255).astype(np.uint8)), (0, 2 * size))
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(size)
+    captions = ("truth", f"render, {decibels:.2f} dB", f"|difference| x {DIFFERENCE_GAIN}")
+    for i, caption in enumerate(captions):
+        draw.text(((i + 0.5) * width, size), caption, fill=(0, 0, 0), font=font, anchor="mm")
+    with atomic_path(path) as temporary:
+        picture.save(temporary, format="PNG", compress_level=PNG_LEVEL)
+
+
+def read_comparison(path: str | Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Read truth and render, linear RGB [H,W,3], rounded to 8 bits, out of a picture of
+    `write_comparison`.
+
+    camera: of the view. Raises InputError if the picture is missing, damaged or not of this
+    camera's size.
+    """
+    pixels, (height, width) = read_png(path), (camera.height, camera.width)
+    if pixels.shape[0] <= height or pixels.shape[1] != 3 * width:
+        raise InputError(
+            f"{path}: is not a comparison of {width}x{height} views; write it again with `mgs eval`"
+        )
+    return pixels[-height:, :width], pixels[-height:, width : 2 * width]
