@@ -37,6 +37,9 @@ class Camera:
     - width, height: of the image, pixels.
     - world_to_camera: [4,4] float64, rigid transform in metres, to OpenCV axes (x right, y down,
       z forward).
+    - film, corner: of a crop window, the camera of the whole film, and the window's left and top on
+      it, pixels (`cropped`). Splats are projected as for the whole film, so that tiles fit together
+      bit for bit.
 
     Raises InputError if K or the pose is not finite, K has skew or a focal length that is not
     positive, an entry exceeds FURTHEST, the width or height is not a whole number of at least 1,
@@ -47,6 +50,8 @@ class Camera:
     width: int
     height: int
     world_to_camera: NDArray[np.float64]
+    film: Camera | None = None
+    corner: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
         K = np.asarray(self.K, np.float64) + 0.0  # makes 0.0 of -0.0: `key` compares bytes
@@ -117,7 +122,10 @@ class Camera:
     def key(self) -> bytes:
         """K, pose and image size as bytes: the key of a view in caches and seeds."""
         size = f"{self.width}x{self.height}".encode()
-        return self.K.tobytes() + self.world_to_camera.tobytes() + size
+        numbers = self.K.tobytes() + self.world_to_camera.tobytes() + size
+        return (
+            numbers if self.film is None else numbers + repr(self.corner).encode() + self.film.key
+        )
 
     def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Project world points [N,3], metres, to pixels [N,2] and z-depths [N], metres.
@@ -147,8 +155,10 @@ class Camera:
     def resized(self, width: int) -> Camera:
         """Same view in an image of this width, pixels. The height follows, rounded, at least 1.
 
-        Raises InputError if the image becomes too large.
+        Raises InputError if the image becomes too large, or is a crop window.
         """
+        if self.film is not None:
+            raise InputError("camera: a crop window keeps its scale; resize the film, then crop it")
         height = max(1, round(self.height * width / self.width))
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return Camera(scale @ self.K, width, height, self.world_to_camera)
@@ -157,7 +167,23 @@ class Camera:
         """Same camera in a world whose lengths are multiplied by a factor."""
         pose = self.world_to_camera.copy()
         pose[:3, 3] *= factor
-        return Camera(self.K, self.width, self.height, pose)
+        film = self.film and self.film.scaled(factor)
+        return Camera(self.K, self.width, self.height, pose, film, self.corner)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """Camera of a window of the image, all four in pixels.
+
+        Raises InputError if the window is empty or leaves the image.
+        """
+        right, bottom = left + width, top + height
+        if not (0 <= left < right <= self.width and 0 <= top < bottom <= self.height):
+            raise InputError(
+                f"camera: the window of {width}x{height} pixels at ({left}, {top}) is empty or "
+                f"leaves the image, {self.width}x{self.height}"
+            )
+        K = self.K - [[0, 0, left], [0, 0, top], [0, 0, 0]]
+        corner = self.corner[0] + left, self.corner[1] + top
+        return Camera(K, width, height, self.world_to_camera, self.film or self, corner)
 
 
 def look_at(

@@ -87,8 +87,14 @@ def test_camera_and_image_are_those_of_the_sensor(ply, options, film):
     np.testing.assert_allclose(np.asarray(rays.d).T, directions, atol=2e-6)
     np.testing.assert_allclose(found.position, EYE, atol=1e-6)
     truth = np.asarray(render(read_ply(ply), found).rgb)
-    np.testing.assert_array_equal(np.asarray(mi.render(scene)), truth)
+    image = np.asarray(mi.render(scene))
+    np.testing.assert_array_equal(image, truth)
     assert truth.max() > 0.3
+    if "crop_width" in film:
+        sensor = sensor_dict({k: v for k, v in film.items() if k not in CROP}, **options)
+        (left, top), (height, width) = found.corner, truth.shape[:2]
+        whole = np.asarray(mi.render(load(ply, sensor)))
+        np.testing.assert_array_equal(image, whole[top : top + height, left : left + width])
 
 
 def test_alpha_depth_and_background(ply):

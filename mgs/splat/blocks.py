@@ -19,6 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.memory import check_room
 from mgs.splat.projection import Splats
@@ -84,7 +85,7 @@ class BlockLists:
     block: block of each lane, counted row by row, UInt32 [L]. Lanes go tile by tile, in a tile the
         longest list first.
     start, end: range of each lane's pairs, UInt32 [L].
-    width, height: pixels; blocks_x: blocks per row; UInt32 [1].
+    left, top, right, bottom: the image on its film, pixels; blocks_x: blocks per row; UInt32 [1].
     footprints: for which the lists were built.
     """
 
@@ -97,8 +98,10 @@ class BlockLists:
     block: Any
     start: Any
     end: Any
-    width: Any
-    height: Any
+    left: Any
+    top: Any
+    right: Any
+    bottom: Any
     blocks_x: Any
     footprints: Footprints
 
@@ -144,21 +147,29 @@ def depth_order(depth: Any) -> Any:
     return _sorted(index, dr.reinterpret_array(mi.UInt32, depth), 1 << 32)
 
 
-def build(splats: Splats, width: int, height: int, older: BlockLists | None = None) -> BlockLists:
+def build(splats: Splats, camera: Camera, older: BlockLists | None = None) -> BlockLists:
     """Build the block lists of detached splats.
 
-    width, height: pixels. older: lists of the same camera whose depth order and places are reused;
-    no splat may be REORDERED since.
+    Blocks are those of the camera's whole film: a crop window has the ones that it touches.
+    older: lists of the same camera whose depth order and places are reused. No splat may be
+    REORDERED since.
 
     Pairs are made front to back and then sorted by block. The sort is stable, so each block's list
     is front to back, too. A splat touches a block if its ellipse does, not its bounding box. Raises
     InputError for more than MAX_PAIRS pairs, or too many for the memory, before taking memory.
     """
-    blocks_x, blocks_y = -(-width // BLOCK_X), -(-height // BLOCK_Y)
+    left, top = camera.corner
+    right, bottom = left + camera.width, top + camera.height
+    column, row = left // BLOCK_X, top // BLOCK_Y
+    blocks_x, blocks_y = -(-right // BLOCK_X) - column, -(-bottom // BLOCK_Y) - row
+    first = dr.opaque(mi.UInt32, column), dr.opaque(mi.UInt32, row)
     foot = footprints(splats)
-    order, place = (older.order, older.place) if older else _orders(splats, blocks_x, blocks_y)
+    if older:
+        order, place = older.order, older.place
+    else:
+        order, place = _orders(splats, first, blocks_x, blocks_y)
     numbers = _tile_number(dr.arange(mi.UInt32, blocks_x * blocks_y), blocks_x)
-    owner, number, slot_start, slot_end = _pairs(foot, order, place, blocks_x, blocks_y)
+    owner, number, slot_start, slot_end = _pairs(foot, order, place, first, blocks_x, blocks_y)
     splat, pair, start, end = _by_block(owner, number, _tile_numbers(blocks_x, blocks_y))
     start, end = dr.gather(mi.UInt32, start, numbers), dr.gather(mi.UInt32, end, numbers)
     lane = _lanes_by_tile(end - start, numbers, _tile_numbers(blocks_x, blocks_y))
@@ -172,8 +183,10 @@ def build(splats: Splats, width: int, height: int, older: BlockLists | None = No
         block=lane,
         start=dr.gather(mi.UInt32, start, lane),
         end=dr.gather(mi.UInt32, end, lane),
-        width=dr.opaque(mi.UInt32, width),
-        height=dr.opaque(mi.UInt32, height),
+        left=dr.opaque(mi.UInt32, left),
+        top=dr.opaque(mi.UInt32, top),
+        right=dr.opaque(mi.UInt32, right),
+        bottom=dr.opaque(mi.UInt32, bottom),
         blocks_x=dr.opaque(mi.UInt32, blocks_x),
         footprints=foot,
     )
@@ -225,13 +238,20 @@ def _permutation(keys: Any, count: int) -> Any:
     return order
 
 
-def _orders(splats: Splats, blocks_x: int, blocks_y: int) -> tuple[Any, Any]:
-    """Order and place of `BlockLists`. A centre outside the image counts to the nearest block."""
+def _orders(
+    splats: Splats, first: tuple[Any, Any], blocks_x: int, blocks_y: int
+) -> tuple[Any, Any]:
+    """Order and place of `BlockLists`. A centre outside the image counts to the nearest block.
 
-    def block(pixel: Any, size: int, count: int) -> Any:
-        return mi.UInt32(dr.select(splats.visible, dr.clip(pixel / size, 0, count - 1), 0))
+    first: column and row of the first block on the film, UInt32 [1].
+    """
 
-    row, column = block(splats.mean_y, BLOCK_Y, blocks_y), block(splats.mean_x, BLOCK_X, blocks_x)
+    def block(pixel: Any, size: int, first: Any, count: int) -> Any:
+        number = dr.clip(pixel / size - mi.Float(first), 0, count - 1)
+        return mi.UInt32(dr.select(splats.visible, number, 0))
+
+    column = block(splats.mean_x, BLOCK_X, first[0], blocks_x)
+    row = block(splats.mean_y, BLOCK_Y, first[1], blocks_y)
     number = _tile_number(row * blocks_x + column, blocks_x)
     order = depth_order(splats.depth)
     dr.eval(number)
@@ -254,10 +274,15 @@ def _lanes_by_tile(length: Any, number: Any, numbers: int) -> Any:
 
 
 def _pairs(
-    foot: Footprints, order: Any, place: Any, blocks_x: int, blocks_y: int
+    foot: Footprints,
+    order: Any,
+    place: Any,
+    first_block: tuple[Any, Any],
+    blocks_x: int,
+    blocks_y: int,
 ) -> tuple[Any, ...]:
     """All (splat, block) pairs in the order of their slots: front to back, and for one splat row
-    by row.
+    by row. first_block: as `first` in `_orders`.
 
     Returns, as UInt32: the place of each pair's splat [M], the `_tile_number` of its block [M], and
     the range of slots of the splat at each place [N], [N]. The first two are empty if no splat is
@@ -273,8 +298,9 @@ def _pairs(
         for part in (foot.mean_x, foot.mean_y, foot.shear, foot.white_x, foot.white_y, foot.level)
     )
     half = dr.sqrt(dr.maximum(q, 0)) * dr.rcp(e)
-    low = dr.clip(dr.ceil((v - half + 0.5) / BLOCK_Y) - 1, 0, blocks_y)
-    high = dr.clip(dr.floor((v + half - 0.5) / BLOCK_Y) + 1, 0, blocks_y)
+    row = mi.Float(first_block[1])
+    low = dr.clip(dr.ceil((v - half + 0.5) / BLOCK_Y) - 1 - row, 0, blocks_y)
+    high = dr.clip(dr.floor((v + half - 0.5) / BLOCK_Y) + 1 - row, 0, blocks_y)
     rows = mi.UInt32(dr.select(q > 0, dr.maximum(high - low, 0), 0))
     shapes = dr.empty(mi.Float, 8 * n)
     for i, part in enumerate((mi.Vector4f(u, v, k, p), mi.Vector4f(e, q, low, 0))):
@@ -288,7 +314,7 @@ def _pairs(
     if len(rank) > 0:
         owner = dr.gather(mi.UInt32, nearest, rank)
         offset = dr.arange(mi.UInt32, len(rank)) - dr.gather(mi.UInt32, first_row, rank)
-        block, columns = _blocks_of_row(shapes, rank, offset, blocks_x)
+        block, columns = _blocks_of_row(shapes, rank, offset, first_block, blocks_x)
         dr.eval(owner, block, columns)
     count = _total(columns, blocks_x, "blocks")
     if count == 0:
@@ -337,12 +363,15 @@ def _run_numbers(start: Any, length: Any, count: int) -> Any:
     return dr.block_prefix_reduce(dr.ReduceOp.Max, begun, count, exclusive=False)
 
 
-def _blocks_of_row(shapes: Any, splat: Any, offset: Any, blocks_x: int) -> tuple[Any, Any]:
+def _blocks_of_row(
+    shapes: Any, splat: Any, offset: Any, first_block: tuple[Any, Any], blocks_x: int
+) -> tuple[Any, Any]:
     """Blocks that an ellipse touches in one row of blocks: number of the first (row by row), count.
 
     shapes: two packets per splat, front to back: (mean_x, mean_y, shear, white_x) and
         (white_y, level, first row, unused).
     splat: index in `shapes`, UInt32. offset: row, counted from the splat's first row, UInt32.
+    first_block: as `first` in `_orders`.
 
     The ellipse counts between the centres of the row's first and last pixels. At height y from the
     splat's centre its right rim is x = k y + sqrt(q - e^2 y^2) / p (letters: docs/notation.md),
@@ -352,7 +381,7 @@ def _blocks_of_row(shapes: Any, splat: Any, offset: Any, blocks_x: int) -> tuple
     u, v, k, p = dr.gather(mi.Vector4f, shapes, 2 * splat)
     e, q, first_row, _ = dr.gather(mi.Vector4f, shapes, 2 * splat + 1)
     by, half = mi.UInt32(first_row) + offset, dr.sqrt(q) * dr.rcp(e)
-    top = mi.Float(by * BLOCK_Y) + 0.5 - v
+    top = mi.Float((by + first_block[1]) * BLOCK_Y) + 0.5 - v
     low, high = dr.maximum(top, -half), dr.minimum(top + (BLOCK_Y - 1), half)
     slant = k * p
     summit = slant * half * dr.rsqrt(e * e + slant * slant)
@@ -361,8 +390,9 @@ def _blocks_of_row(shapes: Any, splat: Any, offset: Any, blocks_x: int) -> tuple
         y = dr.clip(side * summit, low, high)
         return u + k * y + side * dr.sqrt(dr.maximum(dr.fma(-e * y, e * y, q), 0)) / p
 
-    first = dr.clip(dr.ceil((rim(-1) + 0.5) / BLOCK_X) - 1, 0, blocks_x)
-    last = dr.clip(dr.floor((rim(1) - 0.5) / BLOCK_X) + 1, 0, blocks_x)
+    column = mi.Float(first_block[0])
+    first = dr.clip(dr.ceil((rim(-1) + 0.5) / BLOCK_X) - 1 - column, 0, blocks_x)
+    last = dr.clip(dr.floor((rim(1) - 0.5) / BLOCK_X) + 1 - column, 0, blocks_x)
     columns = mi.UInt32(dr.select(low <= high, dr.maximum(last - first, 0), 0))
     return by * blocks_x + mi.UInt32(first), columns
 

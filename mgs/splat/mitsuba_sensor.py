@@ -29,10 +29,9 @@ def camera_from_sensor(sensor: Any) -> Camera:
         )
     width, height = params["film.size"]
     left, top = params["film.crop_offset"]
-    columns, rows = params["film.crop_size"]
     focal = 0.5 * width / np.tan(0.5 * np.radians(_number(params["x_fov"])))
-    cx = (0.5 - _number(params["principal_point_offset_x"])) * width - left
-    cy = (0.5 - _number(params["principal_point_offset_y"])) * height - top
+    cx = (0.5 - _number(params["principal_point_offset_x"])) * width
+    cy = (0.5 - _number(params["principal_point_offset_y"])) * height
     to_world = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
     if np.linalg.det(to_world[:3, :3]) < 0:
         raise InputError(
@@ -44,7 +43,11 @@ def camera_from_sensor(sensor: Any) -> Camera:
     except np.linalg.LinAlgError:
         raise InputError("sensor: to_world is singular; its rotation must be orthonormal") from None
     K = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]])
-    return Camera(K, int(columns), int(rows), world_to_camera)
+    film, window = Camera(K, width, height, world_to_camera), map(int, params["film.crop_size"])
+    columns, rows = window
+    if (columns, rows) == (film.width, film.height):
+        return film
+    return film.cropped(int(left), int(top), columns, rows)
 
 
 def _number(value: Any) -> float:

@@ -42,7 +42,7 @@ LOG2E = 1.4426950408889634
 class Splats:
     """N projected Gaussians, Dr.Jit arrays [N]: Float from `project`, Float64 from `project64`.
 
-    mean_x, mean_y: centre, pixels from the image's corner.
+    mean_x, mean_y: centre, pixels from the corner of the film (`Camera.film`).
     shear (no unit), white_x, white_y (1/px): the whitening, see the module.
     log2_opacity: base-2 logarithm of the opacity, times its compensation if antialiased.
     depth: z-depth of the centre, metres.
@@ -77,12 +77,13 @@ class Splats:
 
 def camera_array(camera: Camera) -> Any:
     """The camera as a Dr.Jit array of 23 Float64. Unlike Python numbers, these are not compiled
-    into a kernel.
+    into a kernel. Of a crop window it is that of its film.
 
     Layout: rotation (9, row by row) and translation (3) of `world_to_camera`; fx, fy, cx, cy,
     pixels; lower and upper bound of x/z, then of y/z (4, FRUSTUM_MARGIN); camera centre (3),
     metres.
     """
+    camera = camera.film or camera
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / fx
     margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / fy

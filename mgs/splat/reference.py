@@ -34,7 +34,8 @@ from mgs.splat.constants import (
 class Projected:
     """Projected Gaussians.
 
-    means2d: [N,2] px. cov2d: [N,2,2] px^2, EPS2D included. depths: [N] m, 1 where not visible.
+    means2d: [N,2] px, on the film (`Camera.film`). cov2d: [N,2,2] px^2, EPS2D included. depths: [N]
+    m, 1 where not visible.
     opacities: [N], of it compensations [N] the factor of antialiased Gaussians, else 1. colours:
     [N,3] linear RGB. visible: [N] bool, in front of the near plane.
     """
@@ -84,6 +85,7 @@ def project(gaussians: Gaussians, camera: Camera) -> Projected:
     J [N,2,3] is the Jacobian of the projection at each mean, T = J R maps metres to pixels.
     """
     means = np.asarray(gaussians.means, np.float64)
+    camera = camera.film or camera
     R, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     x, y, z = (means @ R.T + t).T
@@ -114,6 +116,12 @@ def project(gaussians: Gaussians, camera: Camera) -> Projected:
     return Projected(means2d, cov2d, z, opacities, compensations, np.maximum(raw, 0), visible)
 
 
+def _pixels(camera: Camera) -> np.ndarray:
+    """Centres of the pixels [H*W,2], row by row, on the film."""
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    return np.stack([u.ravel(), v.ravel()], 1) + camera.corner
+
+
 def _half_square(d: np.ndarray, cov: np.ndarray) -> np.ndarray:
     """1/2 d^T cov^-1 d for each row d of [P,2]; cov: [2,2]."""
     return 0.5 * ((d @ np.linalg.inv(cov)) * d).sum(1)
@@ -130,8 +138,7 @@ def composite(
     """
     index = np.flatnonzero(projected.visible)
     order = index[np.argsort(projected.depths[index].astype(np.float32), kind="stable")]
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    pixels = np.stack([u.ravel(), v.ravel()], 1)
+    pixels = _pixels(camera)
     alpha = np.zeros((len(order), len(pixels))).T  # transposed, as one splat is written at a time
     transmittance = np.zeros_like(alpha)
     clipped = np.zeros_like(alpha, bool)
@@ -177,8 +184,7 @@ def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """
     p = project(gaussians, camera)
     order, alpha, _, _ = composite(p, camera)
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    pixels = np.stack([u.ravel(), v.ravel()], 1)
+    pixels = _pixels(camera)
     least = np.full(len(pixels), np.inf)
     T, amplification, live = np.ones(len(pixels)), np.zeros(len(pixels)), np.ones(len(pixels), bool)
     for i, j in enumerate(order):
@@ -262,8 +268,7 @@ def jacobian(
     surround = np.append(background, np.zeros(extra))
     image = contribution.sum(1) + (1 - weights.sum(1))[:, None] * surround
     behind = image[:, None, :] - np.cumsum(contribution, 1)
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    pixels = np.stack([u.ravel(), v.ravel()], 1)
+    pixels = _pixels(camera)
     moves = mean_directions(n, means, normals)
     transparency = expit(-np.asarray(gaussians.logit_opacities, np.float64))
     d_means2d, d_cov2d, d_colours, d_log = _projection_jacobian(gaussians, camera, moves)

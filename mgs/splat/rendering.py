@@ -115,7 +115,7 @@ class ListCache:
         self, key: bytes, splats: Splats, camera: Camera, older: BlockLists | None = None
     ) -> BlockLists:
         """New lists, kept if there is room."""
-        lists = blocks.build(splats, camera.width, camera.height, older)
+        lists = blocks.build(splats, camera, older)
         self.builds += 1
         self._keep(key, lists)
         return lists
@@ -225,12 +225,12 @@ class _Rasterise(dr.CustomOp):
         self.set_grad_in("splats", kernels.splat_gradient(sums, self.splats))
 
 
-def _block_major(width: int, height: int) -> Any:
+def _block_major(lists: BlockLists, width: int, height: int) -> Any:
     """Index of each pixel (row by row) in the output of the kernels (block by block), UInt32
     [H*W]."""
     index = dr.arange(mi.UInt32, width * height)
-    x, y = index % width, index // width
-    block = (y // BLOCK_Y) * (-(-width // BLOCK_X)) + x // BLOCK_X
+    x, y = lists.left % BLOCK_X + index % width, lists.top % BLOCK_Y + index // width
+    block = (y // BLOCK_Y) * lists.blocks_x + x // BLOCK_X
     return block * PIXELS + (y % BLOCK_Y) * BLOCK_X + x % BLOCK_X
 
 
@@ -384,5 +384,5 @@ def _rasterised(
     splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, channels: int
 ) -> Any:
     """Outputs of `_Rasterise`, with gradients of the means if enabled."""
-    places, means = _block_major(width, height), dr.grad_enabled(splats.mean_x)
+    places, means = _block_major(lists, width, height), dr.grad_enabled(splats.mean_x)
     return dr.custom(_Rasterise, splats, packed, lists, places, means, channels)

@@ -130,10 +130,15 @@ def lanes(lists: BlockLists) -> tuple[Lane, list[Any]]:
         across = lane % per_block % BLOCK_X
         down = lane % per_block // BLOCK_X
         first = block * PIXELS + lane % per_block
-    x, y = (block % lists.blocks_x) * BLOCK_X, (block // lists.blocks_x) * BLOCK_Y
-    x, y = x + across, y + down
+    x = (lists.left // BLOCK_X + block % lists.blocks_x) * BLOCK_X + across
+    y = (lists.top // BLOCK_Y + block // lists.blocks_x) * BLOCK_Y + down
+
+    def inside(x: Any, y: Any) -> Any:
+        across = (x >= lists.left) & (x < lists.right)
+        return across & (y >= lists.top) & (y < lists.bottom)
+
     T = [
-        dr.select((x + i < lists.width) & (y + j < lists.height), mi.Float(1), mi.Float(0))
+        dr.select(inside(x + i, y + j), mi.Float(1), mi.Float(0))
         for j in range(rows)
         for i in range(columns)
     ]

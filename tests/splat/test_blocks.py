@@ -63,7 +63,7 @@ def test_lists_hold_every_pair_and_little_more(seed, scales):
     """For small splats, needles and splats as large as the image."""
     camera, g = make_camera(), make_gaussians(60, seed, log_scales=scales)
     needed = needed_pairs(g, camera)
-    listed = pairs_of(build(projected(g, camera), camera.width, camera.height))
+    listed = pairs_of(build(projected(g, camera), camera))
     assert needed <= listed
     assert len(listed) < 1.25 * len(needed)
 

@@ -1,5 +1,7 @@
 """Images against the float64 reference: errors, flipped pixels, thresholds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 
 from mgs.colour import SH_C0
 from mgs.gaussians import Gaussians
-from mgs.splat import reference, render
+from mgs.splat import fisher, reference, render
 from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
 from .scenes import SIZE, changed, make_camera, make_gaussians, margins, place
@@ -132,3 +134,29 @@ def test_alpha_is_clamped():
     camera = make_camera()
     alpha = np.asarray(render(changed(stack(camera, [0.5]), logit_opacities=[20]), camera).alpha)
     assert alpha[12, 20] == pytest.approx(ALPHA_MAX, abs=1e-6)
+
+
+def test_tiles_are_the_whole_bit_for_bit():
+    """Tiles of no whole blocks, of Gaussians so large that the Jacobian's clamp matters."""
+    camera, g = make_camera((50, 37)), make_gaussians(60, 3, 1, log_scales=(-3.0, 0.5), spread=1.5)
+    whole, truth = render(g, camera, 0.3), reference.render(g, camera, (0.3, 0.3, 0.3))
+    plain, information = 0, np.zeros_like(fisher(g, camera))
+    for top in range(0, 37, 11):
+        for left in range(0, 50, 13):
+            width, height = min(13, 50 - left), min(11, 37 - top)
+            tile = camera.cropped(left, top, width, height)
+            window = slice(top, top + height), slice(left, left + width)
+            drawn = render(g, tile, 0.3)
+            for name in ("rgb", "alpha", "depth"):
+                expected = np.asarray(getattr(whole, name))[window]
+                np.testing.assert_array_equal(np.asarray(getattr(drawn, name)), expected)
+                found = reference.render(g, tile, (0.3, 0.3, 0.3))[name]
+                np.testing.assert_allclose(found, truth[name][window], rtol=0, atol=1e-14)
+            information += fisher(g, tile)
+            half = tile.cropped(0, 0, width, height // 2)
+            rows = np.asarray(drawn.rgb)[: height // 2]
+            np.testing.assert_array_equal(np.asarray(render(g, half, 0.3).rgb), rows)
+            alone = np.asarray(render(g, replace(tile, film=None, corner=(0, 0)), 0.3).rgb)
+            plain += (np.abs(alone - np.asarray(drawn.rgb)) > 1e-3).any(-1).sum()
+    np.testing.assert_allclose(information, fisher(g, camera), rtol=1e-4, atol=1e-6)
+    assert plain > 0.2 * 50 * 37, "a camera that does not know its film draws otherwise"
