@@ -44,6 +44,19 @@ def flag(setting: str) -> str:
     return FLAGS.get(setting) or f"--{setting.replace('_', '-')}"
 
 
+def printable(text: str) -> str:
+    """Text for a terminal, a page or a figure: control characters and half characters, which names
+    of files and frames may have, are escaped."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def printable_lines(text: str) -> str:
+    """Text of several lines, each `printable`."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
 class InputError(ValueError):
     """Bad input. The message is one line: what is wrong, where, and how to correct it.
 
@@ -53,10 +66,8 @@ class InputError(ValueError):
 
     @property
     def line(self) -> str:
-        """The message for the command line. Control characters in names are escaped."""
-        message = str(self.args[0])
-        escaped = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
-        return "".join(escaped)
+        """The message for the command line, `printable`."""
+        return printable(str(self.args[0]))
 
     def __str__(self) -> str:
         return in_python(self.line)

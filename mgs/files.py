@@ -9,11 +9,15 @@ from __future__ import annotations
 import csv
 import fcntl
 import hashlib
+import io
 import json
 import os
+import re
+import secrets
 import shutil
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -31,10 +35,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
     If the block fails, the temporary file is deleted. Missing parent folders are made. Raises
     InputError if the path cannot be written: no permission, a file in place of a folder, a full
-    disk.
+    disk, a device, or a symbolic link on the way (`check_place`).
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    check_place(path)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}-{TOKEN}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
@@ -46,12 +51,52 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+TOKEN = secrets.token_hex(4)
+"""Part of the names of this process's temporary files, so that nobody can put a link there."""
+
+LEFTOVER = re.compile(r"\..*\.(\d+)-[0-9a-f]{8}\.part(\..*)?")
+"""Names of temporary files, with the number of the process."""
+
+
+def check_place(path: Path) -> None:
+    """Raise InputError if writing or removing `path` would leave a folder that this process has
+    locked, through a symbolic link, or would replace a device or a pipe."""
+    path = Path(os.path.abspath(path))
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path}: is a device or a pipe; name a file to write")
+    for root in _held:
+        if root in path.parents:
+            below(root, path.parent.relative_to(root))
+
+
+def below(root: str | Path, *names: str | Path) -> Path:
+    """Path below a folder. Raises InputError if it leads out of it: a symbolic link, or `..`."""
+    path = Path(root)
+    for name in Path(*names).parts:
+        path /= name
+        if name in ("..", os.sep) or path.is_symlink():
+            raise InputError(f"{path}: leads out of {root}; remove the link, or copy what it names")
+    return path
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file, if it exists, from a folder that this process has locked. Raises InputError
+    if it is elsewhere."""
+    check_place(path)
+    if not any(root in Path(os.path.abspath(path)).parents for root in _held):
+        raise InputError(f"{path}: is in another folder, and is not removed; correct its path")
+    path.unlink(missing_ok=True)
+
+
 def remove_leftovers(folder: Path) -> None:
     """Remove the temporary files that ended processes left in a folder and below it."""
-    for left in folder.rglob(".*.[0-9]*.part*"):
-        process = left.name.partition(".part")[0].rpartition(".")[2]
-        if process == str(os.getpid()) or not Path("/proc", process).exists():
-            left.unlink(missing_ok=True)
+    for where, _, names in os.walk(folder):
+        for name in names:
+            named, path = LEFTOVER.fullmatch(name), Path(where, name)
+            if named and not path.is_symlink() and path.is_file():
+                mine = int(named[1]) == os.getpid()
+                if mine or not Path("/proc", named[1]).exists():
+                    path.unlink(missing_ok=True)
 
 
 def not_writable(path: Path, error: Exception) -> InputError:
@@ -68,6 +113,7 @@ def check_writable(path: str | Path) -> Path:
     Makes nothing; commands call it before long work. Raises InputError if it could not be written.
     """
     path = Path(path)
+    check_place(path)
     try:
         there = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
         with TemporaryFile(dir=there if there.is_dir() or there != path else there.parent):
@@ -129,14 +175,19 @@ def fingerprint(path: str | Path) -> dict[str, str]:
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Write data as indented JSON in UTF-8; the file appears complete.
+    """Write data as indented JSON; the file appears complete.
 
     Raises ValueError for NaN and infinities, which JSON cannot express (write None instead), and
     InputError as `atomic_path`.
     """
-    text = json.dumps(data, indent=2, allow_nan=False)
+    write_text(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write text as UTF-8; the file appears complete. Half characters of file names are escaped.
+    Raises InputError as `atomic_path`."""
     with atomic_path(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_bytes(text.encode(errors="backslashreplace"))
 
 
 def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
@@ -146,23 +197,76 @@ def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     InputError as `atomic_path`.
     """
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    file = io.StringIO(newline="")
+    writer = csv.DictWriter(file, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, file.getvalue())
     return Path(path)
+
+
+LARGEST = 1 << 25
+"""Most bytes of a text file that is read whole: 30,000 frames of transforms.json."""
+
+
+def read_bytes(path: str | Path, what: str = "file", most: int = LARGEST) -> bytes:
+    """Contents of a file. Raises InputError if it is missing, unreadable or larger than `most`."""
+    path = Path(path)
+    with reading(path, what):
+        if (size := path.stat().st_size) > most:
+            raise InputError(
+                f"{path}: has {size:,} bytes, and such a file has at most {most:,}; give another"
+            )
+        return path.read_bytes()
+
+
+def read_text(path: str | Path) -> str:
+    """Text of a file in UTF-8; what is not UTF-8 is replaced. Raises InputError as `read_bytes`."""
+    return read_bytes(path).decode("utf-8-sig", errors="replace")
 
 
 def read_json(path: str | Path) -> Any:
     """Contents of a JSON file. Raises InputError if it is missing, unreadable or not valid JSON."""
-    path = Path(path)
-    with reading(path):
-        data = path.read_bytes()
+    return _parsed(path, "JSON", lambda data: json.loads(data.decode(json.detect_encoding(data))))
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Contents of a TOML file. Raises InputError if it is missing, unreadable or not valid TOML."""
+    found: dict[str, Any] = _parsed(path, "TOML", lambda data: tomllib.loads(data.decode()))
+    return found
+
+
+def read_csv(path: str | Path) -> list[tuple[int, list[str]]]:
+    """Rows of a CSV file that are not empty, each after the number of its last line. Raises
+    InputError if it is missing, unreadable or not valid CSV."""
+
+    def rows(data: bytes) -> list[tuple[int, list[str]]]:
+        table = csv.reader(io.StringIO(data.decode("utf-8-sig", errors="replace"), newline=""))
+        return [(table.line_num, row) for row in table if any(cell.strip() for cell in row)]
+
+    found: list[tuple[int, list[str]]] = _parsed(path, "CSV", rows)
+    return found
+
+
+def read_xml(path: str | Path) -> Any:
+    """Root element of an XML file without entities. Raises InputError if it is missing, unreadable
+    or not valid XML."""
+    from defusedxml.ElementTree import fromstring
+
+    return _parsed(path, "XML", fromstring)
+
+
+def _parsed(path: str | Path, kind: str, parse: Callable[[bytes], Any]) -> Any:
+    """Contents of a text file. Raises InputError where `parse` fails on them."""
+    data = read_bytes(path)
     try:
-        return json.loads(data.decode(json.detect_encoding(data)))  # UTF-8, -16 or -32
-    except (ValueError, RecursionError) as error:  # RecursionError: nested too deeply
+        with decoding(Path(path)):
+            return parse(data)
+    except (ValueError, RecursionError, SyntaxError, csv.Error) as error:
+        # RecursionError: nested too deeply; SyntaxError: of XML
+        reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:200]
         raise InputError(
-            f"{path}: not valid JSON ({error}); the file is damaged, write it again"
+            f"{path}: not valid {kind} ({reason}); the file is damaged, write it again"
         ) from None
 
 
@@ -252,6 +356,8 @@ def atomic_folder(path: str | Path, ours: Ours | None = None) -> Iterator[Path]:
     """
     path = check_new_folder(path, ours).resolve()
     temporary, replaced = (path.with_name(f".{path.name}.{end}") for end in ("part", "old"))
+    for each in (temporary, replaced):
+        _check_leftover(each)
     try:
         with folder_locked(temporary):
             try:
@@ -260,6 +366,8 @@ def atomic_folder(path: str | Path, ours: Ours | None = None) -> Iterator[Path]:
                 try:
                     if any(check_new_folder(path, ours).glob("*")):
                         shutil.rmtree(replaced, ignore_errors=True)
+                        if not _is_lock(path / LOCK):
+                            _lock(path / LOCK).close()  # the token of `_check_leftover`
                         os.replace(path, replaced)
                     (path / LOCK).unlink(missing_ok=True)  # of a killed process
                     os.replace(temporary, path)
@@ -273,6 +381,52 @@ def atomic_folder(path: str | Path, ours: Ours | None = None) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.rmdir()
+
+
+def _check_leftover(folder: Path) -> None:
+    """Raise InputError unless a folder is missing or empty, or has a lock file of mgs, as what a
+    killed process left."""
+    if not os.path.lexists(folder):
+        return
+    if not folder.is_symlink() and folder.is_dir():
+        names = [path.name for path in folder.iterdir()]
+        if not names or _is_lock(folder / LOCK, names == [LOCK]):
+            return
+    raise in_the_way(folder)
+
+
+def in_the_way(path: Path) -> InputError:
+    """InputError for a path that mgs needs and did not make."""
+    return InputError(f"{path}: is in the way, and mgs did not make it; move it away")
+
+
+def _is_lock(path: Path, or_empty: bool = False) -> bool:
+    """Whether a path is a lock file of mgs, or an empty file."""
+    if path.is_symlink() or not path.is_file():
+        return False
+    data = path.read_bytes()[: len(MARK) + 20]
+    return data.startswith(MARK.encode()) or (or_empty and not data)
+
+
+@contextmanager
+def scratch_folder(path: str | Path) -> Iterator[Path]:
+    """Context manager: a folder for temporary files, removed after the block with all its contents.
+
+    What a killed process left in it is removed first. Raises InputError if a folder of this name is
+    there that mgs did not make, or that another process uses.
+    """
+    path = Path(path)
+    _check_leftover(path)
+    try:
+        with folder_locked(path):
+            _clear(path)
+            try:
+                yield path
+            finally:
+                _clear(path)
+    finally:
+        with suppress(OSError):
+            path.rmdir()
 
 
 def _clear(folder: Path) -> None:
@@ -311,8 +465,12 @@ def folder_locked(folder: str | Path) -> Iterator[None]:
 LOCK = ".lock"
 """File in a folder that the process that works in it has locked."""
 
+MARK = "mgs "
+"""Start of a lock file, before the number of the process: it proves that mgs made the folder's
+leftovers."""
+
 _held: set[Path] = set()
-"""Locks that this process holds."""
+"""Folders that this process has locked."""
 
 
 @contextmanager
@@ -328,12 +486,13 @@ def locked(folder: str | Path) -> Iterator[None]:
         file = _lock(path)
     except OSError as error:
         raise not_writable(path, error) from None
+    root = Path(os.path.abspath(folder))
     with file:
-        _held.add(path.resolve())
+        _held.add(root)
         try:
             yield
         finally:
-            _held.discard(path.resolve())
+            _held.discard(root)
             with suppress(OSError):
                 path.unlink()
 
@@ -349,7 +508,9 @@ def working_in(folder: str | Path) -> Iterator[None]:
 
 def _lock(path: Path) -> TextIO:
     """Open and lock the file, and write this process's id into it. Raises InputError if another
-    process has locked it."""
+    process has locked it, or if it is no lock file: a link, or a file with other contents."""
+    if os.path.lexists(path) and not _is_lock(path, or_empty=True):
+        raise in_the_way(path)
     while True:  # until the locked file is the one of this name
         with ExitStack() as closed_on_failure:
             file = closed_on_failure.enter_context(open(path, "a+", encoding="ascii"))
@@ -360,7 +521,7 @@ def _lock(path: Path) -> TextIO:
                 ours = False
             if ours:  # else the process that had the lock removed the file after we opened it
                 file.truncate(0)
-                print(os.getpid(), end="", file=file, flush=True)
+                print(f"{MARK}{os.getpid()}", end="", file=file, flush=True)
                 closed_on_failure.pop_all()
                 return file
 
@@ -371,14 +532,15 @@ def _flock(path: Path, file: TextIO) -> None:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         file.seek(0)
+        process = file.read().removeprefix(MARK)
         raise InputError(
-            f"{path.parent}: process {file.read()} works on it; wait until it has ended"
+            f"{path.parent}: process {process} works on it; wait until it has ended"
         ) from None
 
 
 def _check_unlocked(path: Path) -> None:
     """Raise InputError if another process holds a lock, which is not taken."""
-    if path.resolve() in _held:
+    if Path(os.path.abspath(path.parent)) in _held or not _is_lock(path):
         return
     with suppress(OSError), open(path, encoding="ascii") as file:
         _flock(path, file)

@@ -25,7 +25,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from mgs import __version__
-from mgs.errors import InputError, Notice, missing
+from mgs.errors import InputError, Notice, missing, printable
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C: by convention 128 plus the number of the signal, SIGINT."""
@@ -125,7 +125,9 @@ app = typer.Typer(name="mgs", cls=_Program, add_completion=False, pretty_excepti
 def _print_version(wanted: bool) -> None:
     """Callback of --version."""
     if wanted:
-        typer.echo(f"mgs {__version__}")
+        from mgs.cli.terminal import echo
+
+        echo(f"mgs {__version__}")
         raise typer.Exit
 
 
@@ -193,7 +195,7 @@ def _import_help() -> None:
 
 def _print_warning(message: Any, category: type, filename: str, line: int, *_: Any) -> None:
     """Print a Notice as one line of ours, other warnings as Python does."""
-    text = f"mgs: {message}\n" if category is Notice else None
+    text = f"mgs: {printable(str(message))}\n" if category is Notice else None
     sys.stderr.write(text or warnings.formatwarning(message, category, filename, line))
 
 
@@ -232,5 +234,5 @@ def _system_error(error: OSError) -> str:
 
 def _stop(message: str, code: int) -> SystemExit:
     """Print one line to standard error; return the exception that ends the process."""
-    print(f"mgs: {message}", file=sys.stderr)
+    print(f"mgs: {printable(message)}", file=sys.stderr)
     return SystemExit(code)

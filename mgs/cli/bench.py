@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from rich.console import Console
 from rich.table import Table
 
 from mgs import runtime
 from mgs.cli.options import Force, option
+from mgs.cli.terminal import Terminal
 from mgs.files import check_new_file, write_json
 from mgs.provenance import command_line, versions
 
@@ -32,7 +32,7 @@ def bench(
     runtime.start()
     from mgs.bench import bench_splat
 
-    console = Console()
+    console = Terminal()
 
     def report(what: str) -> None:  # no spinner: its thread would be timed too
         console.print(f"timing {what}", style="dim")

@@ -6,10 +6,9 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from rich.console import Console
-
 from mgs.cli.options import argument, option
 from mgs.cli.progress import progress_bar
+from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import working_in
 
@@ -45,7 +44,7 @@ def _make_masks(path: Path, prior: Path) -> None:
     from mgs.prior.build import load_prior
 
     loaded, known = load_dataset(path), load_prior(prior)
-    console = Console()
+    console = Terminal()
     with working_in(path), progress_bar("masks", console) as progress:
         made = make_masks(loaded, known.mesh, partial(progress, "masks"))
     console.print(
@@ -58,7 +57,7 @@ def _check(path: Path) -> None:
     from mgs.data.dataset import load_dataset
 
     loaded = load_dataset(path)
-    console = Console()
+    console = Terminal()
     with progress_bar("reading", console) as progress:
         check = check_dataset(loaded, partial(progress, "reading"))
     camera, (low, high) = loaded.frames[0].camera, check.depth_range

@@ -10,8 +10,6 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from rich.console import Console
-
 from mgs import runtime
 from mgs.cli.models import diagnose
 from mgs.cli.nbv import resume_and_print, start_and_print
@@ -20,6 +18,7 @@ from mgs.cli.printing import print_quality
 from mgs.cli.prior import prior
 from mgs.cli.progress import progress_bar
 from mgs.cli.synth_orbit import synth_orbit
+from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import check_new_folder, check_writable, read_json
 
@@ -59,7 +58,7 @@ def demo(
     from mgs.run.folder import open_run
 
     runtime.start()
-    console, started = Console(highlight=False), time.monotonic()
+    console, started = Terminal(), time.monotonic()
     dataset, folder, report = out / "dataset", out / "prior", out / "report"
     runs = [out / policy for policy in POLICIES]
     check_writable(out)
@@ -100,7 +99,7 @@ def demo(
         console.print(f"  {picture}", soft_wrap=True)
 
 
-def completed(runs: list[Run], console: Console) -> Iterator[Run]:
+def completed(runs: list[Run], console: Terminal) -> Iterator[Run]:
     """Complete runs, as many at once as there are cores, each in a process; yield them in order.
 
     The last ones, fewer than the cores, have several threads each. Raises InputError as

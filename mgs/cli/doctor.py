@@ -8,11 +8,10 @@ import platform
 from importlib.util import find_spec
 
 import typer
-from rich.console import Console
 from rich.table import Table
-from rich.text import Text
 
 from mgs import runtime
+from mgs.cli.terminal import Terminal
 from mgs.errors import EXTRAS, InputError
 from mgs.resources import resource_folder
 
@@ -32,8 +31,8 @@ def doctor() -> None:
     rows = _software() + _machine() + _resources()
     table = Table(show_header=False, box=None, pad_edge=False)
     for name, value, problem in rows:
-        table.add_row(Text(name), Text(value), style="red" if problem else None)
-    console = Console(highlight=False)
+        table.add_row(name, value, style="red" if problem else None)
+    console = Terminal()
     console.print(table)
     problems = [problem for *_, problem in rows if problem]
     for problem in problems:

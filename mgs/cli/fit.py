@@ -56,11 +56,10 @@ def fit(
     views are never fitted. The output is a run folder like that of `mgs nbv`, so all commands for
     runs accept it.
     """
-    from rich.console import Console
-
+    from mgs.cli.terminal import Terminal
     from mgs.run.nbv import start_fit
 
-    console = Console(highlight=False)
+    console = Terminal()
     given = {name: options[name] for name in options if options[name] not in (None, [])}
     asked = {"prior": prior, "gaussians": parse_gaussians(gaussians), "force": force}
     run = start_and_print(dataset, out, console, start_fit, **asked, **settings_of(given))

@@ -9,10 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from rich.console import Console
-
 from mgs.cli.options import Force, argument, option, parse_up
 from mgs.cli.progress import progress_bar
+from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import Ours, clear_folder
 
@@ -94,7 +93,7 @@ def import_data(
     from mgs.data.sources import read_source
     from mgs.images import exif_exposure
 
-    console, notes = Console(), Console(stderr=True)
+    console, notes = Terminal(), Terminal(stderr=True)
     if masks is not None and mesh is not None:
         raise InputError(
             "import: --masks and --mesh both say where masks come from; give one of them"

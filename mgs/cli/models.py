@@ -6,15 +6,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-from rich.console import Console
-
 from mgs import runtime
 from mgs.cli.options import Force, Runs, argument, option
 from mgs.cli.printing import print_quality
 from mgs.cli.progress import progress_bar
+from mgs.cli.terminal import Terminal, echo
 from mgs.errors import InputError
-from mgs.files import check_new_file, folder_locked, working_in
+from mgs.files import below, check_new_file, folder_locked, working_in
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
 
 if TYPE_CHECKING:
@@ -73,7 +71,7 @@ def evaluate(
                     metrics = measured(path, dataset, progress=progress)
                     rows.append(metrics_row(name, metrics))
                     said.append(f"wrote {path.with_suffix('.metrics.json')}")
-    print_quality(Console(), rows)
+    print_quality(Terminal(), rows)
     _print(said)
 
 
@@ -136,7 +134,7 @@ def diagnose(
         raise InputError(
             f"--views {views!r}: names no frame; give some, as in kf_0003,kf_0010, or leave it out"
         )
-    folders = [open_run(run).folder / "diagnostics" for run in runs]
+    folders = [below(open_run(run).folder, "diagnostics") for run in runs]
     for folder in folders:
         check_new_file(folder / ("uncertainty.json" if calibrate else "information.ply"), force)
     runtime.start()
@@ -149,7 +147,7 @@ def diagnose(
             else:
                 written = diagnose_run(run, wanted, partial(bar, "mapping"))
         for path in written:
-            typer.echo(f"wrote {path}")
+            echo(f"wrote {path}")
 
 
 def prune(
@@ -252,4 +250,4 @@ def _refitted(found: RefittedRun) -> list[str]:
 
 def _print(lines: list[str]) -> None:
     for line in lines:
-        Console(highlight=False).print(line, soft_wrap=True)
+        Terminal().print(line, soft_wrap=True)

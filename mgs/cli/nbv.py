@@ -17,8 +17,7 @@ from mgs.policy.registry import policy_names
 from mgs.run.settings import PRESETS, NbvSettings, settings_in
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
+    from mgs.cli.terminal import Terminal
     from mgs.run.folder import Run
     from mgs.run.live import Live
     from mgs.run.state import State
@@ -151,15 +150,14 @@ def nbv(
     config.json, steps.jsonl (a line for each view), checkpoint.npz, gaussians.ply and metrics.json
     into the run folder. An interrupted run continues with --resume and chooses the same views.
     """
-    from rich.console import Console
-
     from mgs.cli.options import parse_gaussians
+    from mgs.cli.terminal import Terminal
     from mgs.errors import InputError
     from mgs.run.folder import open_run
 
     if tensorboard:
         import tensorboardX  # noqa: F401  # its absence is known before the work
-    console = Console(highlight=False)
+    console = Terminal()
     given = {name: options[name] for name in options if options[name] not in (None, [])}
     live = live_capture(
         capture_command,
@@ -201,11 +199,12 @@ def nbv(
 
 def _logged(run: Run, wanted: bool) -> Callable[[State], None]:
     """Callback that logs steps to RUN/tensorboard, or does nothing."""
+    from mgs.files import below
     from mgs.run import tensorboard
 
     if not wanted:
         return lambda state: None
-    return tensorboard.tensorboard(run.folder / "tensorboard", run.dataset)
+    return tensorboard.tensorboard(below(run.folder, "tensorboard"), run.dataset)
 
 
 def live_capture(
@@ -311,7 +310,7 @@ def pairs(name: str, given: list[str]) -> dict[str, float]:
 def start_and_print(
     dataset: Path | None,
     out: Path,
-    console: Console,
+    console: Terminal,
     start: Callable[..., Run] | None = None,
     **settings: Any,
 ) -> Run:
@@ -334,7 +333,7 @@ def start_and_print(
 
 def resume_and_print(
     run: Path | Run,
-    console: Console,
+    console: Terminal,
     policy: str | None = None,
     pictures: bool = False,
     live: Live | None = None,

@@ -8,11 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
-
 from mgs import runtime
 from mgs.cli.options import Force, argument, option
 from mgs.cli.progress import progress_bar
+from mgs.cli.terminal import echo
 from mgs.errors import InputError
 from mgs.files import check_new_folder, folder_locked
 
@@ -101,7 +100,7 @@ def render(
         draw_views(out, gaussians, views, background, exr, progress)
     colours = "linear RGB" if gaussians.linear else "sRGB"
     what = f"{len(gaussians):,} Gaussians (SH degree {gaussians.sh_degree}, colours in {colours})"
-    typer.echo(f"wrote {len(views)} views of {what} to {out}")
+    echo(f"wrote {len(views)} views of {what} to {out}")
 
 
 def view(
@@ -132,10 +131,10 @@ def view(
     try:
         token = viewer.access.token
         if token:
-            typer.echo(f"--host {host}: anyone who has the address below, with its token, can look")
+            echo(f"--host {host}: anyone who has the address below, with its token, can look")
         shown = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         query = f"/?token={token}" if token else ""
-        typer.echo(f"open http://{shown}:{viewer.port}{query} in a browser; Ctrl-C ends it")
+        echo(f"open http://{shown}:{viewer.port}{query} in a browser; Ctrl-C ends it")
         while True:
             viewer.tick()
             time.sleep(0.05)

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich import box
-from rich.console import Console
 from rich.table import Column, Table
-from rich.text import Text
+
+from mgs.cli.terminal import Terminal
 
 if TYPE_CHECKING:
     from mgs.run.state import State
@@ -41,13 +41,13 @@ MEASURED = {
 """Metrics of steps.jsonl -> headings; a table of steps shows the first two that there are."""
 
 
-def fits(console: Console, table: Table) -> bool:
+def fits(console: Terminal, table: Table) -> bool:
     """Whether a table fits the width of the console without breaking a cell."""
     unlimited = console.options.update(max_width=1 << 16)
     return console.measure(table, options=unlimited).maximum <= console.width
 
 
-def print_quality(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
+def print_quality(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print the rows of `mgs.report.tables.comparison_rows` as a table, for 80 columns.
 
     Names that do not fit beside the numbers are printed below, by the number of their row.
@@ -60,7 +60,7 @@ def print_quality(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
     numbers = [str(number) for number in range(1, len(rows) + 1)]
     console.print(_quality("run", numbers, rows))
     for number, name in zip(numbers, names, strict=True):
-        console.print(Text(f"{number}: {name}"), soft_wrap=True)
+        console.print(f"{number}: {name}", soft_wrap=True)
 
 
 def _quality(heading: str, first: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> Table:
@@ -76,7 +76,7 @@ def _quality(heading: str, first: Sequence[str], rows: Sequence[Mapping[str, Any
     for key in keys:
         table.add_column(_heading(key, new), justify="right", no_wrap=True)
     for name, row in zip(first, rows, strict=True):
-        table.add_row(Text(name), *(table_cell(key, row.get(key)) for key in keys))
+        table.add_row(name, *(table_cell(key, row.get(key)) for key in keys))
     return table
 
 
@@ -90,7 +90,7 @@ def _heading(key: str, new: bool) -> str:
     return ("masked\n" if mask else "") + f"{name.upper()}\n{group}"
 
 
-def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console) -> None:
+def print_run(out: Path, state: State, metrics: dict[str, Any], console: Terminal) -> None:
     """Print the steps of a run as a table, on a terminal only, then the quality of its model."""
     from mgs.run.ending import RunEnd, fit_line, why_ended
 
@@ -106,7 +106,7 @@ def print_run(out: Path, state: State, metrics: dict[str, Any], console: Console
     console.print(f"wrote {out}", soft_wrap=True)
 
 
-def _print_steps(steps: Sequence[Mapping[str, Any]], console: Console) -> None:
+def _print_steps(steps: Sequence[Mapping[str, Any]], console: Terminal) -> None:
     """Print the steps of a run as a table. Names that are too wide have a table of their own."""
     measured = _measured(steps)
     fitted = [MEASURED[key] for key in measured] or ["loss", "stopped"]
@@ -128,7 +128,7 @@ def _print_steps(steps: Sequence[Mapping[str, Any]], console: Console) -> None:
         headings = (Column(columns[i], no_wrap=i != 1, overflow="fold") for i in shown)
         made = Table(*headings, box=None)
         for row in rows:
-            made.add_row(*(Text(row[i]) for i in shown))
+            made.add_row(*(row[i] for i in shown))
         return made
 
     whole = table(*range(len(columns)))

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from mgs.cli.options import DatasetFolder, Force, Seed, option, parse_gaussians, parse_up
 from mgs.cli.progress import progress_bar
+from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
-from mgs.files import Ours, atomic_folder
+from mgs.files import Ours, atomic_folder, below
 
 if TYPE_CHECKING:
     from mgs.data.dataset import Dataset
@@ -105,14 +105,14 @@ def prior(
     from mgs.prior.photographs import source_of
     from mgs.prior.settings import PriorSettings
 
-    console = Console()
+    console = Terminal()
     axis = None if up is None else parse_up(up)
     if mesh is not None and (source not in (None, "mesh") or points is not None):
         raise InputError(
             "prior: --mesh gives the surface, and --from or --points build one; give one of them"
         )
     loaded = load_dataset(dataset)
-    folder = out if out is not None else dataset / "prior"
+    folder = out if out is not None else below(dataset, "prior")
     number = parse_gaussians(gaussians)
     settings = PriorSettings(number, spacing, poisson_depth, prior_noise, holes, seed, backing)
     # The folder is checked and locked before the work.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -14,6 +13,8 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
+
+from mgs.cli.terminal import Terminal
 
 
 class ProgressBar:
@@ -43,8 +44,9 @@ class ProgressBar:
         self._bar.console.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
+
 @contextmanager
-def progress_bar(stage: str = "reading", console: Console | None = None) -> Iterator[ProgressBar]:
+def progress_bar(stage: str = "reading", console: Terminal | None = None) -> Iterator[ProgressBar]:
     """Show progress while the context is open, on a terminal or in a notebook; nothing of it stays.
 
     The object it yields is called as progress(stage, done, total). For a function that reports
@@ -56,7 +58,7 @@ def progress_bar(stage: str = "reading", console: Console | None = None) -> Iter
         MofNCompleteColumn(),
         TimeElapsedColumn(),
     )
-    console = console or Console()
+    console = console or Terminal()
     off = not (console.is_terminal or console.is_jupyter)  # it would leave an empty line
     with Progress(*columns, console=console, transient=True, disable=off) as bar:
         yield ProgressBar(bar, stage)

@@ -6,13 +6,11 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import typer
-from rich.console import Console
-
 from mgs import runtime
 from mgs.cli.options import Force, argument, option
 from mgs.cli.printing import print_quality
 from mgs.cli.progress import progress_bar
+from mgs.cli.terminal import Terminal, echo
 from mgs.errors import InputError
 from mgs.files import check_new_file, folder_locked
 
@@ -71,18 +69,16 @@ def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
     with folder_locked(out):
         written = write_report(out, compared, kind)
     rows = comparison_rows(compared)
-    print_quality(Console(), rows)
+    print_quality(Terminal(), rows)
     for row, run in zip(rows, compared.runs.values(), strict=True):
         if run.settings["budget"]:
             path = f"a path of {row['path']:.2f} {row['unit']}"
-            typer.echo(f"{row['policy']}: {path}; the run has ended: {why_ended(run.ended or {})}")
+            echo(f"{row['policy']}: {path}; the run has ended: {why_ended(run.ended or {})}")
     for file in written:
-        typer.echo(f"wrote {file}")
+        echo(f"wrote {file}")
     chosen = any(run.settings["budget"] for run in compared.runs.values())
     if chosen and not any(file.stem == "psnr" for file in written):
-        typer.echo(
-            "PSNR against images is left out: make all runs with --evaluate-every to have it"
-        )
+        echo("PSNR against images is left out: make all runs with --evaluate-every to have it")
 
 
 def _write_page(runs: list[Path], html: Path) -> None:
@@ -92,4 +88,4 @@ def _write_page(runs: list[Path], html: Path) -> None:
     runtime.start()
     with progress_bar() as bar:
         size = write_page(html, runs, progress=partial(bar, "drawing"))
-    typer.echo(f"wrote {html} ({size / 1e6:.1f} MB)")
+    echo(f"wrote {html} ({size / 1e6:.1f} MB)")

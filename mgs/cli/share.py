@@ -6,10 +6,9 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
-
 from mgs.cli.options import Force, Runs, argument, option
 from mgs.cli.progress import progress_bar
+from mgs.cli.terminal import echo
 from mgs.errors import InputError
 from mgs.files import check_new_file
 
@@ -56,7 +55,7 @@ def export(
         shown = in_srgb(found.gaussians) if colour_space == "srgb" else found.gaussians
         write_gaussians(path, shown, to, to_y_up(found.up))
         megabytes = path.stat().st_size / 1e6
-        typer.echo(f"wrote {len(shown):,} Gaussians to {path} ({megabytes:.1f} MB)")
+        echo(f"wrote {len(shown):,} Gaussians to {path} ({megabytes:.1f} MB)")
 
 
 def _targets(
@@ -138,4 +137,4 @@ def video(
             lengths = [each] * (count - 1) + [3 * each if story else each]
             write_film(target, frames, lengths, partial(bar.whole, "frames"))
         size = target.stat().st_size / 1e6
-        typer.echo(f"wrote {count} frames to {target} ({size:.1f} MB)")
+        echo(f"wrote {count} frames to {target} ({size:.1f} MB)")

@@ -7,11 +7,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from rich.console import Console
 from rich.table import Table
 
 from mgs import runtime
 from mgs.cli.options import argument, option, parse_gaussians
+from mgs.cli.terminal import Terminal
 from mgs.errors import InputError, row_named
 from mgs.files import check_new_folder, check_writable, folder_locked, read_json, write_json
 from mgs.provenance import command_line
@@ -28,14 +28,14 @@ Workers = Annotated[int, option("Worker processes, which share the cores.", min=
 @contextmanager
 def _study(
     out: Path, sizes: Mapping[str, Size], preset: str
-) -> Iterator[tuple[Size, Console, Report]]:
+) -> Iterator[tuple[Size, Terminal, Report]]:
     """Context of every study: locks its folder and records its scale; gives the size, a console,
     and the callback that prints each cell that begins.
 
     Raises InputError for an unknown scale, and if the folder is of another scale, holds something
     else, cannot be written or is in use.
     """
-    size, console = row_named(sizes, preset, "--scale"), Console(highlight=False)
+    size, console = row_named(sizes, preset, "--scale"), Terminal()
     record = check_writable(out) / "study.json"
 
     def report(cell: str, done: int, total: int) -> None:
@@ -247,7 +247,7 @@ def chart(
         _print_claims(console, claims)
 
 
-def _print_claims(console: Console, claims: list[dict[str, Any]]) -> None:
+def _print_claims(console: Terminal, claims: list[dict[str, Any]]) -> None:
     from mgs.study.verdict import effect
 
     for one in claims:

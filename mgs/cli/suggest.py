@@ -8,13 +8,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
-from rich.console import Console
 from rich.table import Table
 
 from mgs import runtime
 from mgs.cli.nbv import PANELS, with_settings_as_options
 from mgs.cli.options import Force, argument, option, parse_gaussians
 from mgs.cli.progress import progress_bar
+from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
 
@@ -97,7 +97,7 @@ def suggest(
     """
     from mgs.data.flight_plan import check_plan_path, parse_origin
 
-    console = Console(highlight=False)
+    console = Terminal()
     place = parse_origin(origin) if origin else None
     for path in plan or ():
         check_plan_path(path)
@@ -270,7 +270,7 @@ def _write_plan(path: Path, run: Run, found: Suggestion, place: Any, settings: A
     write_flight_plan(path, stops, place, hover, speed)
 
 
-def _print(console: Console, found: Suggestion, views: int, run: Run, crossed: str) -> None:
+def _print(console: Terminal, found: Suggestion, views: int, run: Run, crossed: str) -> None:
     """Print what was dropped, the views as a table, and the flight."""
     from mgs.policy.criteria import GAIN_UNIT
 

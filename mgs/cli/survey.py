@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from rich.console import Console
 from rich.table import Table
 
 from mgs.cli.options import Force, Seed, argument, option
 from mgs.cli.progress import progress_bar
-from mgs.files import Ours, atomic_folder
+from mgs.cli.terminal import Terminal
+from mgs.files import Ours, atomic_folder, below
 
 FILES = [
     *("survey.json", "cloud.ply", "survey.png", "transforms.json", "rock.glb"),
@@ -53,9 +53,9 @@ def survey(
     from mgs.survey.folder import save_survey
     from mgs.synth.scene_file import sensor_of
 
-    console = Console()
+    console = Terminal()
     frames = load_dataset(dataset)
-    folder = out if out is not None else dataset / "survey"
+    folder = out if out is not None else below(dataset, "survey")
     sensor = sensor_of(dataset)
     noise = sensor.noise if sensor_noise is None else sensor_noise
     drift = sensor.drift if drift is None else drift

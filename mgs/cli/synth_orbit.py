@@ -9,12 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from rich.console import Console
-
 from mgs import runtime
 from mgs.camera import MAX_PIXELS
 from mgs.cli.options import Force, Seed, argument, option
 from mgs.cli.progress import progress_bar
+from mgs.cli.terminal import Terminal
 from mgs.errors import InputError, row_named
 from mgs.files import Ours, clear_folder
 from mgs.synth.scene_file import ORBITS, load_scene_file
@@ -112,7 +111,7 @@ def synth_orbit(
     views = f"{images.frames} frames" + (", none rendered" if on_demand else "")
     views += f" and {test_views} test views" if test_views else ""
     stage = f"{views}, {images.width}x{images.height}"
-    console = Console()
+    console = Terminal()
     if force:
         clear_folder(out, Ours(FILES, [path for path in (mesh, Path(scene)) if path]))
     with progress_bar(stage, console) as progress:

@@ -16,7 +16,7 @@ from mgs.camera import Camera, opencv_from_opengl, opengl_from_opencv
 from mgs.data.frames import SURVEY_FOLDER, Frame, as_asked, as_captured
 from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.errors import InputError
-from mgs.files import THERE, check_new_folder, read_json, write_json
+from mgs.files import THERE, check_new_folder, read_json, remove_leftovers, write_json
 from mgs.memory import padded
 from mgs.notebook import html, thumbnails
 
@@ -302,8 +302,7 @@ def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
     finished if it has a transforms.json. Temporary files of a killed process are removed. Raises
     InputError if `out` holds anything else.
     """
-    for left in out.glob(f".{Path(record).stem}.*.part{Path(record).suffix}"):
-        left.unlink()  # of a process killed while writing the record
+    remove_leftovers(out)
     if not (out / record).is_file():
         check_new_folder(out)
         return False
@@ -311,8 +310,6 @@ def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
     if not isinstance(found, dict) or any(found.get(key) != asked[key] for key in asked):
         state = "a finished" if (out / "transforms.json").is_file() else "an unfinished"
         raise InputError(f"{out}: {state} dataset of other settings or sources {THERE}")
-    for left in out.rglob(".*.part*"):  # none is of a running process: the lock is held
-        left.unlink()
     return True
 
 

@@ -21,7 +21,7 @@ from mgs.data.rock_image import premultiplied, write_rock_image
 from mgs.data.sources import Shot, Source, find_image
 from mgs.data.up import PLUS_Z, Up
 from mgs.errors import InputError
-from mgs.files import copy_file, fingerprint, folder_locked, write_json
+from mgs.files import copy_file, fingerprint, folder_locked, remove_file, write_json
 from mgs.images import read_exr, read_mask, read_rgba, read_values, write_exr, write_png
 
 RECORD = "import.json"
@@ -162,10 +162,10 @@ def import_shot(
         begin()
         if depth_path is not None and depth is not None:
             write_exr(depth_path, {"Z": undo(depth, False)})
-        mask_path.unlink(missing_ok=True)
+        remove_file(mask_path)
         if mask is not None:
             write_png(mask_path, mask)
-        rock_path.unlink(missing_ok=True)
+        remove_file(rock_path)
         if rock is not None:
             write_rock_image(rock_path, rock)
         if _is_plain_png(shot.image, camera) and not shot.distortion.any():

@@ -24,7 +24,7 @@ from mgs.data.importers import import_shot, silhouette_of
 from mgs.data.sources import Shot, record_camera
 from mgs.data.up import levelled
 from mgs.errors import InputError, Notice
-from mgs.files import read_json, write_json
+from mgs.files import below, read_json, remove_file, write_json
 from mgs.prior.build import Prior
 from mgs.run.transports import Transport, answers, picture
 
@@ -108,7 +108,7 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
                 f"{dataset.root}: frame {frame.name} has no image; "
                 "give --capture-command or --capture-folder"
             )
-        folder, reason = live.folder or dataset.root / "flight", ""
+        folder, reason = live.folder or below(dataset.root, "flight"), ""
         for attempt in range(1, live.tries + 1):
             pose, out = ask(folder, frame, dataset, attempt)
             try:
@@ -207,7 +207,7 @@ def _commit(
     silhouette: Callable[[], Callable[[Camera], np.ndarray]],
 ) -> Frame:
     """Import a picture into the dataset, check it, and write its record."""
-    frame.image_path.unlink(missing_ok=True)  # of a picture that was refused or interrupted
+    remove_file(frame.image_path)  # of a picture that was refused or interrupted
     made = import_shot(shot, root, None if shot.mask else silhouette(), 1, lambda: None)
     if made.mask_path is None:
         raise InputError(f"{shot.mask}: is no mask")

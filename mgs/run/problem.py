@@ -15,6 +15,7 @@ from mgs.data.dataset import Dataset, target_of
 from mgs.data.frames import Frame, as_asked, capture_record
 from mgs.data.up import PLUS_Z, Up, upright
 from mgs.errors import InputError
+from mgs.files import remove_file
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, VIEW_BYTES, Deferred, kept_within
 from mgs.policy import criteria, poses, tour
@@ -284,7 +285,7 @@ class Problem:
         """Make candidates again of the frames that were given up."""
         for i, frame in enumerate(self.frames):
             if frame.given_up:
-                capture_record(frame).unlink()
+                remove_file(capture_record(frame))
                 self.frames[i] = replace(frame, given_up=False)
 
     def make_seeds(self) -> None:
