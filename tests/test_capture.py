@@ -284,7 +284,7 @@ def test_one_command_does_all_of_it(small, tmp_path, capsys):
     assert "test views (1)" in said
     assert "training views (4)" in said
     assert "held" not in said
-    leftover = run / f"dataset/images/.kf_0009.{2**30}.part.png"  # no process has this id
+    leftover = run / f"dataset/images/.kf_0009.{2**30}-01234567.part.png"  # no process has this id
     leftover.write_bytes(b"left by a kill")
     command("nbv", "--resume", run)
     assert not leftover.exists()

@@ -19,6 +19,7 @@ from mgs.colour import linear_from_srgb
 from mgs.data.meshes import load_mesh
 from mgs.errors import InputError
 from mgs.files import (
+    TOKEN,
     atomic_folder,
     atomic_path,
     copy_file,
@@ -64,7 +65,7 @@ WRITERS = {
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_full_disk_is_one_line(tmp_path, name):
     stem, suffix = name.split(".")
-    (tmp_path / f".{stem}.{os.getpid()}.part.{suffix}").symlink_to("/dev/full")
+    (tmp_path / f".{stem}.{os.getpid()}-{TOKEN}.part.{suffix}").symlink_to("/dev/full")
     with pytest.raises(InputError, match="No space left"):
         WRITERS[name](tmp_path / name)
     assert not list(tmp_path.iterdir())
@@ -142,10 +143,11 @@ def test_a_folder_that_fails_leaves_all_as_it_was(tmp_path, there):
 def test_what_ended_processes_left_in_a_folder_is_removed(tmp_path):
     """But nothing of a process that runs, and nothing of the user."""
     (tmp_path / "renders").mkdir()
-    ended = [f".a.{process}.part.ply" for process in (os.getpid(), 2**30)]
-    kept = {".a.1.part.ply", ".a.part", "a.1.part"}
-    for name in [*ended, *kept]:
+    ended = [f".a.{process}-{TOKEN}.part.ply" for process in (os.getpid(), 2**30)]
+    kept = {f".a.1-{TOKEN}.part.ply", ".a.part", f".a.{2**30}.part.ply", f".b.{2**30}-{TOKEN}.part"}
+    for name in [*ended, *sorted(kept)[:-1]]:
         (tmp_path / "renders" / name).touch()
+    (tmp_path / "renders" / max(kept)).mkdir()
     with working_in(tmp_path):
         assert {path.name for path in (tmp_path / "renders").iterdir()} == kept
 
@@ -153,8 +155,8 @@ def test_what_ended_processes_left_in_a_folder_is_removed(tmp_path):
 def test_what_a_killed_process_left_of_an_atomic_folder_is_removed(tmp_path):
     for name in (".out.part/images", ".other.part", "out"):
         (tmp_path / name).mkdir(parents=True)
-    (tmp_path / ".out.part/.lock").touch()
-    (tmp_path / "out/.lock").touch()
+    for name in (".out.part", "out"):
+        (tmp_path / name / ".lock").write_text("mgs 1")
     with atomic_folder(tmp_path / "out") as made:
         (made / "file").touch()
     assert {path.name for path in tmp_path.iterdir()} == {"out", ".other.part"}
@@ -293,7 +295,7 @@ def test_one_process_at_a_time_works_on_a_folder(tmp_path, end):
             process.send_signal(signal.SIGKILL)
     assert [path.name for path in tmp_path.iterdir()] == ([".lock"] if end == "killed" else [])
     with locked(tmp_path):
-        assert (tmp_path / ".lock").read_text() == str(os.getpid())
+        assert (tmp_path / ".lock").read_text() == f"mgs {os.getpid()}"
     assert not list(tmp_path.iterdir())
 
 

@@ -339,7 +339,7 @@ def test_two_commands_on_one_run(capsys, stranger, monkeypatch):
     monkeypatch.setattr("mgs.report.runs.compare_runs", lambda runs: runs)
     for name, place in PLACES.items():
         with folder_locked(stranger / place):
-            (stranger / ".checkpoint.1.part.npz").write_bytes(b"half")
+            (stranger / ".checkpoint.1073741824-01234567.part.npz").write_bytes(b"half")
             given = ["--out", stranger / place] if name == "report" else []
             line = refused(capsys, [name, stranger, *given], stranger)
             assert f"process {os.getpid()} works on it" in line

@@ -59,7 +59,7 @@ def test_ended_in_the_middle_and_given_again(many, tmp_path, monkeypatch, end, c
     assert process.returncode == code, process.stderr
     assert not (out / "transforms.json").exists()
     assert len(list((out / "images").iterdir())) == 3
-    (out / "images/.kf_0003.1.part.png").touch()  # as a kill in the middle of writing leaves it
+    (out / "images/.kf_0003.1073741824-01234567.part.png").touch()  # of a killed process
     kept = {path: path.stat().st_mtime_ns for path in (out / "images").glob("kf_*")}
 
     read, load = [], importers.read_rgba
@@ -107,6 +107,6 @@ def test_a_frame_whose_files_changed_is_made_again(source, many, tmp_path, capsy
 
 def test_killed_before_the_first_frame(many, tmp_path):
     (tmp_path / "out").mkdir()
-    (tmp_path / "out/.import.1.part.json").touch()
+    (tmp_path / "out/.import.1073741824-01234567.part.json").touch()
     command(*many, tmp_path / "out")
     assert not list((tmp_path / "out").glob(".*"))

@@ -80,7 +80,7 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise_and_test_views(dataset, 
         assert not (out / unwritten).exists()
     written = {path: path.stat().st_mtime_ns for path in out.rglob("*_0*.*")}
     assert len(written) == 4 * 7
-    left = out / "images/.kf_0003.1.part.png"
+    left = out / "images/.kf_0003.1073741824-01234567.part.png"
     left.touch()
     with locked(out), pytest.raises(InputError, match="works on it"):
         synthesise(out, **made)

@@ -13,6 +13,7 @@ import typer
 from mgs.cli.options import argument, option
 from mgs.errors import FLAGS, flag
 from mgs.fit.settings import TrainSettings
+from mgs.policy.from_file import in_file
 from mgs.policy.registry import policy_names
 from mgs.run.settings import PRESETS, NbvSettings, settings_in
 
@@ -173,6 +174,9 @@ def nbv(
         resume_and_print(resume, console, given.get("policy"), live=live, on_state=logged)
         return
     settings: dict[str, Any] = settings_in(config) if config else {}
+    own = settings.get("policy", "")
+    if in_file(own) and "policy" not in given:
+        raise InputError(f"{config}: its policy is a program, {own}; to run it, add --policy {own}")
     dataset = dataset or (None if capture else settings.get("dataset"))
     if gaussians is None:
         prior = prior or settings.get("prior")

@@ -108,7 +108,7 @@ def load(name: str) -> Policy:
         )
     try:
         module = _executed(path, path.read_bytes())
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(f"--policy {name}: {_failed(path, error)}") from error
     wanted = name.rpartition(":")[2]
     function = getattr(module, wanted, None)
@@ -157,7 +157,7 @@ def by_parameter_name(name: str, function: Callable[..., Any], path: Path | None
             ]
         except InputError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             if path is None:
                 raise
             raise InputError(f"--policy {name}: {_failed(path, error)}") from error
@@ -165,7 +165,7 @@ def by_parameter_name(name: str, function: Callable[..., Any], path: Path | None
     return policy
 
 
-def _failed(path: Path, error: Exception) -> str:
+def _failed(path: Path, error: BaseException) -> str:
     """Message for an exception of a user's file: the last line of that file in the traceback."""
     if isinstance(error, SyntaxError):
         line, message = error.lineno, error.msg

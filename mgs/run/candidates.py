@@ -5,7 +5,6 @@ A candidate needs no image. Positions are in the world of the dataset, metres.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from mgs.data.dataset import load_cameras
 from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.up import upright
 from mgs.errors import InputError
-from mgs.files import reading
+from mgs.files import read_csv
 from mgs.prior.build import Prior
 from mgs.rotation import rotmat_from_quat
 from mgs.synth.orbit import orbit_positions
@@ -81,10 +80,8 @@ def read_poses(path: str | Path, site: Site) -> list[Named]:
 
 
 def _read_csv(path: Path, site: Site) -> list[Named]:
-    with reading(path), open(path, newline="", encoding="utf-8-sig", errors="replace") as file:
-        table = csv.reader(file)
-        columns = [name.strip().lower() for name in next(table, [])]
-        lines = [(table.line_num, row) for row in table if any(cell.strip() for cell in row)]
+    (_, first), *lines = read_csv(path) or [(0, [])]
+    columns = [name.strip().lower() for name in first]
     unknown = [name for name in columns if name not in COLUMNS]
     known = ", ".join(COLUMNS)
     if unknown or not columns:

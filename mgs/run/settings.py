@@ -5,7 +5,6 @@ The docstring of a field is the help of its option of `mgs nbv`. Needs neither M
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mgs.errors import InputError, flag, row_named
-from mgs.files import read_json, reading
+from mgs.files import read_json, read_toml
 from mgs.fit.settings import (
     ALPHA_WEIGHT,
     MEAN_RATE,
@@ -167,12 +166,7 @@ def settings_in(file: Path) -> dict[str, Any]:
         config = read_json(file)
         found = config.get("settings") if isinstance(config, dict) else None
     else:
-        with reading(file):
-            data = file.read_bytes()
-        try:
-            found = tomllib.loads(data.decode())
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise InputError(f"{file}: not valid TOML ({error}); correct it") from None
+        found = read_toml(file)
     if not isinstance(found, dict):
         raise InputError(f"{file}: has no settings; give a TOML file or the config.json of a run")
     validated(NbvSettings, {"dataset": "", "prior": "", **found}, file)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mgs.errors import InputError
-from mgs.files import read_json, reading
+from mgs.files import read_json, read_toml
 from mgs.resources import scene_path
 
 Positive = Annotated[float, Field(gt=0)]
@@ -150,10 +149,9 @@ def load_scene_file(scene: str | Path) -> SceneFile:
     range.
     """
     path = scene_path(scene)
-    with reading(path):
-        data = path.read_bytes()
+    data = read_toml(path)
     try:
-        return SceneFile.model_validate(tomllib.loads(data.decode()))
+        return SceneFile.model_validate(data)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
@@ -163,8 +161,6 @@ def load_scene_file(scene: str | Path) -> SceneFile:
         raise InputError(
             f"{path}: {key}: {first['msg']} (is {repr(first['input'])[:80]}); correct it"
         ) from None
-    except (ValueError, RecursionError) as error:  # RecursionError: nested too deeply
-        raise InputError(f"{path}: not valid TOML ({error}); correct it") from None
 
 
 def _keys_beside(where: tuple[int | str, ...]) -> list[str]:
