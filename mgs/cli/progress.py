@@ -44,7 +44,6 @@ class ProgressBar:
         self._bar.console.print(text, soft_wrap=True, markup=False, highlight=False)
 
 
-
 @contextmanager
 def progress_bar(stage: str = "reading", console: Terminal | None = None) -> Iterator[ProgressBar]:
     """Show progress while the context is open, on a terminal or in a notebook; nothing of it stays.
