@@ -79,12 +79,11 @@ def below(root: str | Path, *names: str | Path) -> Path:
     return path
 
 
-def remove_file(path: Path) -> None:
-    """Remove a file, if it exists, from a folder that this process has locked. Raises InputError
-    if it is elsewhere."""
-    check_place(path)
-    if not any(root in Path(os.path.abspath(path)).parents for root in _held):
-        raise InputError(f"{path}: is in another folder, and is not removed; correct its path")
+def remove_file(root: Path, path: Path) -> None:
+    """Remove a file below a folder, if it exists. Raises InputError if it is elsewhere."""
+    if not path.is_relative_to(root):
+        raise InputError(f"{path}: is not in {root}, and is not removed; correct its path")
+    below(root, path.relative_to(root).parent)
     path.unlink(missing_ok=True)
 
 

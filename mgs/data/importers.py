@@ -162,10 +162,10 @@ def import_shot(
         begin()
         if depth_path is not None and depth is not None:
             write_exr(depth_path, {"Z": undo(depth, False)})
-        remove_file(mask_path)
+        remove_file(out, mask_path)
         if mask is not None:
             write_png(mask_path, mask)
-        remove_file(rock_path)
+        remove_file(out, rock_path)
         if rock is not None:
             write_rock_image(rock_path, rock)
         if _is_plain_png(shot.image, camera) and not shot.distortion.any():

@@ -207,7 +207,7 @@ def _commit(
     silhouette: Callable[[], Callable[[Camera], np.ndarray]],
 ) -> Frame:
     """Import a picture into the dataset, check it, and write its record."""
-    remove_file(frame.image_path)  # of a picture that was refused or interrupted
+    remove_file(root, frame.image_path)  # of a picture that was refused or interrupted
     made = import_shot(shot, root, None if shot.mask else silhouette(), 1, lambda: None)
     if made.mask_path is None:
         raise InputError(f"{shot.mask}: is no mask")

@@ -285,7 +285,7 @@ class Problem:
         """Make candidates again of the frames that were given up."""
         for i, frame in enumerate(self.frames):
             if frame.given_up:
-                remove_file(capture_record(frame))
+                remove_file(self.dataset.root, capture_record(frame))
                 self.frames[i] = replace(frame, given_up=False)
 
     def make_seeds(self) -> None:
