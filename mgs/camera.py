@@ -163,6 +163,21 @@ class Camera:
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return Camera(scale @ self.K, width, height, self.world_to_camera)
 
+    def seen_from(self, origin: Sequence[float]) -> Camera:
+        """Same camera in a world whose coordinates count from `origin` [3], metres."""
+        if not any(origin):
+            return self
+        pose = self.world_to_camera.copy()
+        pose[:3, 3] += pose[:3, :3] @ origin
+        return Camera(
+            self.K,
+            self.width,
+            self.height,
+            pose,
+            self.film and self.film.seen_from(origin),
+            self.corner,
+        )
+
     def scaled(self, factor: float) -> Camera:
         """Same camera in a world whose lengths are multiplied by a factor."""
         pose = self.world_to_camera.copy()

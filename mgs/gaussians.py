@@ -37,6 +37,9 @@ LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
 ARRAYS = ("means", "log_scales", "quats", "logit_opacities", "sh")
 """Parameters of `Gaussians`: its fields that are arrays."""
 
+MARKS = ("antialiased", "linear", "origin")
+"""Fields of `Gaussians` that are no arrays."""
+
 KINDS = ("colour", "scale", "rotation", "opacity")
 """Names of the LEARNED parameters in settings and columns, in the same order."""
 
@@ -65,9 +68,11 @@ class Gaussians:
       larger (Yu et al. 2024, Mip-Splatting; `antialiased` of gsplat); in 3DGS it stays.
     - linear: whether colours are linear RGB. Files of most other tools have sRGB, which is blended
       as it is.
+    - origin: place in the world, metres, from which means count, in float64. It is not zero for
+      files whose coordinates float32 does not resolve, such as UTM.
 
     `gaussians[10:20]`, `gaussians[mask]` and `gaussians[indices]` are Gaussians again. Two are
-    equal if all numbers are, and both marks.
+    equal if all numbers and marks are.
     """
 
     means: Any
@@ -77,6 +82,7 @@ class Gaussians:
     sh: Any
     antialiased: bool = True
     linear: bool = True
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -101,8 +107,8 @@ class Gaussians:
         if not isinstance(other, Gaussians):
             return NotImplemented
         pairs = ((getattr(self, name), getattr(other, name)) for name in ARRAYS)
-        marks = (self.antialiased, self.linear) == (other.antialiased, other.linear)
-        return marks and all(
+        same = all(getattr(self, name) == getattr(other, name) for name in MARKS)
+        return same and all(
             np.array_equal(np.asarray(mine), np.asarray(theirs)) for mine, theirs in pairs
         )
 

@@ -5,17 +5,27 @@
 
 from __future__ import annotations
 
+import gzip
+import struct
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
 
-from mgs.errors import InputError
+from mgs.data.gltf import MAGIC
+from mgs.data.up import PLUS_Z, Up
+from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, parsing, reading
-from mgs.gaussians import Gaussians
-from mgs.splat_gltf import MAGIC, read_glb, write_glb
-from mgs.splat_ply import read_ply, write_compressed_ply, write_ply
+from mgs.gaussians import ARRAYS, Gaussians
+from mgs.splat.constants import LOG_SCALE_RANGE
+from mgs.splat_gltf import read_glb, up_of_glb, write_glb
+from mgs.splat_places import mirrored
+from mgs.splat_ply import parse_ply, write_compressed_ply, write_ply
 
 FORMATS = {"ply": ".ply", "compressed-ply": ".compressed.ply", "glb": ".glb", "spz": ".spz"}
 """Formats that are written, with the endings of their files."""
@@ -26,14 +36,21 @@ SPZ_MAGIC = (b"\x1f\x8b", b"NGSP")
 SPZ_BITS = 23
 """Bits of the magnitude of an SPZ position, a fixed-point number."""
 
-Y_UP = np.array([1, -1, -1], np.float32)
-"""Signs of x, y, z between the axes of 3DGS files (y down, z forward) and of SPZ (y up)."""
+SPZ_HEADER = struct.Struct("<4sIIBBBBI")
+"""Magic, version, number of Gaussians N, SH degree, fractional bits, flags, and (version 4) number
+of streams and offset of their table."""
 
-Y_UP_QUATS = np.array([1, 1, -1, -1], np.float32)
-"""Signs of w, x, y, z of a quaternion between these axes."""
+SPZ_ANTIALIASED, SPZ_EXTENSIONS = 1, 2
+"""Flags of the header."""
 
-Y_UP_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-"""Signs s_k of the colour coefficients between these axes: Y_k(x, -y, -z) = s_k Y_k(x, y, z)."""
+SPZ_AXES = 0xADBE0003
+"""Type of the extension that names the axes (`_axes`)."""
+
+RUB = 3
+"""Axes right, up, back: those of an SPZ that names no others."""
+
+UNBOUNDED = 13.8
+"""Logit that stands for an infinite one: an opacity of 1 - 1e-6."""
 
 OTHERS = {
     ".splat": "a .splat",
@@ -48,16 +65,36 @@ OTHERS = {
 def load_gaussians(path: str | Path) -> Gaussians:
     """Read Gaussians from a PLY in the layout of 3DGS, a compressed PLY, a GLB, or an SPZ.
 
-    Colours are unchanged. Raises InputError if the file is missing, damaged or of another format,
-    or if a package that it needs is missing.
+    Colours are unchanged. Infinite logits of opacity are cut to finite ones, and flat Gaussians get
+    the least thickness. Those with a NaN or another infinite number are left out, with a Notice.
+    Raises InputError if the file is missing, damaged or of another format, or if a package that it
+    needs is missing.
     """
     path = Path(path)
-    kind = _kind(path)
-    if kind == "glb":
-        return read_glb(path)
-    if kind == "spz":
-        return _read_spz(path)
-    return read_ply(path)
+    read = {"glb": read_glb, "spz": _read_spz, "ply": parse_ply}[_kind(path)]
+    g = read(path)
+    g.check_shapes(path)
+    flat, logits = np.isneginf(g.log_scales), np.clip(g.logit_opacities, -UNBOUNDED, UNBOUNDED)
+    g = replace(
+        g,
+        log_scales=np.where(flat, np.float32(LOG_SCALE_RANGE[0]), g.log_scales),
+        logit_opacities=np.where(np.isinf(g.logit_opacities), logits, g.logit_opacities),
+    )
+    good = np.ones(len(g), bool)
+    for array in (getattr(g, name) for name in ARRAYS):
+        good &= np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+    if not good.all():
+        if not good.any():
+            raise InputError(f"{path}: no Gaussian has finite numbers; export it again")
+        notice = f"{path}: {(~good).sum():,} Gaussians with NaN or infinite numbers are left out"
+        warnings.warn(notice, Notice, stacklevel=2)
+        g = g[good]
+    return g.check(path)
+
+
+def upward(path: str | Path) -> Up:
+    """Upward direction of a file's world: what a GLB says, else +Z."""
+    return up_of_glb(Path(path)) if _kind(Path(path)) == "glb" else PLUS_Z
 
 
 def _kind(path: Path) -> str:
@@ -81,8 +118,14 @@ def write_gaussians(path: str | Path, gaussians: Gaussians, kind: str, to_y_up: 
     """Write Gaussians (NumPy fields) in a format of FORMATS; the file appears complete.
 
     Compressed PLY and SPZ cannot say that colours are linear. to_y_up: for a GLB (`write_glb`).
-    Raises InputError as `mgs.files.atomic_path`, and if a package is missing.
+    Raises InputError as `mgs.files.atomic_path`, if a package is missing, and if there are no
+    Gaussians or their positions are too far for the format.
     """
+    if len(gaussians) == 0:
+        raise InputError(f"{path}: there are no Gaussians to write")
+    if any(gaussians.origin) and kind not in ("ply", "glb"):
+        place = ", ".join(f"{x:.0f}" for x in gaussians.origin)
+        raise InputError(f"{path}: the model lies at {place}, too far for {kind}; use ply or glb")
     if kind == "glb":
         write_glb(path, gaussians, to_y_up)
     elif kind == "spz":
@@ -107,10 +150,59 @@ def _spz_codec(path: Path) -> Any:
     return gsply_cpp
 
 
-def _flip_y_up(g: Gaussians) -> Gaussians:
-    """Turn Gaussians between the axes of 3DGS files and of SPZ; twice gives the same Gaussians."""
-    sh = g.sh * Y_UP_SH[: g.sh.shape[1], None]
-    return replace(g, means=g.means * Y_UP, quats=g.quats * Y_UP_QUATS, sh=sh)
+def _axes(number: int) -> tuple[int, int, int]:
+    """Signs of x, y, z between 3DGS files (right, down, front) and the axes of a number: bit 0
+    right, bit 1 up, bit 2 front."""
+    return (1 if number & 1 else -1, -1 if number & 2 else 1, 1 if number & 4 else -1)
+
+
+def _spz_bits(path: Path, means: np.ndarray) -> int:
+    """Fractional bits of positions [N,3]. Raises InputError if they are too far for any."""
+    largest = max(float(np.abs(means).max(initial=0)), 1e-6)
+    if not largest < 2**SPZ_BITS:
+        raise InputError(f"{path}: positions up to {largest:.3g} are too far for SPZ; use ply")
+    return min(int(np.floor(SPZ_BITS - np.log2(largest * (1 + 1e-6)))), 24)
+
+
+@contextmanager
+def _decodable(path: Path) -> Iterator[Path]:
+    """Context manager: an SPZ that the codec reads; a copy of a file of version 1, whose positions
+    are half floats, as version 2."""
+    with path.open("rb") as raw, gzip.open(raw) if raw.read(2) == SPZ_MAGIC[0] else raw as file:
+        raw.seek(0)
+        if SPZ_HEADER.unpack(file.read(20))[1] != 1:
+            yield path
+            return
+        file.seek(0)
+        data = bytearray(file.read())
+    n = SPZ_HEADER.unpack_from(data)[2]
+    means = np.frombuffer(data, "<f2", 3 * n, 16).astype(np.float64)
+    bits = _spz_bits(path, means)
+    fixed = np.round(means * 2.0**bits).astype("<i4").view("u1").reshape(-1, 4)[:, :3]
+    data[4], data[13] = 2, bits
+    with NamedTemporaryFile(suffix=".spz") as copy:
+        copy.write(gzip.compress(data[:16] + fixed.tobytes() + data[16 + 6 * n :], 1))
+        copy.flush()
+        yield Path(copy.name)
+
+
+def _spz_marks(path: Path) -> tuple[bool, int]:
+    """Whether an SPZ is antialiased, and the number of its axes. Raises errors of many types."""
+    with path.open("rb") as raw, gzip.open(raw) if raw.read(2) == SPZ_MAGIC[0] else raw as file:
+        raw.seek(0)
+        _, version, n, degree, _, flags, _, end = SPZ_HEADER.unpack(file.read(20))
+        axes = RUB
+        if flags & SPZ_EXTENSIONS:
+            each = (6 if version == 1 else 9) + 7 + (4 if version == 3 else 3)
+            start = 16 + n * (each + 3 * ((degree + 1) ** 2 - 1))
+            file.seek(start if version < 4 else 32)
+            data = file.read(1 << 16 if version < 4 else max(end - 32, 0))
+            while len(data) >= 8:
+                kind, size = struct.unpack_from("<II", data)
+                if kind == SPZ_AXES and data[8] in range(1, 9):
+                    axes = data[8] - 1
+                data = data[8 + size :]
+    return bool(flags & SPZ_ANTIALIASED), axes
 
 
 def _read_spz(path: Path) -> Gaussians:
@@ -120,34 +212,45 @@ def _read_spz(path: Path) -> Gaussians:
     """
     codec = _spz_codec(path)
     with reading(path), parsing(path, "SPZ", "export it again"):
-        found = codec.read_spz(str(path))
+        with _decodable(path) as decodable:
+            found = codec.read_spz(str(decodable))
+        antialiased, axes = _spz_marks(path)
         parts = [found["sh0"][:, None, :]]
         if found["shN"] is not None and found["shN"].size:
             parts.append(found["shN"])
-        y_up = Gaussians(
+        g = Gaussians(
             means=found["means"],
             log_scales=found["scales"],
             quats=found["quats"],
             logit_opacities=found["opacities"],
             sh=np.concatenate(parts, axis=1),
-            antialiased=False,
+            antialiased=antialiased,
             linear=False,
-        ).check(path)
-    return _flip_y_up(y_up)
+        )
+        return mirrored(g, _axes(axes))
 
 
 def _write_spz(path: Path, gaussians: Gaussians) -> None:
     """Write an SPZ of version 3, y up. Positions take as many fractional bits as their size allows.
 
     Values outside the format's range are clipped: log-scales to -10 to 5.9, coefficients of degree
-    0 to +-3.3, and the others to +-1.
+    0 to +-3.3, and the others to +-1. Raises InputError if the steps of the positions would be
+    coarser than the Gaussians.
     """
     codec = _spz_codec(path)
-    g = _flip_y_up(gaussians)
-    largest = max(float(np.abs(g.means).max(initial=0)), 1e-6)
-    bits = int(np.clip(np.floor(SPZ_BITS - np.log2(largest * (1 + 1e-6))), 1, 24))
+    g = mirrored(gaussians, _axes(RUB))
+    bits = _spz_bits(path, g.means)
+    if 2.0**-bits > np.exp(np.median(g.log_scales)):
+        raise InputError(
+            f"{path}: positions this far from the origin have steps of {2.0**-bits:.3g} in an "
+            "SPZ, coarser than the Gaussians; use ply or glb"
+        )
     fields = (g.means, g.log_scales, g.quats, g.logit_opacities, g.sh[:, 0])
     arrays = [np.ascontiguousarray(values, np.float32) for values in fields]
     higher = np.ascontiguousarray(g.sh[:, 1:], np.float32) if g.sh.shape[1] > 1 else None
     with atomic_path(path) as temporary:
         codec.write_spz(str(temporary), *arrays, higher, fractional_bits=bits)
+        if g.antialiased:  # the codec leaves the flags empty
+            data = bytearray(gzip.decompress(temporary.read_bytes()))
+            data[14] |= SPZ_ANTIALIASED
+            temporary.write_bytes(gzip.compress(data, 6, mtime=0))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,22 +17,25 @@ import numpy as np
 from scipy.special import logit
 
 from mgs.colour import SH_C0
+from mgs.data.gltf import BINARY, JSON, MAGIC, SIZES, Gltf
+from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.errors import InputError
 from mgs.files import atomic_path, parsing, reading
-from mgs.gaussians import Gaussians
+from mgs.gaussians import ARRAYS, Gaussians
+from mgs.splat_places import mirrored, moved
 
-MAGIC = b"glTF"
 EXTENSION = "KHR_gaussian_splatting"
 SPACES = {True: "lin_rec709_display", False: "srgb_rec709_display"}
 """`Gaussians.linear` -> `colorSpace` of the extension."""
 
-JSON, BINARY = 0x4E4F534A, 0x004E4942
-"""Types of the two chunks of a GLB."""
+FLOAT, VERTICES = 5126, 34962
+"""Component type of the accessors, and target of the buffer views."""
 
-FLOAT = 5126
-COMPONENTS = {FLOAT: "f4", 5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2"}
-"""Component types of accessors -> NumPy's."""
-SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+HANDLED = {EXTENSION, "KHR_mesh_quantization"}
+"""Extensions that are read."""
+
+PLAYCANVAS = "splat-transform"
+"""Generator of files whose x and y point against those of the PLY that they were made of."""
 
 CLEAREST = 1e-6
 """Opacities are kept this far from 0 and 1 when read, so that their logits are finite."""
@@ -47,10 +51,10 @@ def write_glb(path: str | Path, gaussians: Gaussians, to_y_up: np.ndarray) -> No
     """Write Gaussians (NumPy fields) as a GLB; the file appears complete.
 
     to_y_up: rotation [3,3] from the model's world to glTF's, in which +Y is up; it becomes the
-    transform of the file's only node.
+    transform of the file's only node, with the origin. `read_glb` undoes it.
     Raises InputError as `mgs.files.atomic_path`.
     """
-    g, scales = gaussians, np.exp(gaussians.log_scales)
+    g, scales = gaussians, np.exp(np.clip(gaussians.log_scales, -80, 80))  # within float32
     quats = g.quats / np.maximum(np.linalg.norm(g.quats, axis=1, keepdims=True), 1e-12)
     colours = np.clip(np.column_stack([0.5 + SH_C0 * g.sh[:, 0], g.opacities]), 0, 1)
     attributes = {
@@ -67,7 +71,8 @@ def write_glb(path: str | Path, gaussians: Gaussians, to_y_up: np.ndarray) -> No
     for name, values in attributes.items():
         data = np.ascontiguousarray(values, "<f4")
         kind = next(kind for kind, size in SIZES.items() if size == data.shape[1])
-        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": data.nbytes})
+        place = {"buffer": 0, "byteOffset": len(body), "byteLength": data.nbytes}
+        views.append(place | {"target": VERTICES})
         accessor = {"bufferView": len(accessors), "componentType": FLOAT, "count": len(data)}
         accessors.append(accessor | {"type": kind})
         if name == "POSITION":
@@ -80,9 +85,13 @@ def write_glb(path: str | Path, gaussians: Gaussians, to_y_up: np.ndarray) -> No
         "extras": {"antialiased": g.antialiased},
     }
     matrix = np.eye(4)
-    matrix[:3, :3] = to_y_up
+    matrix[:3, :3], matrix[:3, 3] = to_y_up, to_y_up @ np.array(g.origin)
     content = {
-        "asset": {"version": "2.0", "generator": "mgs"},
+        "asset": {
+            "version": "2.0",
+            "generator": "mgs",
+            "extras": {"y_up_from_model": to_y_up.tolist()},
+        },
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -101,76 +110,87 @@ def write_glb(path: str | Path, gaussians: Gaussians, to_y_up: np.ndarray) -> No
 
 
 def read_glb(path: str | Path) -> Gaussians:
-    """Read the first primitive of Gaussians of a GLB.
+    """Read all Gaussians of a GLB's scene, under the transforms of their nodes.
 
-    Positions are those of the primitive: transforms of nodes are ignored. Raises InputError if the
-    file is missing or damaged, holds no Gaussians, or only compressed ones.
+    Files of mgs, and those that PlayCanvas' splat-transform made of a PLY, come back in the axes of
+    the model; others stay in glTF's. Raises InputError if the file is missing or damaged, holds no
+    Gaussians, or compressed ones, ones that differ in colour space, or a node has shear.
     """
     path = Path(path)
     with reading(path, "file; give a GLB"), parsing(path, "GLB", "export it again"):
-        content, body = _chunks(path.read_bytes())
-        return _gaussians(path, content, body)
+        gltf = Gltf(path, HANDLED)
+        back, parts = np.eye(4), list[Gaussians]()
+        back[:3, :3] = _y_up_from_model(gltf).T
+        for mesh, place in gltf.placed():
+            for primitive in gltf.json["meshes"][mesh]["primitives"]:
+                if EXTENSION in primitive.get("extensions", {}):
+                    parts.append(moved(_gaussians(gltf, primitive), back @ place, path))
+        if not parts:
+            raise InputError(
+                f"{path}: no Gaussians in it (no {EXTENSION}); export it as a splat PLY"
+            )
+        whole = _joined(path, parts)
+        made_by = str(gltf.json.get("asset", {}).get("generator", ""))
+        return mirrored(whole, (-1, -1, 1)) if made_by.startswith(PLAYCANVAS) else whole
 
 
-def _chunks(data: bytes) -> tuple[Any, bytes]:
-    """JSON and binary chunk of a GLB. Raises ValueError or struct.error if it is damaged."""
-    start = 12
-    chunks: dict[int, bytes] = {}
-    while start + 8 <= len(data):
-        size, kind = struct.unpack_from("<II", data, start)
-        if start + 8 + size > len(data):
-            raise ValueError("it ends within a chunk")
-        chunks.setdefault(kind, data[start + 8 : start + 8 + size])
-        start += 8 + size
-    return json.loads(chunks[JSON]), chunks.get(BINARY, b"")
+def up_of_glb(path: Path) -> Up:
+    """Upward direction in the world in which `read_glb` returns Gaussians. Raises InputError."""
+    with reading(path, "file; give a GLB"), parsing(path, "GLB", "export it again"):
+        gltf = Gltf(path, HANDLED)
+        if str(gltf.json.get("asset", {}).get("generator", "")).startswith(PLAYCANVAS):
+            return PLUS_Z
+        return unit_up(_y_up_from_model(gltf)[1])
 
 
-def _gaussians(path: Path, content: Any, body: bytes) -> Gaussians:
-    """Gaussians from the chunks of a GLB."""
-    primitives = [p for mesh in content.get("meshes", []) for p in mesh["primitives"]]
-    found = next((p for p in primitives if EXTENSION in p.get("extensions", {})), None)
-    if found is None:
-        raise InputError(f"{path}: no Gaussians in it (no {EXTENSION}); export it as a splat PLY")
-    extension = found["extensions"][EXTENSION]
+def _y_up_from_model(gltf: Gltf) -> np.ndarray:
+    """Rotation [3,3] from the model's axes to glTF's, as a file of mgs names it, else none."""
+    extras = gltf.json.get("asset", {}).get("extras", {})
+    turn = extras.get("y_up_from_model") if isinstance(extras, dict) else None
+    return np.eye(3) if turn is None else np.asarray(turn, np.float64).reshape(3, 3)
+
+
+def _joined(path: Path, parts: list[Gaussians]) -> Gaussians:
+    """One model of several parts, with their highest SH degree. Raises InputError if they differ in
+    a mark."""
+    first, degree = parts[0], max(part.sh_degree for part in parts)
+    if len(parts) == 1:
+        return first
+    if len({(part.linear, part.antialiased) for part in parts}) > 1:
+        raise InputError(f"{path}: its parts differ in colour space or antialiasing; split it")
+    same = [part.with_degree(degree) for part in parts]
+    for part in same:
+        part.means = part.means + np.subtract(part.origin, first.origin).astype(np.float32)
+    arrays: Any = {name: np.concatenate([getattr(part, name) for part in same]) for name in ARRAYS}
+    return replace(first, **arrays)
+
+
+def _gaussians(gltf: Gltf, primitive: dict[str, Any]) -> Gaussians:
+    """Gaussians of a primitive, in its own coordinates."""
+    extension, given = primitive["extensions"][EXTENSION], primitive["attributes"]
     if extension.get("extensions"):
         kind = next(iter(extension["extensions"]))
-        raise InputError(f"{path}: its Gaussians are compressed ({kind}); export it uncompressed")
+        raise InputError(f"{gltf.path}: its Gaussians are compressed ({kind}); export uncompressed")
 
     def values(name: str) -> np.ndarray:
-        return _accessor(path, content, found["attributes"][name], body)
+        return gltf.accessor(given[name]).astype(np.float32)
 
-    coefficients = sum(name.startswith(f"{EXTENSION}:SH_") for name in found["attributes"])
+    coefficients = sum(name.startswith(f"{EXTENSION}:SH_") for name in given)
     opacities = values(f"{EXTENSION}:OPACITY")[:, 0].astype(np.float64)
-    with np.errstate(divide="ignore", invalid="ignore"):  # bad scales are refused by `check`
-        log_scales = np.log(values(f"{EXTENSION}:SCALE"))
+    scales = values(f"{EXTENSION}:SCALE")
+    if (scales < 0).any():
+        raise InputError(
+            f"{gltf.path}: has negative scales, which are probably logarithms; the program that "
+            "wrote it must write standard deviations"
+        )
+    with np.errstate(divide="ignore"):  # flat Gaussians
+        log_scales = np.log(scales)
     return Gaussians(
         means=values("POSITION"),
         log_scales=log_scales,
         quats=np.roll(values(f"{EXTENSION}:ROTATION"), 1, axis=1),
         logit_opacities=logit(np.clip(opacities, CLEAREST, 1 - CLEAREST)).astype(np.float32),
         sh=np.stack([values(name) for name in _sh_names(coefficients)], axis=1),
-        antialiased=found.get("extras", {}).get("antialiased") is True,
+        antialiased=primitive.get("extras", {}).get("antialiased") is True,
         linear=extension.get("colorSpace") == SPACES[True],
-    ).check(path)
-
-
-def _accessor(path: Path, content: Any, index: int, body: bytes) -> np.ndarray:
-    """Values of an accessor, float32 [N,size]. NumPy raises TypeError or ValueError if they do not
-    lie within the binary chunk."""
-    accessor = content["accessors"][index]
-    if "sparse" in accessor:
-        raise InputError(
-            f"{path}: has sparse accessors, which are not supported; export it without"
-        )
-    view = content["bufferViews"][accessor["bufferView"]]
-    kind, size = np.dtype(COMPONENTS[accessor["componentType"]]), SIZES[accessor["type"]]
-    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    stride = view.get("byteStride", kind.itemsize * size)
-    if not isinstance(accessor["count"], int) or start < 0 or stride < kind.itemsize * size:
-        raise ValueError("an accessor lies outside its buffer")
-    shape, strides = (accessor["count"], size), (stride, kind.itemsize)
-    stored: np.ndarray = np.ndarray(shape, kind.newbyteorder("<"), body, start, strides)
-    numbers = stored.astype(np.float32)
-    if accessor.get("normalized") and kind.kind != "f":
-        numbers = np.maximum(numbers / np.iinfo(kind).max, -1)
-    return numbers
+    )

@@ -15,19 +15,24 @@ from tempfile import NamedTemporaryFile
 import numpy as np
 from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
-from scipy.special import logit
+from scipy.special import expit, logit
 
 from mgs.colour import SH_C0
 from mgs.errors import InputError
 from mgs.files import atomic_path, parsing, reading
 from mgs.gaussians import Gaussians
+from mgs.splat_places import settled
 
 LINEAR_COMMENT = "mgs: colours are linear RGB"
 """Comment in the header of the files that mgs writes; the layout has no field for the colour space.
 Most other tools train on sRGB values, so the colours in their files must be blended as sRGB."""
 
-ANTIALIASED_COMMENT = "mgs: antialiased"
-"""Comment in the header of files of antialiased Gaussians (`mgs.gaussians.Gaussians`)."""
+ANTIALIASED_COMMENT = "SplatRenderMode: mip"
+"""Comment of antialiased Gaussians (`mgs.gaussians.Gaussians`), as of Brush and PlayCanvas."""
+
+RENDER_MODE = re.compile(r"(splatrendermode: |antialiased |mgs: )(\S+)")
+"""Comments about antialiasing, in lower case: of Brush (default, mip, 2dgs), of Postshot (0, 1),
+and of mgs 0.1 (antialiased)."""
 
 CHUNK = 256
 """Consecutive splats of a compressed PLY that share one row of its element `chunk`."""
@@ -62,8 +67,8 @@ def write_ply(
 
     It opens in any splat viewer. Viewers that expect sRGB show linear RGB too dark. marks: {name:
     [N] bool}, extra properties of the vertices, bytes of 0 or 1, which `read_ply` and viewers
-    ignore. Comments record that Gaussians are linear or antialiased. Raises InputError as
-    `mgs.files.atomic_path`.
+    ignore. Comments record that Gaussians are linear or antialiased. Positions are doubles where
+    they have an origin. Raises InputError as `mgs.files.atomic_path`.
     """
     g, n = gaussians, len(gaussians)
     names = _ply_names(g.sh.shape[1])
@@ -72,10 +77,13 @@ def write_ply(
     parts = [g.means, normals, g.sh[:, 0, :], rest, opacity, g.log_scales, g.quats]
     columns = np.concatenate(parts, axis=1).astype(np.float32)
     marks = marks or {}
-    types = [(name, "f4") for name in names] + [(name, "u1") for name in marks]
-    vertices = np.empty(n, dtype=types)
+    wide = names[:3] if any(g.origin) else []
+    types = [(name, "f8" if name in wide else "f4") for name in names]
+    vertices = np.empty(n, dtype=types + [(name, "u1") for name in marks])
     for i, name in enumerate(names):
         vertices[name] = columns[:, i]
+    for name, first in zip(wide, g.origin, strict=False):
+        vertices[name] += first
     for name, mask in marks.items():
         vertices[name] = mask
     comments = [LINEAR_COMMENT] * g.linear + [ANTIALIASED_COMMENT] * gaussians.antialiased
@@ -88,9 +96,15 @@ def read_ply(path: str | Path) -> Gaussians:
     """Read a PLY in the layout of 3DGS (binary or ASCII, SH degree 0 to 3), or a compressed one.
 
     Properties are found by name, in any order; others are ignored. Only files of mgs say that
-    they are linear or antialiased. Raises InputError if the file is missing, is not a PLY, lacks a
-    property, or holds values that `Gaussians.check` refuses.
+    they are linear. The smoothing filter of Mip-Splatting (`filter_3D`) is applied. Raises
+    InputError if the file is missing, is not a PLY, lacks a property, or holds values that
+    `Gaussians.check` refuses.
     """
+    return parse_ply(path).check(path)
+
+
+def parse_ply(path: str | Path) -> Gaussians:
+    """`read_ply` without its check of the values."""
     path = Path(path)
     with (
         reading(path, "file; give a 3DGS PLY"),
@@ -106,8 +120,12 @@ def read_ply(path: str | Path) -> Gaussians:
         columns = _decompress(path, ply)
     else:
         columns = {name: vertices[name] for name in vertices.dtype.names}
-    marks = [comment in ply.comments for comment in (ANTIALIASED_COMMENT, LINEAR_COMMENT)]
-    return _from_columns(path, columns, len(vertices), *marks).check(path)
+    said = [RENDER_MODE.fullmatch(comment.lower().strip()) for comment in ply.comments]
+    mode = next((match[2] for match in reversed(said) if match), "0")
+    if mode == "2dgs":
+        raise InputError(f"{path}: holds flat discs (2DGS), which mgs does not draw")
+    marks = mode in ("mip", "1", "antialiased"), LINEAR_COMMENT in ply.comments
+    return _from_columns(path, columns, len(vertices), *marks)
 
 
 def _parse_any_comment(path: Path) -> PlyData:
@@ -148,19 +166,36 @@ def _from_columns(
         with np.errstate(over="ignore"):  # an overflow gives infinity, which the caller refuses
             return np.stack([np.asarray(columns[name], np.float32) for name in names], 1)
 
+    log_scales, logits = stack("scale_0", "scale_1", "scale_2"), stack("opacity").ravel()
+    if "filter_3D" in columns:
+        log_scales, logits = _smoothed(log_scales, logits, np.asarray(columns["filter_3D"]))
     sh = stack("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :]
     if rest:
         higher = stack(*(f"f_rest_{i}" for i in range(rest))).reshape(n, 3, coefficients - 1)
         sh = np.concatenate([sh, np.transpose(higher, (0, 2, 1))], axis=1)
-    return Gaussians(
+    found = Gaussians(
         means=stack("x", "y", "z"),
-        log_scales=stack("scale_0", "scale_1", "scale_2"),
+        log_scales=log_scales,
         quats=stack("rot_0", "rot_1", "rot_2", "rot_3"),
-        logit_opacities=stack("opacity").ravel(),
+        logit_opacities=logits,
         sh=np.ascontiguousarray(sh),
         antialiased=antialiased,
         linear=linear,
     )
+    if any(columns[axis].dtype.itemsize < 8 for axis in "xyz"):
+        return found
+    return settled(found, np.stack([columns[axis] for axis in "xyz"], 1), np.zeros(3))
+
+
+def _smoothed(
+    log_scales: np.ndarray, logits: np.ndarray, width: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log-scales [N,3] and logits [N] after the smoothing filter of standard deviation `width` [N]
+    (Yu et al. 2024, Mip-Splatting, equation 9), which keeps each Gaussian's mass."""
+    squares = np.exp(2 * log_scales.astype(np.float64))
+    wider = squares + width[:, None].astype(np.float64) ** 2
+    opacities = expit(logits.astype(np.float64)) * np.sqrt((squares / wider).prod(1))
+    return (0.5 * np.log(wider)).astype(np.float32), logit(opacities).astype(np.float32)
 
 
 def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:

@@ -2,7 +2,9 @@
 
 import gzip
 import json
+import shutil
 import struct
+import subprocess
 import sys
 from contextlib import suppress
 from dataclasses import replace
@@ -11,15 +13,18 @@ import numpy as np
 import pytest
 from program import command
 from refusals import refused
-from test_render_command import gaussians
+from test_render_command import CAMERAS, gaussians
 from test_splat_ply import assert_close
 
 from mgs.colour import srgb_from_linear
-from mgs.errors import InputError
+from mgs.errors import InputError, Notice
 from mgs.gaussians import Gaussians
 from mgs.report.exporting import in_srgb, to_y_up
+from mgs.rotation import rotmat_from_quat
+from mgs.splat import reference, render
 from mgs.splat.reference import sh_basis
-from mgs.splat_files import FORMATS, Y_UP_SH, load_gaussians, write_gaussians
+from mgs.splat_files import FORMATS, load_gaussians, upward, write_gaussians
+from mgs.splat_places import mirrored
 from mgs.splat_ply import write_ply
 
 TOLERANCES = {
@@ -34,6 +39,11 @@ def unit(quats: np.ndarray) -> np.ndarray:
     """Unit quaternions [N,4] whose largest component is positive."""
     largest = np.take_along_axis(quats, np.abs(quats).argmax(1)[:, None], 1)
     return quats * np.sign(largest) / np.linalg.norm(quats, axis=1, keepdims=True)
+
+
+def covariances(model: Gaussians) -> np.ndarray:
+    axes = rotmat_from_quat(model.quats) * np.exp(model.log_scales.astype(float))[:, None]
+    return axes @ axes.transpose(0, 2, 1)
 
 
 def written(tmp_path, kind: str, model: Gaussians):
@@ -76,15 +86,23 @@ def test_an_spz_is_y_up(tmp_path):
     raw = codec.read_spz(str(written(tmp_path, "spz", model)))
     np.testing.assert_allclose(raw["means"], model.means * (1, -1, -1), atol=1e-6)
     np.testing.assert_allclose(unit(raw["quats"]), unit(model.quats * (1, 1, -1, -1)), atol=3e-3)
-    higher = (model.sh * Y_UP_SH[:, None])[:, 1:]
+    higher = mirrored(model, (1, -1, -1)).sh[:, 1:]
     np.testing.assert_allclose(raw["shN"], higher, atol=TOLERANCES["spz"][-1])
 
 
-def test_the_signs_of_coefficients_turn_the_basis():
+@pytest.mark.parametrize("signs", [(1, -1, -1), (-1, -1, 1), (-1, 1, 1)])
+def test_a_mirrored_model_looks_the_same_from_the_mirrored_side(signs):
     directions = np.random.default_rng(0).normal(size=(100, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    turned = sh_basis(directions * (1, -1, -1), 3)
-    np.testing.assert_allclose(turned, Y_UP_SH * sh_basis(directions, 3), atol=1e-12)
+    model = gaussians(3, n=5)
+    turned = mirrored(model, signs)
+    colours = [
+        np.einsum("dk,nkc->ndc", sh_basis(d, 3), one.sh)
+        for d, one in ((directions, model), (directions * signs, turned))
+    ]
+    np.testing.assert_allclose(*colours, atol=1e-6)
+    expected = covariances(model) * np.outer(signs, signs)
+    np.testing.assert_allclose(covariances(turned), expected, atol=1e-7)
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -103,8 +121,174 @@ def test_antialiasing_and_the_space_of_colours_are_kept_where_a_format_can(tmp_p
     for marked in (True, False):
         model = replace(gaussians(0), antialiased=marked, linear=marked)
         read = load_gaussians(written(tmp_path, kind, model))
-        assert read.antialiased == (marked and kind != "spz")
+        assert read.antialiased == marked
         assert read.linear == (marked and kind in ("ply", "glb"))
+
+
+def test_a_model_far_from_the_origin(tmp_path):
+    """Its positions are doubles in a PLY and a translation in a GLB; it is drawn without loss."""
+    place = (448262.0, 5411932.0, 412.0)
+    near = gaussians(1)
+    far = replace(near, origin=place)
+    for kind in ("ply", "glb"):
+        read = load_gaussians(written(tmp_path, kind, far))
+        assert np.abs(np.add(read.means, read.origin) - near.means - place).max() < 1e-6
+        shifted = CAMERAS[0].seen_from(np.negative(place))
+        images = [
+            np.asarray(render(model, camera).rgb)
+            for model, camera in ((near, CAMERAS[0]), (read, shifted))
+        ]
+        np.testing.assert_allclose(*images, atol=2e-5)
+    exact = reference.render(far, shifted)["rgb"]
+    np.testing.assert_allclose(exact, reference.render(near, CAMERAS[0])["rgb"], atol=1e-5)
+    for kind in ("spz", "compressed-ply"):
+        with pytest.raises(InputError, match="448262, 5411932, 412, too far"):
+            written(tmp_path, kind, far)
+
+
+def test_numbers_that_mean_no_number(tmp_path):
+    """Infinite logits and flat Gaussians are drawn; others that are not finite are counted."""
+    model = gaussians(0)
+    model.logit_opacities[:2] = np.inf, -np.inf
+    model.log_scales[2, 1] = -np.inf
+    model.means[3, 0] = model.sh[4, 0, 0] = np.nan
+    model.log_scales[5, 0] = np.inf
+    with pytest.warns(Notice, match="3 Gaussians"):
+        read = load_gaussians(written(tmp_path, "ply", model))
+    assert len(read) == len(model) - 3
+    np.testing.assert_allclose(read.opacities[:2], [1, 0], atol=2e-6)
+    assert np.exp(read.log_scales[2, 1]) < 1e-6
+    model.means[:] = np.nan
+    with pytest.raises(InputError, match="no Gaussian has finite numbers"):
+        load_gaussians(written(tmp_path, "ply", model))
+
+
+def tilted(scale, shear: float = 0.0) -> np.ndarray:
+    """A transform [4,4]: turned, scaled, sheared, shifted."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotmat_from_quat([0.8, 0.3, -0.4, 0.2]) * np.broadcast_to(scale, 3)
+    matrix[:3, 3] = 1, -2, 3
+    matrix[:3, 1] += shear * matrix[:3, 0]
+    return matrix
+
+
+def glb_with(path, change) -> None:
+    """Change the JSON of a GLB in place."""
+    data = path.read_bytes()
+    size = struct.unpack("<I", data[12:16])[0]
+    content = json.loads(data[20 : 20 + size])
+    change(content)
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + size :]
+    head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+    path.write_bytes(head + text + rest)
+
+
+@pytest.mark.parametrize("scale", [2.0, -0.5, (2.0, 0.5, 1.0)])
+def test_the_transforms_of_nodes_are_applied(tmp_path, scale):
+    """Means and covariances under any scale, colours by the direction in the node's own axes."""
+    model, matrix = gaussians(3), tilted(scale)
+    path = tmp_path / "x.glb"
+    write_gaussians(path, model, "glb", np.eye(3))
+    half = {"matrix": np.diag([0.5, 0.5, 0.5, 1]).ravel().tolist(), "children": [1]}
+    inner = {"mesh": 0, "matrix": (np.diag([2, 2, 2, 1]) @ matrix).T.ravel().tolist()}
+    glb_with(path, lambda content: content.update(nodes=[half, inner]))
+    read, A = load_gaussians(path), matrix[:3, :3]
+    np.testing.assert_allclose(read.means, model.means @ A.T + matrix[:3, 3], atol=1e-5)
+    np.testing.assert_allclose(covariances(read), A @ covariances(model) @ A.T, atol=1e-5)
+    directions = np.random.default_rng(0).normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    own = directions @ (A / np.linalg.norm(A, axis=0))
+    colours = [
+        np.einsum("dk,nkc->ndc", sh_basis(d, 3), one.sh)
+        for d, one in ((directions, read), (own, model))
+    ]
+    np.testing.assert_allclose(*colours, atol=1e-5)
+
+
+def test_shear_is_refused(tmp_path):
+    path = tmp_path / "x.glb"
+    write_gaussians(path, gaussians(0), "glb", np.eye(3))
+    sheared = {"mesh": 0, "matrix": tilted(1.0, shear=0.3).T.ravel().tolist()}
+    glb_with(path, lambda content: content.update(nodes=[sheared]))
+    with pytest.raises(InputError, match="has shear"):
+        load_gaussians(path)
+
+
+def test_all_primitives_are_read(tmp_path):
+    path, model = tmp_path / "x.glb", gaussians(1)
+    write_gaussians(path, model, "glb", np.eye(3))
+    shifted = [{"mesh": 0}, {"mesh": 0, "translation": [0, 0, 2]}]
+
+    def twice(content):
+        content["meshes"][0]["primitives"] *= 2
+        content.update(nodes=shifted, scenes=[{"nodes": [0, 1]}])
+
+    glb_with(path, twice)
+    heights = np.concatenate([model.means[:, 2] + z for z in (0, 0, 2, 2)])
+    np.testing.assert_allclose(load_gaussians(path).means[:, 2], heights, atol=1e-6)
+
+
+def test_a_model_that_is_not_z_up_comes_back_in_its_own_axes(tmp_path):
+    model, up = gaussians(0), (0.6, 0.0, 0.8)
+    write_gaussians(tmp_path / "x.glb", model, "glb", to_y_up(up))
+    np.testing.assert_array_equal(load_gaussians(tmp_path / "x.glb").means, model.means)
+    np.testing.assert_allclose(upward(tmp_path / "x.glb"), up, atol=1e-12)
+
+
+RDF = struct.pack("<III", 0xADBE0003, 4, 6)
+"""Extension of an SPZ: axes right, down, front, those of a PLY."""
+
+
+def test_an_spz_that_names_its_axes(tmp_path):
+    pytest.importorskip("gsply_cpp")
+    model = gaussians(1)
+    path = written(tmp_path, "spz", mirrored(model, (1, -1, -1)))  # so they are stored as a PLY's
+    data = bytearray(gzip.decompress(path.read_bytes()))
+    data[14] |= 2
+    path.write_bytes(gzip.compress(bytes(data) + RDF))
+    assert np.abs(load_gaussians(path).means - model.means).max() < 1e-6
+
+
+def test_an_spz_of_version_1(tmp_path):
+    """Positions are half floats."""
+    pytest.importorskip("gsply_cpp")
+    model, n = gaussians(0), 40
+    head = struct.pack("<4sIIBBBB", b"NGSP", 1, n, 0, 12, 0, 0)
+    quats = unit(model.quats) * np.sign(unit(model.quats)[:, :1])
+    fields = [
+        (model.means * (1, -1, -1)).astype("<f2"),
+        np.round(255 * model.opacities),
+        np.round(255 * (0.15 * model.sh[:, 0] + 0.5)),
+        np.round(16 * (model.log_scales + 10)),
+        np.round(127.5 * (quats[:, 1:] * (1, -1, -1) + 1)),
+    ]
+    body = b"".join(
+        (f if f.dtype.itemsize == 2 else f.clip(0, 255).astype("u1")).tobytes() for f in fields
+    )
+    (tmp_path / "x.spz").write_bytes(gzip.compress(head + body))
+    read = load_gaussians(tmp_path / "x.spz")
+    np.testing.assert_allclose(read.means, model.means, atol=1e-3)
+    np.testing.assert_allclose(read.opacities, model.opacities, atol=0.51 / 255)
+    np.testing.assert_allclose(covariances(read), covariances(model), rtol=0.2, atol=2e-3)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".glb"])
+def test_what_playcanvas_makes_of_a_model_is_the_same_model(tmp_path, suffix):
+    program = shutil.which("splat-transform")
+    if program is None:
+        pytest.skip("splat-transform is not installed")
+    model = replace(gaussians(3, n=100), antialiased=True, linear=False)
+    path, made = written(tmp_path, "ply", model), tmp_path / f"made{suffix}"
+    subprocess.run([program, "-q", path, made], check=True)
+    read = load_gaussians(made)
+    assert read.antialiased == (suffix != ".glb")  # its GLB does not say
+    nearest = np.abs(read.means[:, None] - model.means).sum(-1).argmin(0)
+    step = 2e-3 if "compressed" in suffix else 1e-6
+    np.testing.assert_allclose(read.means[nearest], model.means, atol=step)
+    np.testing.assert_allclose(covariances(read[nearest]), covariances(model), atol=step)
+    np.testing.assert_allclose(read.sh[nearest, 1:], model.sh[:, 1:], atol=1 / 64 + step)
 
 
 def test_colours_become_srgb(tmp_path):
@@ -124,10 +308,12 @@ def test_up_becomes_y():
 def test_the_command_converts_and_keeps_what_is_there(tmp_path, capsys):
     model = gaussians(1)
     write_ply(tmp_path / "a.ply", model)
-    given = ["export", tmp_path / "a.ply", "--out", tmp_path / "b.glb"]
+    given = ["export", tmp_path / "a.ply", "--sh", 3, "--out", tmp_path / "b.glb"]
     command(*given)
     assert "wrote 40 Gaussians" in capsys.readouterr().out
-    assert np.array_equal(load_gaussians(tmp_path / "b.glb").means, model.means)
+    read = load_gaussians(tmp_path / "b.glb")
+    assert np.array_equal(read.means, model.means)
+    assert read.sh.shape == (40, 16, 3)
     assert "is there already" in refused(capsys, given, tmp_path)
 
 

@@ -17,14 +17,14 @@ OPTIONS: dict[str, list[tuple[str, str]]] = {
         ("bench --json .", "is a folder; name a file"),
         ("chart {out} --dataset {data}", "has no test views"),
         ("dataset check {long}", "File name too long"),
-        ("eval {out}", "no such run folder or PLY file"),
+        ("eval {out}", "no such run folder or"),
         ("dataset check {out}", "no such dataset folder"),
         ("render {ply} --cameras {data} --out {out} --width 100000000", "100000000x"),
         ("render {ply} --cameras {data} --out {out} --background 255 255 255", "from 0 to 1"),
         ("video {run} --out {out}.avi", "films are written as .mp4, .gif, .png"),
     ],
     "view": [
-        ("{out}.ply", "no such run folder or PLY file"),
+        ("{out}.ply", "no such run folder or"),
         ("{root}", "holds no run"),
         ("{ply} --follow", "--follow needs the folder of a run"),
         ("{run} --host 192.0.2.1", "cannot be served there"),  # of an example network

@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from plyfile import PlyData, PlyElement
 from test_render_command import foreign_ply, gaussians
 
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
-from mgs.splat_ply import read_ply, write_compressed_ply
+from mgs.splat_ply import read_ply, write_compressed_ply, write_ply
 
 C0 = 0.28209479177387814
 RANGES = [
@@ -127,3 +128,42 @@ def test_any_ply(tmp_path, degree, encoding, comment):
     foreign_ply(path, model, encoding)
     path.write_bytes(path.read_bytes().replace(b"from another tool", comment, 1))
     assert read_ply(path) == replace(model, linear=False)
+
+
+COMMENTS = [
+    (b"SplatRenderMode: mip", True),
+    (b"splatrendermode: default", False),
+    (b"antialiased 1", True),
+    (b"antialiased 0", False),
+    (b"not antialiased at all", False),
+]
+
+
+@pytest.mark.parametrize(("comment", "antialiased"), COMMENTS)
+def test_comments_of_other_tools_about_antialiasing(tmp_path, comment, antialiased):
+    path = tmp_path / "x.ply"
+    foreign_ply(path, gaussians(0), "ascii")
+    path.write_bytes(path.read_bytes().replace(b"from another tool", comment, 1))
+    assert read_ply(path).antialiased == antialiased
+    path.write_bytes(path.read_bytes().replace(comment, b"SplatRenderMode: 2dgs", 1))
+    with pytest.raises(InputError, match="2DGS"):
+        read_ply(path)
+
+
+def test_the_filter_of_mip_splatting_is_applied(tmp_path):
+    """As Mip-Splatting's own export to other viewers: wider, and fainter in proportion."""
+    model, path = gaussians(1), tmp_path / "x.ply"
+    write_ply(path, replace(model, linear=False))
+    ply = PlyData.read(path)
+    table = ply["vertex"].data
+    named = [(name, "f4") for name in (*table.dtype.names, "filter_3D")]
+    wide = np.empty(len(table), named)
+    for name in table.dtype.names:
+        wide[name] = table[name]
+    wide["filter_3D"] = 0.1
+    PlyData([PlyElement.describe(wide, "vertex")], comments=ply.comments).write(path)
+    read = read_ply(path)
+    variances = np.exp(2 * model.log_scales)
+    np.testing.assert_allclose(np.exp(2 * read.log_scales), variances + 0.01, rtol=1e-5)
+    mass = [one.opacities * np.exp(one.log_scales.astype(float).sum(1)) for one in (model, read)]
+    np.testing.assert_allclose(*mass, rtol=1e-4)

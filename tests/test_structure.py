@@ -12,9 +12,9 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 ROOMS = [
     "errors", "seeds", "runtime", "resources", "provenance", "colour", "rotation", "memory",
-    "notebook", "camera", "gaussians", "files", "images", "splat_ply", "splat_gltf", "splat_files",
-    "metrics", "plotting",
-    "data", "synth", "survey", "prior", "splat", "evaluation",
+    "notebook", "camera", "gaussians", "files", "images", "metrics", "plotting",
+    "data", "synth", "survey", "prior", "splat",
+    "splat_places", "splat_ply", "splat_gltf", "splat_files", "evaluation",
     "policy", "fit", "run", "report", "view",
     "bench", "study", "cli", "__main__",
 ]  # fmt: skip

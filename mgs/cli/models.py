@@ -21,10 +21,11 @@ if TYPE_CHECKING:
 
 def evaluate(
     subjects: Annotated[
-        list[Path], argument("Folders that `mgs nbv` wrote, or PLYs.", metavar="RUN|SPLATS.ply...")
+        list[Path],
+        argument("Folders that `mgs nbv` wrote, or PLY, GLB, SPZ.", metavar="RUN|SPLATS..."),
     ],
     dataset: Annotated[
-        Path | None, option("Dataset for a PLY. Default: that of the run whose folder holds it.")
+        Path | None, option("Dataset for a file. Default: that of the run whose folder holds it.")
     ] = None,
     pictures: Annotated[
         bool, option("Write truth, render and difference of each view to RUN/renders.")
@@ -41,7 +42,7 @@ def evaluate(
     RUN/metrics.json, and renders beside the truth.
 
     Held-out views are frames of the dataset that the run did not take. A run's refitted and pruned
-    models are measured, too. The metrics of a PLY are written beside it. Metrics and pictures that
+    models are measured, too. The metrics of a file are written beside it. Metrics and pictures that
     are up to date are kept. The truth is the rock on black. PSNR and SSIM are over the full frame,
     and masked to the pixels of the rock. metrics.json also has the errors of alpha and depth, where
     the dataset has their truth.
@@ -61,7 +62,7 @@ def evaluate(
             if subject.is_dir():
                 if dataset is not None:
                     raise InputError(
-                        f"--dataset: is for a PLY, and {subject} has its own dataset; leave it out"
+                        f"--dataset: is for a file, and {subject} has its own dataset; leave it out"
                     )
                 options = {"pictures": pictures, "convergence": convergence, "progress": progress}
                 rows += _measured_run(subject, len(subjects) == 1, said, options)

@@ -32,6 +32,10 @@ def export(
         Literal["srgb", "linear"],
         option("Colours to write: sRGB, as most viewers expect, or linear RGB, in which mgs fits."),
     ] = "srgb",
+    sh: Annotated[
+        int | None,
+        option("Raise the SH degree, for programs that read degree 3 only.", min=0, max=3),
+    ] = None,
     force: Force = False,
 ) -> None:
     """Write a model for other programs: viewers, game engines, web pages.
@@ -53,6 +57,7 @@ def export(
                 f"{model}: its colours are sRGB already; leave out --colour-space linear"
             )
         shown = in_srgb(found.gaussians) if colour_space == "srgb" else found.gaussians
+        shown = shown.with_degree(max(sh or 0, shown.sh_degree))
         write_gaussians(path, shown, to, to_y_up(found.up))
         megabytes = path.stat().st_size / 1e6
         echo(f"wrote {len(shown):,} Gaussians to {path} ({megabytes:.1f} MB)")

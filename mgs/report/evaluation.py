@@ -21,7 +21,7 @@ from mgs.provenance import versions
 from mgs.report.runs import read_metrics
 from mgs.run.folder import Run, holds_run, open_run, read_config
 from mgs.run.inputs import array_digest, camera_digest, frame_digests
-from mgs.splat_ply import read_ply
+from mgs.splat_files import load_gaussians
 
 
 def evaluate_run(
@@ -165,13 +165,14 @@ def evaluate(
     """Measure PSNR and SSIM of a run or a model; return the contents of metrics.json.
 
     - subject: a run or its folder, measured by `evaluate_run` with its options; or Gaussians, or a
-      PLY file, whose metrics are written beside it as NAME.metrics.json.
-    - dataset: of Gaussians or a PLY. Default for a PLY in a run folder: the run's.
-    - trained: names of the frames that the model was trained on. Default for a PLY in a run folder,
-      on the run's dataset: the views taken.
+      file of them, whose metrics are written beside it as NAME.metrics.json.
+    - dataset: of Gaussians or a file. Default for a file in a run folder: the run's.
+    - trained: names of the frames that the model was trained on. Default for a file in a run
+      folder, on the run's dataset: the views taken.
 
-    Raises InputError as `evaluate_run`, `read_ply` and `load_dataset`, if a model comes without a
-    dataset, if trained names no frame of it, and if dataset or trained are given for a run.
+    Raises InputError as `evaluate_run`, `load_gaussians` and `load_dataset`, if a model comes
+    without a dataset, if trained names no frame of it, and if dataset or trained are given for a
+    run.
     """
     if isinstance(subject, Run) or (not isinstance(subject, Gaussians) and Path(subject).is_dir()):
         if dataset is not None or trained:
@@ -183,8 +184,8 @@ def evaluate(
     if not isinstance(subject, Gaussians):
         path = Path(subject)
         if not path.exists():
-            raise InputError(f"{path}: no such run folder or PLY file")
-        subject = read_ply(path)
+            raise InputError(f"{path}: no such run folder or file of Gaussians")
+        subject = load_gaussians(path)
         if holds_run(path.parent):
             root = dataset.root if isinstance(dataset, Dataset) else dataset
             of_run = Path(read_config(path.parent)["settings"]["dataset"])

@@ -13,7 +13,7 @@ from mgs.gaussians import Gaussians
 from mgs.report.runs import up_of
 from mgs.run.folder import open_run
 from mgs.splat.reference import sh_basis
-from mgs.splat_files import load_gaussians
+from mgs.splat_files import load_gaussians, upward
 
 DIRECTIONS = 64
 """Directions to which the coefficients of a converted colour are fitted."""
@@ -31,11 +31,11 @@ class Model:
 
 
 def read_model(source: str | Path) -> Model:
-    """Read the model of a run folder, or of a file, whose world is taken as +Z up. Raises
+    """Read the model of a run folder, or of a file with the up that it has (`upward`). Raises
     InputError as `open_run`, `Run.state` and `load_gaussians`."""
     source = Path(source)
     if not source.is_dir():
-        return Model(load_gaussians(source))
+        return Model(load_gaussians(source), upward(source))
     run = open_run(source)
     return Model(run.state.gaussians, up_of(run.settings.prior, run.dataset))
 

@@ -169,7 +169,7 @@ def _sums(
 ) -> tuple[Moments, Any, Any, list[ByMean]]:
     """Sums of `kernels.fisher`, the camera and splats for `geometry`, and derivatives by the means.
     means, normals, alpha_weight: as in `exact`."""
-    device = camera_array(camera)
+    device = camera_array(camera.seen_from(gaussians.origin))
     splats, lists, packed = splats_and_lists(gaussians, camera, cache)
     moving = means != "frozen"
     cross = block or (moving and gaussians.sh_degree > 0)  # then colour depends on the mean

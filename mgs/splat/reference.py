@@ -85,7 +85,7 @@ def project(gaussians: Gaussians, camera: Camera) -> Projected:
     J [N,2,3] is the Jacobian of the projection at each mean, T = J R maps metres to pixels.
     """
     means = np.asarray(gaussians.means, np.float64)
-    camera = camera.film or camera
+    camera = (camera.film or camera).seen_from(gaussians.origin)
     R, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     x, y, z = (means @ R.T + t).T
@@ -259,7 +259,8 @@ def jacobian(
     order, alpha, T, clipped = composite(projected, camera)
     weights = alpha * T
     n, K = len(gaussians), (gaussians.sh_degree + 1) ** 2
-    directions = np.asarray(gaussians.means, np.float64) - camera.position
+    eye = camera.seen_from(gaussians.origin).position
+    directions = np.asarray(gaussians.means, np.float64) - eye
     directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
     basis = sh_basis(directions, gaussians.sh_degree)
     extra = int(alpha_weight > 0)

@@ -243,7 +243,8 @@ def splats_and_lists(
     Raises InputError if a parameter is not finite or a colour beyond SH_MAX, naming parameter and
     Gaussian; and if the view has too many pairs.
     """
-    splats = (project if dr.grad_enabled(gaussians) else projected)(gaussians, camera_array(camera))
+    device = camera_array(camera.seen_from(gaussians.origin))
+    splats = (project if dr.grad_enabled(gaussians) else projected)(gaussians, device)
     try:
         return splats, *(cache or ListCache()).get(camera, dr.detach(splats))
     except InputError:

@@ -18,7 +18,7 @@ from mgs.report.page_facts import step_facts
 from mgs.report.runs import read_metrics, up_of
 from mgs.run.ending import RunEnd
 from mgs.run.folder import Run, open_run
-from mgs.splat_files import load_gaussians
+from mgs.splat_files import load_gaussians, upward
 
 SCALARS = ("information", "uncertainty", "unobserved")
 """Scalars of `mgs.report.diagnostics` that the viewer shows."""
@@ -45,7 +45,7 @@ class Subject:
 
     gaussians: the model; None before the first finished step. scalars: name -> [N], of SCALARS;
     empty for a PLY. views: of the dataset, in its order; empty for a PLY. up, unit: of the world;
-    +Z and "unit" for a PLY. scale: all lengths over those of the world.
+    +Z (GLB: what it says) and "unit" for a file. scale: all lengths over those of the world.
     """
 
     title: str
@@ -77,7 +77,7 @@ def read_subject(path: str | Path, follow: bool = False) -> Subject:
         raise InputError(f"{path}: --follow needs the folder of a run")
     if not path.is_file():
         raise InputError(f"{path}: no such run folder or PLY file")
-    return scaled(Subject(path.name, load_gaussians(path), unit="unit"))
+    return scaled(Subject(path.name, load_gaussians(path), up=upward(path), unit="unit"))
 
 
 def scaled(subject: Subject) -> Subject:

@@ -1,0 +1,179 @@
+"""glTF 2.0 files: JSON, the numbers of accessors, and the meshes that a scene places."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from collections.abc import Callable, Iterator, Set
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.errors import InputError
+from mgs.rotation import rotmat_from_quat
+
+MAGIC = b"glTF"
+"""First bytes of a binary file (.glb)."""
+
+JSON, BINARY = 0x4E4F534A, 0x004E4942
+"""Types of the two chunks of a GLB."""
+
+COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+"""Component types of accessors -> NumPy's."""
+
+SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+"""Types of accessors -> numbers of an element."""
+
+INSTANCING = "EXT_mesh_gpu_instancing"
+
+DEEPEST = 200
+"""Most levels of nodes."""
+
+Transform = np.ndarray
+"""Affine map [4,4] from a mesh's coordinates to the scene's."""
+
+
+class Gltf:
+    """Contents of a file: `json`, and its numbers by `accessor` and `bytes_of`.
+
+    Raises InputError if it needs an extension (`extensionsRequired`) that is not in `handled`, and
+    errors of many types if it is damaged (`mgs.files.parsing`). resolve: returns the bytes of a
+    file that is named beside it.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        handled: Set[str],
+        resolve: Callable[[str], bytes] | None = None,
+    ) -> None:
+        self.path, self.resolve = path, resolve
+        data = path.read_bytes()
+        chunks = _chunks(data) if data.startswith(MAGIC) else {JSON: data}
+        self.json: dict[str, Any] = json.loads(chunks[JSON])
+        self.binary = chunks.get(BINARY, b"")
+        if missing := [x for x in self.json.get("extensionsRequired", []) if x not in handled]:
+            raise InputError(
+                f"{path}: needs the glTF extension {missing[0]}, which mgs does not read; "
+                "export it without"
+            )
+        self._buffers: dict[int, bytes] = {}
+
+    def file(self, uri: str) -> bytes:
+        """Bytes of a data URI or of a file beside this one."""
+        if uri.startswith("data:"):
+            return base64.b64decode(uri.partition("base64,")[2])
+        if self.resolve is None:
+            raise InputError(f"{self.path}: names the file {uri}; export it as one GLB")
+        return self.resolve(uri)
+
+    def bytes_of(self, view: int) -> bytes:
+        """Bytes of a buffer view."""
+        found = self.json["bufferViews"][view]
+        index, start = found["buffer"], found.get("byteOffset", 0)
+        if index not in self._buffers:
+            uri = self.json["buffers"][index].get("uri")
+            self._buffers[index] = self.binary if uri is None else self.file(uri)
+        data = self._buffers[index][start : start + found["byteLength"]]
+        if start < 0 or len(data) != found["byteLength"]:
+            raise ValueError("a buffer view lies outside its buffer")
+        return data
+
+    def accessor(self, index: int) -> np.ndarray:
+        """Numbers of an accessor [N,size]; float64 if it is normalised, else of its own type."""
+        found = self.json["accessors"][index]
+        kind, size, count = COMPONENTS[found["componentType"]], SIZES[found["type"]], found["count"]
+        if "bufferView" in found:
+            start = found.get("byteOffset", 0)
+            values = self._numbers(found["bufferView"], start, kind, count, size)
+        else:
+            values = np.zeros((count, size), kind)
+        if "sparse" in found:
+            sparse, values = found["sparse"], values.copy()
+            n, at, new = sparse["count"], sparse["indices"], sparse["values"]
+            whole = COMPONENTS[at["componentType"]]
+            places = self._numbers(at["bufferView"], at.get("byteOffset", 0), whole, n, 1)[:, 0]
+            values[places] = self._numbers(
+                new["bufferView"], new.get("byteOffset", 0), kind, n, size
+            )
+        if found.get("normalized") and values.dtype.kind != "f":
+            return np.maximum(values / np.iinfo(values.dtype).max, -1)
+        return values
+
+    def _numbers(self, view: int, start: int, kind: str, count: int, size: int) -> np.ndarray:
+        """Numbers [count,size] of a buffer view. NumPy raises if they do not lie within it."""
+        each = np.dtype(kind).itemsize
+        stride = self.json["bufferViews"][view].get("byteStride", each * size)
+        if not isinstance(count, int) or start < 0 or stride < each * size:
+            raise ValueError("an accessor lies outside its buffer")
+        return np.ndarray((count, size), kind, self.bytes_of(view), start, (stride, each))
+
+    def placed(self) -> Iterator[tuple[int, Transform]]:
+        """Each mesh of the default scene with its transform; repeated where it is instanced. In a
+        file without nodes, all meshes as they are."""
+        nodes = self.json.get("nodes") or [{"mesh": m} for m in range(len(self.json["meshes"]))]
+        scenes = self.json.get("scenes")
+        if scenes and "nodes" in self.json:
+            roots = scenes[self.json.get("scene", 0)].get("nodes", [])
+        else:
+            children = {child for node in nodes for child in node.get("children", [])}
+            roots = [index for index in range(len(nodes)) if index not in children]
+        waiting, seen = [(root, np.eye(4), 0) for root in reversed(roots)], set()
+        while waiting:
+            index, above, depth = waiting.pop()
+            node = nodes[index]
+            if index in seen or depth > DEEPEST:
+                raise ValueError("its nodes are no tree")
+            seen.add(index)
+            here = above @ node_matrix(node)
+            if "mesh" in node:
+                for instance in self._instances(node):
+                    yield node["mesh"], here @ instance
+            waiting += [(child, here, depth + 1) for child in reversed(node.get("children", []))]
+
+    def _instances(self, node: dict[str, Any]) -> Iterator[Transform]:
+        """Transforms of a node's instances (EXT_mesh_gpu_instancing); the identity without."""
+        given = node.get("extensions", {}).get(INSTANCING, {}).get("attributes", {})
+        names = ("TRANSLATION", "ROTATION", "SCALE")
+        columns = {x.lower(): self.accessor(given[x]).tolist() for x in names if x in given}
+        for values in zip(*columns.values(), strict=True) if columns else [()]:
+            yield node_matrix(dict(zip(columns, values, strict=True)))
+
+
+def _chunks(data: bytes) -> dict[int, bytes]:
+    """Chunks of a GLB by their type. Raises ValueError or struct.error if it is damaged."""
+    start = 12
+    chunks: dict[int, bytes] = {}
+    while start + 8 <= len(data):
+        size, kind = struct.unpack_from("<II", data, start)
+        if start + 8 + size > len(data):
+            raise ValueError("it ends within a chunk")
+        chunks.setdefault(kind, data[start + 8 : start + 8 + size])
+        start += 8 + size
+    return chunks
+
+
+def node_matrix(node: dict[str, Any]) -> Transform:
+    """Transform [4,4] of a node relative to its parent: its matrix, or T R S."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    matrix = np.eye(4)
+    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+    matrix[:3, :3] = rotmat_from_quat([w, x, y, z]) * np.array(node.get("scale", (1, 1, 1)), float)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
+
+
+def triangles(mode: int, indices: np.ndarray) -> np.ndarray:
+    """Faces [F,3] of a primitive's indices; none of points and lines (modes 0 to 3)."""
+    if mode == 4:
+        return indices.reshape(-1, 3)
+    if mode == 5:
+        faces = np.stack([indices[:-2], indices[1:-1], indices[2:]], 1)
+        faces[1::2] = faces[1::2, [1, 0, 2]]
+        return faces
+    if mode == 6:
+        return np.stack([np.full(len(indices) - 2, indices[0]), indices[1:-1], indices[2:]], 1)
+    return np.zeros((0, 3), np.int64)
