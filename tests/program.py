@@ -1,8 +1,10 @@
 """Run commands of the program in this process, and read the steps of a run."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mgs.cli.app import main
@@ -48,3 +50,16 @@ def change_settings(run: Path, **values) -> None:
     config = json.loads((run / "config.json").read_text())
     config["settings"] |= values
     (run / "config.json").write_text(json.dumps(config))
+
+
+def change_steps(run: Path, change: Callable[[list[dict]], list[dict]], **record) -> None:
+    """Change the steps of a run, in its checkpoint and in steps.jsonl. record: other values of the
+    checkpoint's text."""
+    with np.load(run / "checkpoint.npz") as data:
+        arrays = dict(data)
+    known = json.loads(str(arrays["json"]))
+    known |= {"steps": change(known["steps"]), **record}
+    arrays["json"] = np.array(json.dumps(known))
+    np.savez(run / "checkpoint.npz", **arrays)
+    lines = [json.dumps(line) + "\n" for line in known["steps"]]
+    (run / "steps.jsonl").write_text("".join(lines))

@@ -18,8 +18,7 @@ from mgs.evaluation import evaluate_model
 from mgs.images import write_png
 from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.report.page_facts import measured, read_shown
-from mgs.report.runs import read_run
+from mgs.report.page_facts import measured, notes
 from mgs.run import folder as run_folder
 from mgs.run.checks import predicted_psnr
 from mgs.run.detectors import (
@@ -34,6 +33,7 @@ from mgs.run.detectors import (
     view_indicators,
 )
 from mgs.run.ending import why_ended
+from mgs.run.folder import open_run
 from mgs.run.nbv import run_nbv, start_run
 from mgs.splat import as_drjit, render
 
@@ -280,7 +280,7 @@ def test_a_warning_is_printed_recorded_and_on_the_page(rock, tmp_path):
     first = run_folder.read_checkpoint(run).steps[0]
     (said,) = [warning for warning in first["warnings"] if "still fell" in warning]
     assert f"step 0: {said}" in console.export_text()
-    assert f"step 0: {said}" in read_shown("d-optimal", read_run(run), load_dataset(rock)).notes
+    assert f"step 0: {said}" in notes(open_run(run))
     assert not any("indicators" in key for key in measured(first))
 
 

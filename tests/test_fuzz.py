@@ -46,7 +46,7 @@ from mgs.images import (
 from mgs.prior.build import load_prior
 from mgs.report.evaluation import evaluate_run
 from mgs.report.page import write_page
-from mgs.report.runs import read_run
+from mgs.report.runs import compare_runs
 from mgs.run.candidates import Site, read_poses, refusals
 from mgs.run.folder import open_run
 from mgs.splat_ply import read_ply, write_ply
@@ -221,7 +221,8 @@ def read_all(path: Path) -> None:
     """Everything that commands read of the run around a file."""
     root = path.parent.parent
     found = open_run(root / "run")
-    read_run(root / "run")
+    found.metrics, found.steps  # noqa: B018
+    compare_runs([root / "run"])
     found.state, found.dataset, found.prior  # noqa: B018
     read_subject(root / "run")
 

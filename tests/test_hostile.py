@@ -1,6 +1,7 @@
 """Hostile input: one line, exit code 2, nothing lost, nothing decoded that is too large."""
 
 import json
+import math
 import os
 import shutil
 import struct
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 import tiny
 import trimesh
-from program import command, said
+from program import change_steps, command, said
 from refusals import refused
 from test_fuzz import colmap, mesh
 
@@ -24,7 +25,7 @@ from mgs.data.dataset import load_dataset
 from mgs.data.meshes import load_mesh
 from mgs.data.sources import read_source
 from mgs.errors import InputError
-from mgs.files import atomic_folder, folder_locked, read_json
+from mgs.files import atomic_folder, folder_locked, read_json, write_json
 from mgs.images import image_size, read_exr, write_exr
 from mgs.run.folder import open_run
 from mgs.splat_ply import read_ply, write_ply
@@ -358,11 +359,9 @@ def test_the_checkpoint_of_a_stranger(capsys, stranger, damage):
     assert "checkpoint.npz: " in refused(capsys, ["eval", stranger], stranger)
 
 
-SEEDS = {"seeds": [0], "images": 1, "coverage": 1}
-BAD_SEEDS = ({"seeds": [99]}, {"seeds": [-1]}, {"coverage": float("nan")}, {"seconds": [1]})
 LINES = {
     "config.json": ['{"settings": 1}', '{"settings": {}, "frames": 7}', "[]"],
-    "steps.jsonl": ["", "[]", "[" * 100_000, *(json.dumps(SEEDS | bad) for bad in BAD_SEEDS)],
+    "steps.jsonl": ["", "[]", "[" * 100_000],
     "metrics.json": ["[]", '{"images": {}}', "[" * 100_000],
 }
 """File of a run -> damaged contents."""
@@ -377,6 +376,36 @@ def test_the_text_files_of_a_stranger(capsys, stranger, file):
     if file == "metrics.json":
         with pytest.raises(InputError, match=r"metrics\.json"):
             read_subject(stranger)
+
+
+WRONG = {
+    "steps": [
+        {"images": 0}, {"images": "1"}, {"step": "0"}, {"coverage": "much"}, {"coverage": math.nan},
+        {"loss": "small"}, {"score": [1]}, {"psnr": "30"}, {"prediction": {"psnr": "30"}},
+        {"seeds": [0.5]}, {"seconds": [1]}, {"warnings": "one"}, {"ended": {"reason": "tired"}},
+        {"iterations": 1.5}, {"uncertainty": True}, {"exposure": {"kf_0000": 1}},
+    ],
+    "metrics": [
+        {"images": 0}, {"images": True}, {"all": {"psnr": "30"}}, {"views": [{"name": 1}]},
+        {"pictures": "no"}, {"fit": {"converged": 1}}, {"test_views": {}}, {"held_out": None},
+    ],
+}  # fmt: skip
+"""Values of a wrong type in the first step, and in metrics.json."""
+
+
+@pytest.mark.parametrize("change", WRONG["steps"], ids=str)
+def test_a_value_of_a_wrong_type_in_a_step(capsys, stranger, change):
+    change_steps(stranger, lambda lines: [line | change for line in lines])
+    for words in (["report", stranger], ["nbv", "--resume", stranger]):
+        assert "checkpoint.npz: " in refused(capsys, words, stranger)
+
+
+@pytest.mark.parametrize("change", WRONG["metrics"], ids=str)
+def test_a_value_of_a_wrong_type_in_metrics(capsys, stranger, change):
+    sound = {"images": 3, "all": {"count": 0}, "held_out": {"count": 0}, "views": []}
+    write_json(stranger / "metrics.json", sound | change)
+    line = refused(capsys, ["report", stranger, "--html", stranger / "a.html"], stranger)
+    assert f"metrics.json: is damaged ({next(iter(change))}" in line
 
 
 def test_control_characters_of_a_name_do_not_reach_the_terminal(tmp_path, capsys):

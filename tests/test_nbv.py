@@ -233,7 +233,7 @@ def test_a_run_of_other_frames_or_without_settings_is_named(loaded, tmp_path):
     with pytest.raises(InputError, match="frames differ"):
         run_folder.open_run(out).dataset  # noqa: B018
     (out / "config.json").write_text("{}")
-    with pytest.raises(InputError, match="no settings"):
+    with pytest.raises(InputError, match=r"is damaged \(settings: "):
         run_folder.open_run(out)
 
 

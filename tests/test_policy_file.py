@@ -10,7 +10,6 @@ import mgs
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.policy.registry import check_policy, policy_named
-from mgs.report.runs import read_run
 from mgs.run import recording
 from mgs.run.folder import open_run
 from mgs.run.nbv import start_run
@@ -144,7 +143,7 @@ def test_a_run_goes_on_with_the_same_file_only(dataset, file, tmp_path, monkeypa
     assert config["settings"]["policy"] == f"{file}:poses"
     loaded = load_dataset(dataset)
     run(half, loaded, policy=f"{file}:poses", budget=1)
-    assert read_run(half).policy == "mine.py:poses"
+    assert open_run(half).label == "mine.py:poses"
     settings = open_run(half).settings.model_copy(update={"budget": 2})
     further = lambda: recording.run(half, settings, loaded, tiny.operations(), tiny.silent)  # noqa: E731
     file.write_text(FUNCTIONS + "\n")

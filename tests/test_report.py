@@ -2,7 +2,6 @@
 file is missing."""
 
 import io
-import json
 import re
 import shutil
 from itertools import pairwise
@@ -12,12 +11,11 @@ import pytest
 import tiny
 from matplotlib import rc_context
 from PIL import Image
-from program import change_settings, command, table_numbers
-from program import steps as read_steps
-from rich.console import Console
+from program import change_settings, change_steps, command, table_numbers
 
 from mgs import plotting
 from mgs.cli import printing
+from mgs.cli.terminal import Terminal
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
@@ -26,7 +24,8 @@ from mgs.policy.registry import policy_names
 from mgs.report import figures, tables, writing
 from mgs.report.figures import POLICY_STYLE
 from mgs.report.page_plots import SYMBOLS
-from mgs.report.runs import compare_runs, read_run
+from mgs.report.runs import compare_runs
+from mgs.run.folder import open_run
 
 FIGURES = ("orbit", "gain", "coverage", "comparison", "psnr")
 
@@ -52,15 +51,14 @@ def runs(tmp_path_factory):
     ]  # fmt: skip
 
 
-def change_steps(run, change):
-    """Change each line of steps.jsonl of a run."""
-    lines = [json.dumps(change(line)) + "\n" for line in read_steps(run)]
-    (run / "steps.jsonl").write_text("".join(lines))
+def without(word, values):
+    """The values of a dict without the keys that have this word."""
+    return {key: value for key, value in values.items() if word not in key}
 
 
-def without(word):
-    """A change of a dict: keys with this word are left out."""
-    return lambda line: {key: value for key, value in line.items() if word not in key}
+def no_line_has(word):
+    """A change of lines: keys with this word are left out."""
+    return lambda lines: [without(word, line) for line in lines]
 
 
 @pytest.fixture
@@ -101,9 +99,8 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
         assert path.stat().st_size < 400_000
     assert read_json(out / "table.json") == table_numbers(runs)
 
-    read = {run.policy: run for run in map(read_run, runs)}
-    assert len(read["d-optimal"].seeds) == 3
-    assert len(set(read["d-optimal"].taken)) == 8
+    read = {run.label: run for run in map(open_run, runs)}
+    assert len(set(read["d-optimal"].indices)) == 8
 
     def numbers(x, y, factor=1, first=0):
         return {
@@ -124,7 +121,11 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
     positions = np.array([camera.position[:2] for camera in tiny.orbit()])
     for axis, run in zip(drawn["orbit.png"].axes, read.values(), strict=False):
         shown = {points.get_label(): points.get_offsets() for points in axis.collections}
-        frames = {"candidate": range(tiny.FRAMES), "seed": run.seeds, "chosen": run.chosen}
+        frames = {
+            "candidate": range(tiny.FRAMES),
+            "seed": run.indices[:3],
+            "chosen": run.indices[3:],
+        }
         for label, indices in frames.items():
             np.testing.assert_allclose(shown[label], positions[list(indices)], atol=1e-9)
     shown = images(drawn["comparison.png"])
@@ -145,7 +146,7 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
 
 def test_figures_are_written_as_asked_for_and_those_left_out_are_named(runs, tmp_path, capsys):
     run = shutil.copytree(runs[0], tmp_path / "run")
-    change_steps(run, without("psnr"))
+    change_steps(run, no_line_has("psnr"))
     command("report", run, "--out", tmp_path / "report", "--figures", "pdf")
     names = {path.name for path in (tmp_path / "report").iterdir()}
     written = {f"{name}.pdf" for name in FIGURES if name != "psnr"}
@@ -161,13 +162,13 @@ def test_figures_are_written_as_asked_for_and_those_left_out_are_named(runs, tmp
 
 
 def test_table(runs):
-    rows, run = table_numbers(runs), read_run(runs[1])
+    rows, run = table_numbers(runs), open_run(runs[1])
     means = {
         f"{views}.{name}": value
         for views in ("test", "all", "held_out")
         for name, value in run.metrics[views].items()
     }
-    positions = [tiny.orbit()[i].position for i in run.taken]
+    positions = [tiny.orbit()[i].position for i in run.indices]
     path = sum(np.linalg.norm(b - a) for a, b in pairwise(positions))
     known = {"policy": "random", "images": 8, "coverage": 100 * run.steps[-1]["coverage"]}
     assert rows[1] == means | known | {"path": pytest.approx(path), "unit": "m"}
@@ -190,15 +191,15 @@ def test_a_run_that_was_not_measured_on_the_test_views_is_compared_on_the_others
     runs, tmp_path, drawn
 ):
     run = shutil.copytree(runs[1], tmp_path / "random")
-    change_steps(run, without("test"))
-    write_json(run / "metrics.json", without("test")(read_json(run / "metrics.json")))
+    change_steps(run, no_line_has("test"))
+    write_json(run / "metrics.json", without("test", read_json(run / "metrics.json")))
     writing.write_report(tmp_path / "report", [runs[0], run])
-    read = [read_run(folder) for folder in (runs[0], run)]
+    read = [open_run(folder) for folder in (runs[0], run)]
     axis = drawn["psnr.png"].axes[0]
     assert axis.get_ylabel() == "PSNR, all views (dB)"
     assert curves(axis)["random"] == [(s["images"], s["psnr"]) for s in read[1].steps]
     index = int(drawn["comparison.png"].axes[0].get_title().removeprefix("truth\nkf_"))
-    counts = [sum(i in run.taken for run in read) for i in range(tiny.FRAMES)]
+    counts = [sum(i in run.indices for run in read) for i in range(tiny.FRAMES)]
     assert counts[index] == min(counts)
     lines = (tmp_path / "report/table.md").read_text().splitlines()
     assert [line.count("–") for line in lines[2:]] == [0, 4]
@@ -207,7 +208,7 @@ def test_a_run_that_was_not_measured_on_the_test_views_is_compared_on_the_others
 def test_runs_of_one_policy_are_told_apart_by_their_folders(runs, tmp_path):
     other = shutil.copytree(runs[1], tmp_path / "again")
     labels = ["d-optimal", "random (random)", "random (again)"]
-    assert list(compare_runs([*runs, other]).runs) == labels
+    assert list(compare_runs([*runs, other])) == labels
     with pytest.raises(InputError, match="same policy and folder name"):
         compare_runs([runs[1], runs[1]])
 
@@ -224,26 +225,28 @@ def remove(name):
 
 def unfinished(run):
     """A change of a run: it was stopped and evaluated after two steps."""
-    lines = (run / "steps.jsonl").read_text().splitlines(keepends=True)
-    (run / "steps.jsonl").write_text("".join(lines[:3]))
-    remove("gaussians.ply")(run)
+    taken = open_run(run).indices[:5]
+    change_steps(run, lambda lines: lines[:3], taken=taken)
     edit("metrics.json", images=5)(run)
 
 
 UNFIT = {
     "measured before": (edit("metrics.json", images=7), "not evaluated since its last step"),
-    "damaged metrics": (edit("metrics.json", views=[{}]), "metrics.json: is damaged; measure"),
+    "damaged metrics": (
+        edit("metrics.json", views=[{}]),
+        "is damaged (views.0.name: ",
+    ),
     "view not measured": (edit("metrics.json", views=[], test_views=[]), "not evaluated on kf_"),
     "other pictures": (edit("metrics.json", pictures=False), "no picture of this model"),
     "no pictures": (lambda run: shutil.rmtree(run / "renders"), "draw it with `mgs.evaluate"),
-    "another dataset": (lambda run: change_settings(run, dataset="/else"), "another dataset"),
+    "another dataset": (lambda run: change_settings(run, dataset="/"), "another dataset"),
     "frames changed": (edit("config.json", frames=[]), "its frames differ"),
     "budget of words": (lambda run: change_settings(run, budget="many"), "settings.budget: "),
     "budget raised": (lambda run: change_settings(run, budget=7), "with 8 of 10 views; go on"),
     "unfinished": (unfinished, "is unfinished, with 5 of 8 views; go on with `mgs.resume_nbv"),
-    "no model": (remove("gaussians.ply"), "but no gaussians.ply; write it with `mgs.resume_nbv"),
-    "no step": (remove("steps.jsonl"), "steps.jsonl: no such file"),
-    "no frame": (lambda run: change_steps(run, without("frame")), "line 2 is damaged (frame: "),
+    "no step": (remove("checkpoint.npz"), "has no finished step yet; continue it"),
+    "no lines": (remove("steps.jsonl"), "steps.jsonl: is missing or damaged"),
+    "no frame": (lambda run: change_steps(run, no_line_has("frame")), "frames are not those"),
 }
 
 
@@ -321,7 +324,7 @@ def test_every_policy_has_a_colour_and_a_marker_of_its_own():
 @pytest.mark.parametrize("tested", [True, False])
 def test_a_long_name_cuts_no_number_and_is_not_cut(tested):
     name = "random (a [second] run in a folder with a long name" + "x" * 80 + ")"
-    console = Console(width=80, record=True, file=io.StringIO())
+    console = Terminal(width=80, record=True, file=io.StringIO())
     shown = enumerate(printing.SHOWN[tested])
     row = {key: i / 8 if "ssim" in key else 30.125 + i for i, key in shown} | {"coverage": 100.0}
     rows = [{"policy": policy, "images": 12} | row for policy in (name, "random")]

@@ -8,12 +8,11 @@ from hypothesis import strategies as st
 from program import change_settings, command, steps, table_numbers
 from tiny import resume, run
 
-from mgs.data.dataset import load_dataset
 from mgs.policy import criteria
-from mgs.report.page_facts import read_shown
-from mgs.report.runs import read_run
+from mgs.report.page_facts import notes
 from mgs.report.tables import markdown_table
 from mgs.run.ending import GAIN_UNIT, run_end, why_ended
+from mgs.run.folder import open_run
 from mgs.run.settings import NbvSettings
 
 
@@ -124,7 +123,7 @@ def test_one_line_says_why_a_run_ended(dataset, prior, tmp_path, capsys):
     table = [row.split("|")[-2].strip() for row in markdown_table(rows).splitlines()]
     assert table == ["ended by", "---:", "gain", "–"]
     assert "ended by" not in markdown_table(table_numbers([whole]))
-    assert f"T{line[1:]}." in read_shown("early", read_run(early), load_dataset(dataset)).notes
+    assert f"T{line[1:]}." in notes(open_run(early))
 
 
 def test_reasons_in_words():

@@ -17,9 +17,8 @@ from mgs.files import write_json
 from mgs.gaussians import Gaussians
 from mgs.report import diagnostics
 from mgs.report.page import write_page
-from mgs.report.runs import up_of
 from mgs.report.writing import write_report
-from mgs.run.folder import open_run
+from mgs.run.folder import Run, open_run
 from mgs.view import layers
 from mgs.view.subject import read_subject
 
@@ -108,7 +107,8 @@ def test_the_viewer_knows_both(runs):
 
 
 def test_the_axis_of_the_prior_goes_before_that_of_the_dataset(runs, tmp_path):
-    dataset = load_dataset(open_run(runs[1]).settings.dataset)
-    assert up_of(tmp_path, dataset) == dataset.up
+    run = open_run(runs[1])
+    settings = run.settings.model_copy(update={"prior": tmp_path})
+    assert Run(run.folder, settings).up == run.dataset.up
     write_json(tmp_path / "prior.json", {"up": [0, 2, 0]})
-    assert up_of(tmp_path, dataset) == (0, 1, 0)
+    assert Run(run.folder, settings).up == (0, 1, 0)

@@ -92,7 +92,7 @@ def demo(
             diagnose(runs[:1], force=True)
     heading("4/4 the report")
     compared = compare_runs(runs)
-    written = write_report(report, compared)
+    written = write_report(report, list(compared.values()))
     print_quality(console, comparison_rows(compared))
     console.print(f"done in {time.monotonic() - started:.0f} s; look at:")
     for picture in (dataset / "contact_sheet.png", folder / "prior.png", *written):

@@ -82,7 +82,6 @@ def _measured_run(
     """Evaluate a run; return its row of the table. alone: whether no other one is shown. said: gets
     the lines for the user."""
     from mgs.report.evaluation import evaluate_run
-    from mgs.report.runs import Comparison, read_run
     from mgs.report.tables import comparison_rows
     from mgs.run.ending import fit_line
     from mgs.run.folder import open_run
@@ -93,7 +92,7 @@ def _measured_run(
     if "fit" in metrics:
         said.insert(first, fit_line(metrics["fit"], opened.state.steps[-1]["stop_reason"]))
     label = opened.label if alone else f"{opened.label} ({run.resolve().name})"
-    return comparison_rows(Comparison({label: read_run(run)}, opened.dataset))
+    return comparison_rows({label: opened})
 
 
 def diagnose(

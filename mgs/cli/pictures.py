@@ -87,7 +87,7 @@ def render(
     views = [
         (name, camera.resized(width) if width else camera) for name, camera in load_cameras(cameras)
     ]
-    gaussians = read_model(subject).gaussians
+    gaussians, _ = read_model(subject)
     if colour_space != "auto":
         gaussians = replace(gaussians, linear=colour_space == "linear")
     if antialiased is not None:

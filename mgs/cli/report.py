@@ -67,16 +67,16 @@ def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
         check_new_file(out / name, force)
     compared = compare_runs(runs)
     with folder_locked(out):
-        written = write_report(out, compared, kind)
+        written = write_report(out, list(compared.values()), kind)
     rows = comparison_rows(compared)
     print_quality(Terminal(), rows)
-    for row, run in zip(rows, compared.runs.values(), strict=True):
-        if run.settings["budget"]:
+    for row, run in zip(rows, compared.values(), strict=True):
+        if run.settings.budget:
             path = f"a path of {row['path']:.2f} {row['unit']}"
             echo(f"{row['policy']}: {path}; the run has ended: {why_ended(run.ended or {})}")
     for file in written:
         echo(f"wrote {file}")
-    chosen = any(run.settings["budget"] for run in compared.runs.values())
+    chosen = any(run.settings.budget for run in compared.values())
     if chosen and not any(file.stem == "psnr" for file in written):
         echo("PSNR against images is left out: make all runs with --evaluate-every to have it")
 

@@ -51,14 +51,14 @@ def export(
         for one in models
     ]
     for model, path in _targets(models, defaults, out, force):
-        found = read_model(model)
-        if not found.gaussians.linear and colour_space == "linear":
+        gaussians, up = read_model(model)
+        if not gaussians.linear and colour_space == "linear":
             raise InputError(
                 f"{model}: its colours are sRGB already; leave out --colour-space linear"
             )
-        shown = in_srgb(found.gaussians) if colour_space == "srgb" else found.gaussians
+        shown = in_srgb(gaussians) if colour_space == "srgb" else gaussians
         shown = shown.with_degree(max(sh or 0, shown.sh_degree))
-        write_gaussians(path, shown, to, to_y_up(found.up))
+        write_gaussians(path, shown, to, to_y_up(up))
         megabytes = path.stat().st_size / 1e6
         echo(f"wrote {len(shown):,} Gaussians to {path} ({megabytes:.1f} MB)")
 

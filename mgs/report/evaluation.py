@@ -18,8 +18,7 @@ from mgs.files import working_in, write_json
 from mgs.gaussians import ARRAYS, Gaussians
 from mgs.memory import KEPT_BYTES, release
 from mgs.provenance import versions
-from mgs.report.runs import read_metrics
-from mgs.run.folder import Run, holds_run, open_run, read_config
+from mgs.run.folder import Run, holds_run, open_run, read_config, read_metrics
 from mgs.run.inputs import array_digest, camera_digest, frame_digests
 from mgs.splat_files import load_gaussians
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from mgs.colour import srgb_from_linear
-from mgs.data.up import PLUS_Z, Up, upright
+from mgs.data.up import Up, upright
 from mgs.gaussians import Gaussians
-from mgs.report.runs import up_of
 from mgs.run.folder import open_run
 from mgs.splat.reference import sh_basis
 from mgs.splat_files import load_gaussians, upward
@@ -22,22 +21,14 @@ PART = 1 << 16
 """Gaussians whose colours are converted at a time."""
 
 
-@dataclass(frozen=True)
-class Model:
-    """Gaussians, and the world's up."""
-
-    gaussians: Gaussians
-    up: Up = PLUS_Z
-
-
-def read_model(source: str | Path) -> Model:
+def read_model(source: str | Path) -> tuple[Gaussians, Up]:
     """Read the model of a run folder, or of a file with the up that it has (`upward`). Raises
     InputError as `open_run`, `Run.state` and `load_gaussians`."""
     source = Path(source)
     if not source.is_dir():
-        return Model(load_gaussians(source), upward(source))
+        return load_gaussians(source), upward(source)
     run = open_run(source)
-    return Model(run.state.gaussians, up_of(run.settings.prior, run.dataset))
+    return run.gaussians, run.up
 
 
 def in_srgb(g: Gaussians) -> Gaussians:

@@ -8,7 +8,7 @@ missing.
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
 from itertools import pairwise
@@ -18,17 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame
 from mgs.data.up import upright
 from mgs.files import atomic_path
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.page_facts import (
-    Shown,
     links,
     measured,
     measured_views,
-    read_shown,
+    notes,
+    psnr_of,
     setting_rows,
     step_facts,
     summary_rows,
@@ -43,8 +42,9 @@ from mgs.report.page_pictures import (
     new_album,
 )
 from mgs.report.page_plots import METRIC_NAMES, line_plot, orbit_plot, timing_plot, views_plot
-from mgs.report.runs import RunFiles, compare_runs, least_trained, step_curves
+from mgs.report.runs import compare_runs, least_trained, step_curves
 from mgs.report.writing import shown_view
+from mgs.run.folder import Run
 
 COMPARED = 6
 """Most views of the dataset, and most test views, on which truth and renders are compared."""
@@ -62,23 +62,23 @@ def write_page(
     page, byte for byte. Raises InputError as `mgs.report.runs.compare_runs`, and if a file is
     damaged or the page cannot be written.
     """
-    path, compared = Path(path), compare_runs(folders)
-    dataset = compared.dataset
-    shown = [read_shown(label, run, dataset) for label, run in compared.runs.items()]
-    album, views = draw_pictures(shown, dataset, progress)
+    path, runs = Path(path), compare_runs(folders)
+    views = compared_frames(list(runs.values()))
+    album = draw_pictures(runs, views, progress)
     limit = album.finish()
     text = _fill_in(
-        title=", ".join(compared.runs),
-        dataset=dataset.root.resolve().name,
-        shown=shown,
-        summary=summary_rows(shown, dataset),
-        settings=setting_rows(shown),
-        files=[(one.label, links(one.run, path)) for one in shown],
+        title=", ".join(runs),
+        dataset=next(iter(runs.values())).dataset.root.resolve().name,
+        labels=list(runs),
+        notes={label: notes(run) for label, run in runs.items()},
+        summary=summary_rows(runs),
+        settings=setting_rows(runs),
+        files=[(label, links(run, path)) for label, run in runs.items()],
         data={
             "pictures": album.pictures,
-            "runs": [_section(one, dataset) for one in shown],
-            "compared": [_compared(shown, frame) for frame in views],
-            "plots": _plots(shown),
+            "runs": [_section(label, run) for label, run in runs.items()],
+            "compared": [_compared(runs, frame) for frame in views],
+            "plots": _plots(runs),
         },
         limit=limit,
         scales={
@@ -92,27 +92,22 @@ def write_page(
 
 
 def draw_pictures(
-    shown: Sequence[Shown],
-    dataset: Dataset,
+    runs: Mapping[str, Run],
+    views: Sequence[Frame],
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> tuple[Album, list[Frame]]:
-    """Draw the pictures of the page: of every run the views that it took, and of the returned
-    frames (`compared_frames`) the truth and the renders of all runs.
+) -> Album:
+    """Draw the pictures of the page: of every run the views that it took, and of `views` the truth
+    and the renders of all runs.
 
     Raises InputError if a file of a frame cannot be read.
     """
     from mgs.splat import render
 
-    modelled = [(one, one.model) for one in shown if one.model is not None]
-    if not modelled:
-        return Album(), []
-    views = compared_frames([one.run for one in shown], dataset)
-    frames = [*views, *(frame for one, _ in modelled for frame in one.frames)]
-    taken = sum(len(one.frames) for one, _ in modelled)
-    total, done = taken + len(views) * len(modelled), 0
+    frames = [*views, *(frame for run in runs.values() for frame in run.taken)]
+    taken = len(frames) - len(views)
+    total, done = taken + len(views) * len(runs), 0
     # Of each view a render and an error, of taken ones two maps more, of each frame a truth.
-    count = 2 * total + 2 * taken + len({frame.name for frame in frames})
-    album = new_album(frames, count)
+    album = new_album(frames, 2 * total + 2 * taken + len({frame.name for frame in frames}))
 
     def drawn() -> None:
         nonlocal done
@@ -120,28 +115,29 @@ def draw_pictures(
         progress(done, total)
 
     progress(0, total)
-    for one, model in modelled:
-        noise = one.run.settings["pixel_noise"], one.run.settings["prior_std"]
-        draw_taken(album, one.label, model, one.frames, noise, drawn)
+    for label, run in runs.items():
+        draw_taken(album, label, run, drawn)
         for frame in views:
-            name = f"{frame.name}/{one.label}"
+            name = f"{frame.name}/{label}"
             if f"render/{name}" not in album.pictures:
-                draw_render(album, name, frame, np.asarray(render(model, frame.camera).rgb))
+                rgb = np.asarray(render(run.gaussians, frame.camera).rgb)
+                draw_render(album, name, frame, rgb)
             drawn()
-    return album, views
+    return album
 
 
-def compared_frames(runs: Sequence[RunFiles], dataset: Dataset) -> list[Frame]:
+def compared_frames(runs: Sequence[Run]) -> list[Frame]:
     """Frames on which the page compares truth and renders: up to COMPARED that the fewest runs were
     trained on, spread evenly, and as many test views, named `test/NAME`. Of measured runs the first
     is that of `shown_view`."""
-    there = dataset.with_images({dataset.frames[i].name for run in runs for i in run.taken})
-    pool, tests = least_trained(runs, dataset, there), dataset.test_views()
-    frames = () if tests is None else tests.frames
-    views = [*_spread(pool), *_spread([replace(f, name=f"test/{f.name}") for f in frames])]
+    dataset = runs[0].dataset
+    there = dataset.with_images({frame.name for run in runs for frame in run.taken})
+    tests = dataset.test_views()
+    named = [replace(f, name=f"test/{f.name}") for f in (tests.frames if tests else ())]
+    views = [*_spread(least_trained(runs, there)), *_spread(named)]
     if not views or any(run.measured is None for run in runs):
         return views
-    first, of = shown_view(runs, dataset)
+    first, of = shown_view(runs)
     first = replace(first, name=f"test/{first.name}") if of == "test_views" else first
     return [first, *(view for view in views if view.name != first.name)]
 
@@ -152,81 +148,76 @@ def _spread(frames: Sequence[Frame]) -> list[Frame]:
     return [frames[i * len(frames) // count] for i in range(count)]
 
 
-def _section(one: Shown, dataset: Dataset) -> dict[str, Any]:
+def _section(label: str, run: Run) -> dict[str, Any]:
     """Section of one run: its views in the order they were taken, orbit, and times."""
     return {
-        "label": one.label,
-        "views": [_view(one, k) for k in range(len(one.frames))],
-        "orbit": orbit_plot(one.label, one.run, dataset, one.model, one.up),
-        "time": timing_plot(one.label, one.run.steps),
+        "label": label,
+        "views": [_view(label, run, k, frame) for k, frame in enumerate(run.taken)],
+        "orbit": orbit_plot(label, run),
+        "time": timing_plot(label, run.steps),
     }
 
 
-def _view(one: Shown, k: int) -> dict[str, Any]:
+def _view(label: str, run: Run, k: int, frame: Frame) -> dict[str, Any]:
     """The k-th view that a run took: facts, pictures, and the position of its camera in the
     plot."""
-    frame, seeds = one.frames[k], len(one.run.seeds)
-    step = one.run.steps[max(0, k - seeds + 1)]
+    seeds = run.settings.seeds
+    step = run.steps[max(0, k - seeds + 1)]
     role = f"seed {k + 1} of {seeds}" if k < seeds else f"step {step['step']}"
     facts = [("view", frame.name), ("taken as", role)]
     # The numbers are known after the last of the seeds.
     facts += step_facts(step) if k >= seeds - 1 else [("images", str(k + 1))]
-    pictures = [] if one.model is None else _pictures(one, frame.name, k + 1)
-    eye = (upright(one.up) @ frame.camera.position).tolist()
-    return {"name": frame.name, "facts": facts, "pictures": pictures, "eye": eye}
+    return {
+        "name": frame.name,
+        "facts": facts,
+        "pictures": list(_pictures(label, run, frame.name, k)),
+        "eye": (upright(run.up) @ frame.camera.position).tolist(),
+    }
 
 
-def _pictures(one: Shown, view: str, images: int) -> list[dict[str, str]]:
-    """Pictures of a view that a run took: names in the album, captions, alternative texts. images:
-    number of images with this one."""
-    quality, own = one.psnr_of(view), f"{view}/{one.label}"
-    before, after = (f"{n} image{'' if n == 1 else 's'}" for n in (images - 1, images))
-    known = f"Uncertainty seen from {view}"
-    rows = [
-        (f"truth/{view}", "truth", f"Truth: the image of {view}, the rock in front of black."),
+def _pictures(label: str, run: Run, view: str, k: int) -> Iterable[dict[str, str]]:
+    """Pictures of the k-th view that a run took: names in the album, captions, alternative
+    texts."""
+    quality, known = psnr_of(run, view), f"Uncertainty seen from {view}"
+    before, after = (f"{n} image{'' if n == 1 else 's'}" for n in (k, k + 1))
+    render = f"Render of the model of {len(run.indices)} images at {view}{quality}."
+    error = f"Absolute difference of truth and render at {view}, bright where it is large{quality}."
+    bright = "bright where little is known"
+    for name, caption, alt in (
+        ("truth", "truth", f"Truth: the image of {view}, the rock in front of black."),
+        ("render", f"render{quality}", render),
+        ("error", "error", error),
         (
-            f"render/{own}",
-            f"render{quality}",
-            f"Render of the model of {len(one.frames)} images at {view}{quality}.",
-        ),
-        (
-            f"error/{own}",
-            "error",
-            f"Absolute difference of truth and render at {view}, bright where it is large"
-            f"{quality}.",
-        ),
-        (
-            f"before/{own}",
+            "before",
             f"uncertainty before ({before})",
-            f"{known} before it was taken, with {before}: bright where little is known.",
+            f"{known} before it was taken, with {before}: {bright}.",
         ),
         (
-            f"after/{own}",
+            "after",
             f"uncertainty after ({after})",
-            f"{known} after it was taken, with {after}: bright where little is known.",
+            f"{known} after it was taken, with {after}: {bright}.",
         ),
-    ]
-    return [{"name": name, "caption": caption, "alt": alt} for name, caption, alt in rows]
+    ):
+        own = "" if name == "truth" else f"/{label}"
+        yield {"name": f"{name}/{view}{own}", "caption": caption, "alt": alt}
 
 
-def _compared(shown: Sequence[Shown], frame: Frame) -> dict[str, Any]:
+def _compared(runs: Mapping[str, Run], frame: Frame) -> dict[str, Any]:
     """Pictures for either side of the divider at a view: the truth, and the renders of all runs."""
     view = frame.name
     sides = [{"label": "truth", "name": f"truth/{view}", "alt": f"Truth at {view}."}]
-    for one in shown:
-        if one.model is not None:
-            quality, name = one.psnr_of(view), f"render/{view}/{one.label}"
-            alt = f"Render of {one.label} at {view}{quality}."
-            sides.append({"label": one.label + quality, "name": name, "alt": alt})
-    trained = [one.label for one in shown if view in {f.name for f in one.frames}]
+    for label, run in runs.items():
+        quality, name = psnr_of(run, view), f"render/{view}/{label}"
+        alt = f"Render of {label} at {view}{quality}."
+        sides.append({"label": label + quality, "name": name, "alt": alt})
+    trained = [label for label, run in runs.items() if view in {f.name for f in run.taken}]
     note = f"trained on by {', '.join(trained)}" if trained else "held out"
     return {"view": view, "note": note, "sides": sides}
 
 
-def _plots(shown: Sequence[Shown]) -> list[dict[str, Any]]:
+def _plots(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     """Plots that compare runs: the paper's figures, and every metric that was measured after steps
     or of views."""
-    runs = {one.label: one.run for one in shown}
     covered = step_curves(runs, "coverage", 100)
     added = {
         label: (x[1:], [b - a for a, b in pairwise(y)])
@@ -245,13 +236,14 @@ def _plots(shown: Sequence[Shown]) -> list[dict[str, Any]]:
         ("Coverage that each view added (Fig. 3)", added, "percentage points", True),
         ("Variance left, over that of the prior", left, "mean over all parameters", True),
     ]
-    for key in dict.fromkeys(key for one in shown for s in one.run.steps for key in measured(s)):
+    steps = [step for run in runs.values() for step in run.steps]
+    for key in dict.fromkeys(key for step in steps for key in measured(step)):
         name = METRIC_NAMES[key]
         wanted.append((f"{name} after each step", step_curves(runs, key), name, False))
     loss = step_curves(runs, "loss")
     wanted.append(("Loss at the end of each fit", loss, "mean squared error", True))
-    plots = [line_plot(title, found, y, zero) for title, found, y, zero in wanted if found]
-    views = {one.label: measured_views(one.run) for one in shown if one.run.measured}
+    plots = [line_plot(title, curves, y, zero) for title, curves, y, zero in wanted if curves]
+    views = {label: measured_views(run) for label, run in runs.items() if run.measured}
     if views:
         masked = all(
             any(view.get("psnr_mask") is not None for view in of_run) for of_run in views.values()

@@ -17,10 +17,10 @@ import numpy as np
 
 from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
-from mgs.gaussians import Gaussians
 from mgs.plotting import crop, painted
 from mgs.policy.criteria import regularisation, uncertainty
 from mgs.report.diagnostics import VISIBLE, view_maps
+from mgs.run.folder import Run
 
 PIXELS = 40e6
 """Most pixels of all pictures of a page together. WebP takes 0.1 to 0.2 bytes for a pixel of a
@@ -120,26 +120,20 @@ def new_album(frames: Sequence[Frame], count: int) -> Album:
     return Album(window, max(1, int(min(width, WIDEST, fits))))
 
 
-def draw_taken(
-    album: Album,
-    label: str,
-    gaussians: Gaussians,
-    taken: Sequence[Frame],
-    noise: tuple[float, dict[str, float]],
-    drawn: Callable[[], None],
-) -> None:
+def draw_taken(album: Album, label: str, run: Run, drawn: Callable[[], None]) -> None:
     """Draw the views that a run has taken, in their order.
 
     Adds `truth/NAME`, `render/NAME/LABEL`, `error/NAME/LABEL`, and `before/NAME/LABEL` and
     `after/NAME/LABEL`: the uncertainty of the model seen from there before and after the view was
-    taken. noise: settings `pixel_noise` and `prior_std` of the run. drawn: called after each view.
-    Raises InputError if a file of a frame cannot be read.
+    taken. drawn: called after each view. Raises InputError if a file of a frame cannot be read.
     """
     from mgs.splat import fisher, groups
 
-    lam = regularisation(groups(gaussians.sh_degree), *noise)
+    gaussians, settings = run.gaussians, run.settings
+    columns = groups(gaussians.sh_degree)
+    lam = regularisation(columns, settings.pixel_noise, settings.prior_std)
     H = np.zeros((len(gaussians), len(lam)))
-    for frame in taken:
+    for frame in run.taken:
         before = uncertainty(H, lam)
         H += fisher(gaussians, frame.camera)
         maps = view_maps(gaussians, frame.camera, {"before": before, "after": uncertainty(H, lam)})

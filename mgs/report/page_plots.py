@@ -14,11 +14,10 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import Dataset
-from mgs.data.up import Up, upright
+from mgs.data.up import upright
 from mgs.gaussians import Gaussians
 from mgs.report.figures import Curves, axis_names, line_styles
-from mgs.report.runs import RunFiles
+from mgs.run.folder import Run
 
 SYMBOLS: dict[str | tuple[int, int, int], str] = {
     "o": "circle", "s": "square", "^": "triangle-up", "D": "diamond", "v": "triangle-down",
@@ -137,21 +136,19 @@ def views_plot(metric: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> 
     return _plot(title, alt, traces, {"xaxis": axis, "yaxis": _axis(name)})
 
 
-def orbit_plot(
-    label: str, run: RunFiles, dataset: Dataset, model: Gaussians | None, up: Up
-) -> dict[str, Any]:
+def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     """The orbit in 3D: the model as points, all poses, seeds, and the chosen views, numbered and
     joined in their order.
 
     The world is drawn turned so that +Z is up. The last trace, "shown above", marks the view of the
     page's slider; the page moves it.
     """
-    seeds, chosen, taken = run.seeds, run.chosen, run.taken
-    turn, order = upright(up), list(range(1, len(chosen) + 1))
-    names = [frame.name for frame in dataset.frames]
-    cameras = [frame.camera for frame in dataset.frames]
+    taken, frames = run.indices, run.dataset.frames
+    seeds, chosen = taken[: run.settings.seeds], taken[run.settings.seeds :]
+    turn, order = upright(run.up), list(range(1, len(chosen) + 1))
+    names, cameras = zip(*((frame.name, frame.camera) for frame in frames), strict=True)
     eyes = np.array([camera.position for camera in cameras])
-    middle = np.mean(eyes if model is None else model.means, axis=0)
+    middle = np.mean(run.gaussians.means, axis=0)
     length = FRUSTUM * float(np.linalg.norm(eyes - middle, axis=1).mean())
     eyes = eyes @ turn.T
 
@@ -159,7 +156,6 @@ def orbit_plot(
         trace = _points(name, eyes[which], marker)
         return trace | {"hovertext": texts, "hoverinfo": "text+x+y+z"}
 
-    traces = [] if model is None else [_model_points(model, turn)]
     left = [i for i in range(len(eyes)) if i not in taken]
     open_circle = {"size": 3, "color": "#9a9a9a", "symbol": "circle-open"}
     diamond = {"size": 6, "color": "#D55E00", "symbol": "diamond"}
@@ -170,14 +166,15 @@ def orbit_plot(
     path |= {"mode": "lines+markers+text", "text": [str(k) for k in order]}
     path |= {"line": {"color": GREY, "width": 2}, "textfont": {"size": 11}}
     here = {"size": 12, "color": "#dd1111", "symbol": "circle-open"}
-    traces += [
+    traces = [
+        _model_points(run.gaussians, turn),
         markers("candidates", left, [names[i] for i in left], **open_circle),
         _frusta([cameras[i] for i in taken], length, turn),
         markers("seeds", seeds, [names[i] for i in seeds], **diamond),
         path,
         _points("shown above", eyes[taken[:1]], here) | {"hoverinfo": "skip"},
     ]
-    titles = axis_names(up, dataset.unit)
+    titles = axis_names(run.up, run.dataset.unit)
     axes = {f"{a}axis": _axis(title) for a, title in zip("xyz", titles, strict=True)}
     view = {"eye": {"x": 0.9, "y": 0.9, "z": 0.7}}
     alt = (

@@ -16,7 +16,6 @@ from mgs.plotting import NO_GRID, crop, new_figure
 from mgs.policy import criteria
 from mgs.report.diagnostics import VISIBLE, view_maps
 from mgs.report.figures import NEWEST, draw_cameras
-from mgs.report.runs import up_of
 from mgs.report.video import UNKNOWN, Film
 from mgs.run.folder import Run
 from mgs.run.loop import learn
@@ -93,7 +92,7 @@ def _drawn(run: Run, model: Fitted, maps: dict[str, np.ndarray], shown: Frame) -
         figure.suptitle(title, fontsize=14, color=NEWEST)
         eyes = np.array([frame.camera.position for frame in run.dataset.frames])
         views = model.taken[:seeds], model.taken[seeds:]
-        up = up_of(run.settings.prior, run.dataset)
+        up = run.up
         draw_cameras(orbit, eyes, model.gaussians.means, *views, up, model.taken[-1])
         orbit.set_xlabel("cameras, from above")
         render.imshow(rgb[window], interpolation="nearest")

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from mgs.data.dataset import Dataset
 from mgs.policy.poses import path_length
-from mgs.report.runs import Comparison, RunFiles, check_measured
+from mgs.report.runs import check_measured
 from mgs.run.ending import RunEnd
+from mgs.run.folder import Run
 
 COLUMNS = {
     "policy": "policy",
@@ -34,10 +34,10 @@ COLUMNS = {
 """Columns of the table: key in a row of `comparison_rows` -> heading."""
 
 
-def comparison_rows(compared: Comparison) -> list[dict[str, Any]]:
-    """Numbers of each run, a row each.
+def comparison_rows(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
+    """Numbers of each run, a row each. runs: by label (`mgs.report.runs.compare_runs`).
 
-    - policy: the run's label; images: number of training images; coverage: Gaussians observed,
+    - policy: the label; images: number of training images; coverage: Gaussians observed,
       per cent.
     - path: length of the straight lines from view to view, first seed first; unit: of that length,
       metres where it is "m".
@@ -49,21 +49,21 @@ def comparison_rows(compared: Comparison) -> list[dict[str, Any]]:
 
     Raises InputError if a run was not evaluated since its last step.
     """
-    for run in compared.runs.values():
+    for run in runs.values():
         check_measured(run)
-    return [table_row(label, run, compared.dataset) for label, run in compared.runs.items()]
+    return [table_row(label, run) for label, run in runs.items()]
 
 
-def table_row(label: str, run: RunFiles, dataset: Dataset) -> dict[str, Any]:
+def table_row(label: str, run: Run) -> dict[str, Any]:
     """Row of `comparison_rows`; without metrics if they are not of the run's last step."""
-    row = metrics_row(label, (run.measured or {}) | {"images": len(run.taken)})
-    if run.settings.get("exposure"):
+    row = metrics_row(label, (run.measured or {}) | {"images": len(run.indices)})
+    if run.settings.exposure:
         row["exposure"] = True
     if run.ended and run.ended["reason"] != RunEnd.BUDGET:
         row["ended"] = run.ended["reason"]
-    positions = np.array([dataset.frames[i].camera.position for i in run.taken])
+    positions = np.array([frame.camera.position for frame in run.taken])
     row |= {"coverage": 100 * run.steps[-1]["coverage"], "path": path_length(positions)}
-    return row | {"unit": dataset.unit}
+    return row | {"unit": run.dataset.unit}
 
 
 def metrics_row(label: str, metrics: Mapping[str, Any]) -> dict[str, Any]:

@@ -21,7 +21,6 @@ from mgs.data.up import upright
 from mgs.errors import InputError
 from mgs.files import atomic_path
 from mgs.report.diagnostics import VISIBLE, run_scalars, view_maps
-from mgs.report.runs import up_of
 from mgs.run.folder import Run
 
 Film = Iterator[np.ndarray]
@@ -90,7 +89,7 @@ def path_frames(run: Run, path: str, beside: str | None, count: int, width: int)
             yield _side_by_side(truth, _picture(view_maps(model, camera, {})))
         return
     scalars = {"uncertainty": run_scalars(run)["uncertainty"]} if beside else {}
-    up = up_of(run.settings.prior, run.dataset)
+    up = run.up
     for camera in camera_path(run.dataset, model.means, up, path, count, width):
         maps = view_maps(model, camera, scalars)
         right = [_unknown(maps)] if beside else []

@@ -8,24 +8,21 @@ from pathlib import Path
 
 import numpy as np
 
-from mgs.data.dataset import TEST_FOLDER, Dataset
+from mgs.data.dataset import TEST_FOLDER
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.evaluation import read_comparison
 from mgs.files import atomic_path, write_json
 from mgs.report import figures
 from mgs.report.runs import (
-    Comparison,
-    RunFiles,
     check_finished,
     check_measured,
     compare_runs,
     least_trained,
     step_curves,
-    up_of,
 )
-from mgs.report.tables import comparison_rows, markdown_table
-from mgs.splat_ply import read_ply
+from mgs.report.tables import comparison_rows, markdown_table, table_cell
+from mgs.run.folder import Run
 
 CHOICES = ("orbit", "gain", "coverage")
 """Figures of the chosen views."""
@@ -39,12 +36,11 @@ def report_files(kind: str) -> list[str]:
 
 
 def write_report(
-    out: str | Path, runs: Sequence[str | PathLike[str]] | Comparison, kind: str = "png"
+    out: str | Path, runs: Sequence[str | PathLike[str]], kind: str = "png"
 ) -> list[Path]:
     """Write all figures and the table of runs into the folder `out`; return the paths of the files.
 
-    runs: run folders, or what `compare_runs` read of them. kind: format of the figures, one of
-    `mgs.plotting.FORMATS`.
+    runs: run folders, or opened runs. kind: format of the figures, one of `mgs.plotting.FORMATS`.
 
     - orbit.png, gain.png, coverage.png (`mgs.report.figures`): only if a run has chosen views;
     - comparison.png: a view as `shown_view` chooses it;
@@ -56,20 +52,19 @@ def write_report(
     unfinished or was not evaluated since its last step; and if a picture of `mgs eval` is missing
     or damaged. Then nothing is written.
     """
-    compared = runs if isinstance(runs, Comparison) else compare_runs(runs)
-    for run in compared.runs.values():
+    compared = compare_runs(runs)
+    for run in compared.values():
         check_finished(run)
         check_measured(run)
-    out, dataset = Path(out), compared.dataset
+    out = Path(out)
     frame, truth, renders, captions = _comparison(compared)
-    chosen = any(run.chosen for run in compared.runs.values())
+    chosen = any(run.settings.budget for run in compared.values())
     paths = {name: out / f"{name}.{kind}" for name in CHOICES if chosen}
     if chosen:
         _draw_choices(paths, compared)
     paths["comparison"] = out / f"comparison.{kind}"
     figures.comparison_figure(paths["comparison"], truth, renders, frame.name, captions)
-    every = "views taken so far" if dataset.on_demand else "all views"
-    if panels := _psnr_panels(compared.runs, every):
+    if panels := _psnr_panels(compared):
         paths["psnr"] = out / f"psnr.{kind}"
         figures.psnr_figure(paths["psnr"], panels)
 
@@ -80,44 +75,44 @@ def write_report(
     return [*paths.values(), out / "table.md", out / "table.json"]
 
 
-def _draw_choices(paths: Mapping[str, Path], compared: Comparison) -> None:
+def _draw_choices(paths: Mapping[str, Path], runs: Mapping[str, Run]) -> None:
     """Draw CHOICES into these files."""
-    dataset, first = compared.dataset, next(iter(compared.runs.values()))
-    positions = np.array([frame.camera.position for frame in dataset.frames])
-    means = read_ply(first.folder / "gaussians.ply").means
-    choices = {label: (run.seeds, run.chosen) for label, run in compared.runs.items()}
-    up = up_of(first.settings.get("prior", ""), dataset)
-    figures.orbit_figure(paths["orbit"], positions, means, choices, up, dataset.unit)
+    first = next(iter(runs.values()))
+    positions = np.array([frame.camera.position for frame in first.dataset.frames])
+    choices = {}
+    for label, run in runs.items():
+        seeds = run.settings.seeds
+        choices[label] = run.indices[:seeds], run.indices[seeds:]
+    world = first.up, first.dataset.unit
+    figures.orbit_figure(paths["orbit"], positions, first.gaussians.means, choices, *world)
     gains = {
-        label: [step["information_gain"] for step in run.steps[1:]]
-        for label, run in compared.runs.items()
+        label: [step["information_gain"] for step in run.steps[1:]] for label, run in runs.items()
     }
     figures.gain_figure(paths["gain"], gains)
-    figures.coverage_figure(paths["coverage"], step_curves(compared.runs, "coverage"))
+    figures.coverage_figure(paths["coverage"], step_curves(runs, "coverage"))
 
 
 def _comparison(
-    compared: Comparison,
+    runs: Mapping[str, Run],
 ) -> tuple[Frame, np.ndarray, dict[str, np.ndarray], dict[str, str]]:
     """The shown view: frame, truth [H,W,3], renders [H,W,3] by label, captions by label."""
-    frame, views = shown_view(list(compared.runs.values()), compared.dataset)
+    frame, views = shown_view(list(runs.values()))
     within = Path("renders", TEST_FOLDER) if views == "test_views" else Path("renders")
-    pictures = {}
-    for label, run in compared.runs.items():
-        picture = run.folder / within / f"{frame.name}.png"
+    pictures, captions = {}, {}
+    for label, run in runs.items():
+        pictures[label] = picture = run.folder / within / f"{frame.name}.png"
         of_this_model = (run.metrics or {}).get("pictures", True)
         if not (of_this_model and picture.is_file()):
             raise InputError(
                 f"{picture}: no picture of this model; draw it with `mgs eval {run.folder}`"
             )
-        pictures[label] = picture
-    captions = {label: _caption(run, views, frame.name) for label, run in compared.runs.items()}
+        captions[label] = _caption(run, views, frame.name)
     pairs = {label: read_comparison(picture, frame.camera) for label, picture in pictures.items()}
     truth = next(iter(pairs.values()))[0]
     return frame, truth, {label: render for label, (_, render) in pairs.items()}, captions
 
 
-def shown_view(runs: Sequence[RunFiles], dataset: Dataset) -> tuple[Frame, str]:
+def shown_view(runs: Sequence[Run]) -> tuple[Frame, str]:
     """The view that the comparison shows, and the key of metrics.json that lists it, "test_views"
     or "views".
 
@@ -126,23 +121,31 @@ def shown_view(runs: Sequence[RunFiles], dataset: Dataset) -> tuple[Frame, str]:
     runs have taken have an image. Raises InputError as `Dataset.test_views`, and if there is no
     such frame.
     """
+    dataset = runs[0].dataset
     tests = dataset.test_views()
     if tests is not None and all((run.metrics or {}).get("test_views") for run in runs):
         return _typical_view(runs, tests.frames, "test_views"), "test_views"
-    shared = set.intersection(*({dataset.frames[i].name for i in run.taken} for run in runs))
-    shown = dataset.with_images(shared)
+    shown = dataset.with_images(
+        set.intersection(*({frame.name for frame in run.taken} for run in runs))
+    )
     if not shown:
         raise InputError(
             f"{dataset.root}: has no test views, and no frame that all runs have taken; "
             "report them one by one"
         )
-    return _typical_view(runs, least_trained(runs, dataset, shown), "views"), "views"
+    return _typical_view(runs, least_trained(runs, shown), "views"), "views"
 
 
-def _typical_view(runs: Sequence[RunFiles], frames: Sequence[Frame], views: str) -> Frame:
+def _psnr_by_name(run: Run, views: str) -> dict[str, float]:
+    """PSNR of the views that the key `views` of metrics.json lists."""
+    listed = (run.metrics or {}).get(views, [])
+    return {view["name"]: view["psnr"] for view in listed if view["psnr"] is not None}
+
+
+def _typical_view(runs: Sequence[Run], frames: Sequence[Frame], views: str) -> Frame:
     """The frame whose PSNRs are closest to the runs' means, in least squares, of those that all
     runs were measured on by the key `views` of metrics.json; the first if there is none."""
-    measured = [{v["name"]: v["psnr"] for v in (run.metrics or {}).get(views, [])} for run in runs]
+    measured = [_psnr_by_name(run, views) for run in runs]
     known = [frame for frame in frames if all(frame.name in of for of in measured)]
     if not known:
         return frames[0]
@@ -150,7 +153,7 @@ def _typical_view(runs: Sequence[RunFiles], frames: Sequence[Frame], views: str)
     return known[int(np.argmin(((psnr - psnr.mean(1, keepdims=True)) ** 2).sum(0)))]
 
 
-def _caption(run: RunFiles, views: str, name: str) -> str:
+def _caption(run: Run, views: str, name: str) -> str:
     """Number of images, PSNR and SSIM of a render. views: key of metrics.json that lists it.
     Raises InputError if it was not evaluated."""
     view = next((view for view in (run.metrics or {})[views] if view["name"] == name), None)
@@ -159,12 +162,14 @@ def _caption(run: RunFiles, views: str, name: str) -> str:
             f"{run.folder}: was not evaluated on {name}; measure it with `mgs eval {run.folder}`"
         )
     seen = ", trained on" if view["trained"] else ""
-    quality = f"{view['psnr']:.2f} dB, SSIM {view['ssim']:.4f}"
-    return f"{len(run.taken)} images{seen}; {quality}"
+    decibels, ssim = (table_cell(key, view[key]) for key in ("psnr", "ssim"))
+    return f"{len(run.indices)} images{seen}; {decibels} dB, SSIM {ssim}"
 
 
-def _psnr_panels(runs: Mapping[str, RunFiles], every: str) -> dict[str, figures.Curves]:
-    """Panels of `psnr_figure`, over the test views or else `every`; empty without PSNR."""
+def _psnr_panels(runs: Mapping[str, Run]) -> dict[str, figures.Curves]:
+    """Panels of `psnr_figure`, over the test views or else all views taken; empty without PSNR."""
+    on_demand = next(iter(runs.values())).dataset.on_demand
+    every = "views taken so far" if on_demand else "all views"
     for prefix, views in (("test_", "test views"), ("", every)):
         panels = {
             f"PSNR, {views}": step_curves(runs, f"{prefix}psnr"),

@@ -29,17 +29,17 @@ import json
 import math
 import warnings
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame
-from mgs.data.up import upright
+from mgs.data.up import Up, unit_up, upright
 from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, parsing, read_json, reading, write_json
 from mgs.gaussians import ARRAYS, Gaussians
@@ -48,14 +48,15 @@ from mgs.policy.from_file import label
 from mgs.prior.build import Prior, load_prior
 from mgs.provenance import versions
 from mgs.run.ending import RunEnd
+from mgs.run.records import Config, Metrics, Record, checked, read_checked
 from mgs.run.settings import NbvSettings, check_settings, validated
 from mgs.run.state import State
 from mgs.splat_ply import read_ply, write_ply
 
-POLICY_SOURCE = "policy.py"
+CHECKPOINT, STEPS, POLICY_SOURCE = "checkpoint.npz", "steps.jsonl", "policy.py"
 
 FILES = [
-    *("config.json", "checkpoint.npz", "steps.jsonl", "metrics.json", "gaussians*", POLICY_SOURCE),
+    *("config.json", CHECKPOINT, STEPS, "metrics.json", "gaussians*", POLICY_SOURCE),
     *("prior", "dataset", "renders", "diagnostics", "tensorboard", "export.*", "video.*"),
 ]
 """Names in the folder of a run, with what commands add to it."""
@@ -65,11 +66,12 @@ DATASET = "dataset"
 
 
 class Run:
-    """A run folder, its settings, and its dataset, prior and state, each read once at first use.
+    """A run folder: its settings, and what its files hold, each read once at first use.
 
     settings: from the folder's config.json. policy: as it was given in this process, if it was. A
     Run can be given wherever a folder is wanted. Properties raise InputError if a file is missing
-    or damaged; `state` also if no step is finished yet; `dataset` also if its frames changed.
+    or damaged; `steps` and `state` also if no step is finished yet; `dataset` also if its frames
+    changed.
     """
 
     def __init__(
@@ -82,39 +84,62 @@ class Run:
         state: State | None = None,
     ) -> None:
         self.folder, self.settings, self.policy = folder, settings, policy
-        self._dataset, self._prior, self._state = dataset, prior, state
+        for name, value in (("dataset", dataset), ("prior", prior), ("state", state)):
+            if value is not None:
+                self.__dict__[name] = value
 
     def __fspath__(self) -> str:
         return str(self.folder)
 
     def __repr__(self) -> str:
-        planned = self.settings.seeds + self.settings.budget
-        path = self.folder / "checkpoint.npz"
-        views = len(self.state.taken) if self._state or path.is_file() else 0
-        return f"Run({self.folder}: {self.label}, {views} of {planned} views)"
+        views = len(self.indices) if self.begun else 0
+        return f"Run({self.folder}: {self.label}, {views} of {self.planned} views)"
 
     def _repr_html_(self) -> str:
-        if not (self._state or (self.folder / "checkpoint.npz").is_file()):
+        if not self.begun:
             return html(repr(self), [])
         taken, g = thumbnails([frame.image_path for frame in self.taken]), self.gaussians
         turn = upright(self.prior.up)
         return html(repr(self), [*taken, cloud(g.means @ turn.T, g.rgb)])
 
+    @property
+    def label(self) -> str:
+        """Name of the policy; "fit" if the run chooses no view."""
+        return label(self.settings.policy, self.settings.budget)
+
+    @property
+    def planned(self) -> int:
+        """Number of seeds and of views to choose."""
+        return self.settings.seeds + self.settings.budget
+
+    @property
+    def begun(self) -> bool:
+        """Whether a step is finished."""
+        return "state" in self.__dict__ or (self.folder / CHECKPOINT).is_file()
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """Contents of config.json: `settings`, `versions` and the names of all `frames`."""
+        return read_config(self.folder)
+
     @cached_property
     def dataset(self) -> Dataset:
         """The dataset of the run."""
-        if self._dataset is not None:
-            return self._dataset
         dataset = load_dataset(self.settings.dataset)
-        check_same_frames(self.folder, dataset)
+        self.check_frames(dataset)
         return dataset
+
+    def check_frames(self, dataset: Dataset) -> None:
+        """Raises InputError if a dataset has other frames than the run was started on."""
+        if self.config["frames"] != [frame.name for frame in dataset.frames]:
+            raise InputError(
+                f"{dataset.root}: its frames differ from those {self.folder} was started on; "
+                "restore them or start a new run"
+            )
 
     @cached_property
     def prior(self) -> Prior:
         """The prior of the run."""
-        if self._prior is not None:
-            return self._prior
-
         path = self.settings.prior
         if not path.is_dir():
             where = f"{self.folder / 'config.json'}: prior {path}"
@@ -122,17 +147,35 @@ class Run:
         return load_prior(path)
 
     @cached_property
+    def up(self) -> Up:
+        """Up direction of the prior, or of the dataset if the prior's folder is gone."""
+        file = self.settings.prior / "prior.json"
+        numbers = read_json(file) if file.is_file() else None
+        if isinstance(numbers, dict) and "up" in numbers:
+            return unit_up(numbers["up"])
+        return self.dataset.up
+
+    @cached_property
+    def steps(self) -> list[dict[str, Any]]:
+        """Lines of the finished steps, those of steps.jsonl (`mgs.run.folder`)."""
+        if "state" in self.__dict__:
+            return self.state.steps
+        steps: list[dict[str, Any]] = self._existing(read_record(self.folder))["steps"]
+        return steps
+
+    @cached_property
     def state(self) -> State:
         """The state after the last finished step."""
-        if self._state is not None:
-            return self._state
-        state = read_checkpoint(self.folder)
-        if state is None:
-            resume = f"`mgs nbv --resume {self.folder}`"
-            raise InputError(f"{self.folder}: has no finished step yet; continue it with {resume}")
+        state = self._existing(read_checkpoint(self.folder))
         if "ended" in state.steps[-1]:
             self._repair(state)
         return state
+
+    def _existing(self, found: Any) -> Any:
+        if found is None:
+            resume = f"`mgs nbv --resume {self.folder}`"
+            raise InputError(f"{self.folder}: has no finished step yet; continue it with {resume}")
+        return found
 
     def _repair(self, state: State) -> None:
         """Write gaussians.ply again where it is not the model of the checkpoint, and warn."""
@@ -153,14 +196,33 @@ class Run:
         return self.state.gaussians
 
     @property
-    def taken(self) -> list[Frame]:
-        """The frames trained on, in the order of their choice."""
-        return [self.dataset.frames[i] for i in self.state.taken]
+    def indices(self) -> list[int]:
+        """Indices of the frames trained on, in the order of their choice."""
+        return frames_of(self.steps)
 
     @property
-    def label(self) -> str:
-        """Name of the policy; "fit" if the run chooses no view."""
-        return label(self.settings.policy, self.settings.budget)
+    def taken(self) -> list[Frame]:
+        """The frames trained on, in the order of their choice."""
+        return [self.dataset.frames[i] for i in self.indices]
+
+    @property
+    def ended(self) -> dict[str, Any] | None:
+        """Why the run ended (`mgs.run.ending.run_end`); None for an unfinished run, also where the
+        budget was raised after it was spent."""
+        ended: dict[str, Any] | None = self.steps[-1].get("ended")
+        spent = ended is not None and ended["reason"] == RunEnd.BUDGET
+        return None if spent and len(self.indices) < self.planned else ended
+
+    @cached_property
+    def metrics(self) -> dict[str, Any] | None:
+        """Contents of metrics.json; None if the run was not evaluated."""
+        return read_metrics(self.folder)
+
+    @property
+    def measured(self) -> dict[str, Any] | None:
+        """`metrics`, if they are of the model after the last step."""
+        fresh = self.metrics is not None and self.metrics["images"] == len(self.indices)
+        return self.metrics if fresh else None
 
 
 def open_run(folder: str | Path) -> Run:
@@ -197,10 +259,14 @@ def read_config(out: Path) -> dict[str, Any]:
         raise InputError(
             f"{out}: holds no run (no config.json); start one with `mgs nbv DATASET --out {out}`"
         )
-    config = read_json(path)
-    if not isinstance(config, dict) or not isinstance(config.get("settings"), dict):
-        raise InputError(f"{path}: has no settings; the file is damaged, start the run anew")
-    return config
+    return read_checked(Config, path, "start the run anew")
+
+
+def read_metrics(out: Path) -> dict[str, Any] | None:
+    """Read metrics.json of a run; None if there is none. Raises InputError if it is damaged."""
+    path = out / "metrics.json"
+    cure = f"measure the run again with `mgs eval {out}`"
+    return read_checked(Metrics, path, cure) if path.exists() else None
 
 
 def holds_run(out: Path) -> bool:
@@ -210,15 +276,6 @@ def holds_run(out: Path) -> bool:
     except (InputError, OSError):  # OSError: a name that is too long
         return False
     return True
-
-
-def check_same_frames(out: Path, dataset: Dataset) -> None:
-    """Raises InputError where the dataset has other frames than the run was started on."""
-    if read_config(out).get("frames") != [frame.name for frame in dataset.frames]:
-        raise InputError(
-            f"{dataset.root}: its frames differ from those {out} was started on; "
-            "restore them or start a new run"
-        )
 
 
 def write_checkpoint(out: Path, state: State) -> None:
@@ -233,44 +290,75 @@ def write_checkpoint(out: Path, state: State) -> None:
         allow_nan=False,
     )
     arrays = {name: getattr(state.gaussians, name) for name in ARRAYS}
-    with atomic_path(out / "checkpoint.npz") as temporary, open(temporary, "wb") as file:
+    with atomic_path(out / CHECKPOINT) as temporary, open(temporary, "wb") as file:
         np.savez(file, H=state.H, surface=state.surface, json=np.array(text), **arrays)
     write_steps(out, state)
 
 
 def write_steps(out: Path, state: State) -> None:
     """Write steps.jsonl from the state, atomically."""
-    text = "".join(json.dumps(line, allow_nan=False) + "\n" for line in state.steps)
-    with atomic_path(out / "steps.jsonl") as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    with atomic_path(out / STEPS) as temporary:
+        temporary.write_text(text_of(state.steps), encoding="utf-8")
 
 
-def read_checkpoint(out: Path) -> State | None:
-    """Read the state after the last finished step; None before the first.
+def text_of(steps: Sequence[dict[str, Any]]) -> str:
+    """Text of steps.jsonl."""
+    return "".join(json.dumps(line, allow_nan=False) + "\n" for line in steps)
+
+
+def frames_of(steps: Sequence[dict[str, Any]]) -> list[int]:
+    """Indices of the frames taken: seeds, then chosen ones."""
+    return [*steps[0]["seeds"], *(line["frame"] for line in steps[1:])]
+
+
+@contextmanager
+def _checkpoint(out: Path) -> Iterator[zipfile.ZipFile | None]:
+    """Context manager: the checkpoint of a run, None before the first step. Errors that damage
+    causes become an InputError."""
+    path = out / CHECKPOINT
+    if not path.is_file():
+        yield None
+        return
+    cure = "delete it to start again from the seeds"
+    with reading(path), parsing(path, "checkpoint", cure), zipfile.ZipFile(path) as file:
+        yield file
+
+
+def read_record(out: Path) -> dict[str, Any] | None:
+    """Read the `mgs.run.records.Record` of the last finished step; None before the first.
 
     Raises InputError where the file is damaged, or claims more than it holds.
     """
-    path = out / "checkpoint.npz"
-    if not path.is_file():
+    with _checkpoint(out) as file:
+        if file is None:
+            return None
+        record = checked(Record, str(_member(file, "json", "U")[()]))
+    frames = read_config(out)["frames"]
+    if not all(0 <= frame < len(frames) for frame in record["taken"]):
+        raise InputError(
+            f"{out / CHECKPOINT}: takes frames beyond the {len(frames)} of the run; "
+            "start the run anew"
+        )
+    return record
+
+
+def read_checkpoint(out: Path) -> State | None:
+    """Read the state after the last finished step; None before the first. Raises InputError as
+    `read_record`."""
+    record = read_record(out)
+    if record is None:
         return None
-    kinds = {"json": "U", "H": "f", "surface": "f"} | dict.fromkeys(ARRAYS, "f")
-    cure = "delete it to start again from the seeds"
-    with reading(path), parsing(path, "checkpoint", cure), zipfile.ZipFile(path) as file:
-        arrays: dict[str, Any] = {n: _member(file, n, kind) for n, kind in kinds.items()}
-        record = json.loads(str(arrays.pop("json")[()]))
+    with _checkpoint(out) as file:
+        assert file is not None
+        arrays: dict[str, Any] = {
+            name: _member(file, name, "f") for name in (*ARRAYS, "H", "surface")
+        }
         H, surface = arrays.pop("H"), arrays.pop("surface")
-        gaussians = Gaussians(**arrays, antialiased=record.pop("antialiased") is True)
-        gaussians.check(f"{path}: not a readable checkpoint")
-        state = State(gaussians, H, surface, **record)
-        for number, line in enumerate(state.steps, 1):
-            check_line(number, line)
-        if not isinstance(state.inputs, dict) or frames_of(state.steps) != state.taken:
-            raise ValueError("its frames are not those of its steps")
-        if H.ndim != 2 or surface.ndim != 2 or len(H) != len(state.gaussians):
-            raise ValueError(f"H has shape {H.shape} of {len(state.gaussians)} Gaussians")
-    frames = read_config(out).get("frames")
-    check_frames(path, state.taken, len(frames) if isinstance(frames, list) else 0)
-    return state
+        gaussians = Gaussians(**arrays, antialiased=record.pop("antialiased"))
+        gaussians.check(f"{out / CHECKPOINT}: not a readable checkpoint")
+        if H.ndim != 2 or surface.ndim != 2 or len(H) != len(gaussians):
+            raise ValueError(f"H has shape {H.shape} of {len(gaussians)} Gaussians")
+    return State(gaussians, H, surface, **record)
 
 
 def _member(file: zipfile.ZipFile, name: str, kind: str) -> np.ndarray:
@@ -292,59 +380,3 @@ def _member(file: zipfile.ZipFile, name: str, kind: str) -> np.ndarray:
     if math.prod(shape) * dtype.itemsize != len(data):
         raise ValueError(f"{name} has shape {shape} in {len(data)} bytes")
     return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C").copy("K")
-
-
-def check_frames(path: Path, taken: Sequence[int], count: int) -> None:
-    """Raises InputError where frames taken, as a file says, are not among this number."""
-    if not all(0 <= frame < count for frame in taken):
-        raise InputError(f"{path}: takes frames beyond the {count} of the run; start the run anew")
-
-
-class _Checked(BaseModel):
-    model_config = ConfigDict(allow_inf_nan=False)
-
-
-class _Ended(_Checked):
-    reason: RunEnd
-    views: int
-    name: str = ""
-    limit: float = 0.0
-    uncertainty: float = 0.0
-    information_gain: float = 0.0
-    metres: float = 0.0
-
-
-class _Line(_Checked):
-    """Keys of every line, and the types of optional ones."""
-
-    images: int
-    coverage: float
-    ended: _Ended | None = None
-    step: int = 0
-    name: str | None = None
-    warnings: list[str] = []
-    seconds: dict[str, float] = {}
-    exposure: dict[str, list[float]] | None = None
-
-
-class _SeedLine(_Line):
-    """The first line, which is about the seeds."""
-
-    seeds: list[int]
-
-
-class _ChoiceLine(_Line):
-    """Any other line, which is about one chosen view."""
-
-    frame: int
-    information_gain: float
-
-
-def check_line(number: int, line: Any) -> None:
-    """Raises ValueError (pydantic's ValidationError) where a line, counted from 1, is damaged."""
-    (_SeedLine if number == 1 else _ChoiceLine).model_validate(line)
-
-
-def frames_of(lines: Sequence[dict[str, Any]]) -> list[int]:
-    """Indices of the frames taken, by checked lines: seeds, then chosen ones."""
-    return [*lines[0]["seeds"], *(int(line["frame"]) for line in lines[1:])]

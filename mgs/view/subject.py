@@ -15,7 +15,6 @@ from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.report.diagnostics import run_scalars
 from mgs.report.page_facts import step_facts
-from mgs.report.runs import read_metrics, up_of
 from mgs.run.ending import RunEnd
 from mgs.run.folder import Run, open_run
 from mgs.splat_files import load_gaussians, upward
@@ -115,48 +114,37 @@ def _read_run(run: Run, follow: bool) -> Subject:
         None,
         views=[View(frame, "candidate", None, []) for frame in dataset.frames],
         mesh=read_mesh(mesh) if mesh.is_file() else None,
-        up=up_of(settings.prior, dataset),
+        up=run.up,
         unit=dataset.unit,
     )
-    if follow and not (run.folder / "checkpoint.npz").is_file():
+    if follow and not run.begun:
         return waiting
-    state = run.state
-    early = state.steps[-1].get("ended", {}).get("reason", RunEnd.BUDGET) != RunEnd.BUDGET
-    planned = "" if early else f" of {settings.seeds + settings.budget}"
-    count = f"{len(state.taken)}{planned} views, {len(state.gaussians):,} Gaussians"
+    early = run.state.steps[-1].get("ended", {}).get("reason", RunEnd.BUDGET) != RunEnd.BUDGET
+    planned = "" if early else f" of {run.planned}"
+    count = f"{len(run.indices)}{planned} views, {len(run.gaussians):,} Gaussians"
     scalars = run_scalars(run)
     return replace(
         waiting,
         title=f"{name}: {run.label}, {count}",
-        gaussians=state.gaussians,
+        gaussians=run.gaussians,
         scalars={scalar: scalars[scalar] for scalar in SCALARS},
-        views=_views(run, _psnr(run.folder, len(state.taken))),
+        views=_views(run),
     )
 
 
-def _psnr(run: Path, images: int) -> dict[str, float]:
-    """PSNR of each view by its name, if the run was measured since its last step."""
-    metrics = read_metrics(run)
-    if metrics is None or metrics["images"] != images:
-        return {}
-    return {view["name"]: view["psnr"] for view in metrics["views"]}
-
-
-def _views(run: Run, psnr: dict[str, float]) -> list[View]:
-    """The cameras of the dataset, with facts from the run's state."""
-    seed_line, *lines = run.state.steps
-    by_frame = {line["frame"]: line for line in lines}
+def _views(run: Run) -> list[View]:
+    """The cameras of the dataset, with facts from the run's steps and metrics."""
+    psnr = {view["name"]: view["psnr"] for view in (run.measured or {}).get("views", [])}
+    lines = {line["frame"]: line for line in run.steps[1:]}
     views = []
     for index, frame in enumerate(run.dataset.frames):
-        facts = []
-        if frame.name in psnr:
+        facts, role, step = [], "candidate", None
+        if psnr.get(frame.name) is not None:
             facts.append(("PSNR of the model here", f"{psnr[frame.name]:.2f} dB"))
-        if index in seed_line["seeds"]:
-            views.append(View(frame, "seed", 0, facts))
-        elif index in by_frame:
-            line = by_frame[index]
+        if index in run.steps[0]["seeds"]:
+            role, step = "seed", 0
+        elif line := lines.get(index):
+            role, step = "chosen", line["step"]
             facts += [(f"{name} then", value) for name, value in step_facts(line)]
-            views.append(View(frame, "chosen", line["step"], facts))
-        else:
-            views.append(View(frame, "candidate", None, facts))
+        views.append(View(frame, role, step, facts))
     return views

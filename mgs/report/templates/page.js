@@ -137,14 +137,12 @@ function showView() {
   showCompared();
 }
 
-if (data.compared.length) {
-  options(byId("compare-view"), data.compared.map(view => `${view.view} (${view.note})`), 0);
-  byId("compare-view").addEventListener("change", showView);
-  byId("compare-left").addEventListener("change", showCompared);
-  byId("compare-right").addEventListener("change", showCompared);
-  const at = byId("compare-at"), move = () => byId("divider").style.setProperty("--at", at.value + "%");
-  at.addEventListener("input", move);
-  at.value = 50;
-  move();
-  showView();
-}
+options(byId("compare-view"), data.compared.map(view => `${view.view} (${view.note})`), 0);
+byId("compare-view").addEventListener("change", showView);
+byId("compare-left").addEventListener("change", showCompared);
+byId("compare-right").addEventListener("change", showCompared);
+const at = byId("compare-at"), move = () => byId("divider").style.setProperty("--at", at.value + "%");
+at.addEventListener("input", move);
+at.value = 50;
+move();
+showView();

@@ -1,0 +1,144 @@
+"""Contents of the JSON files of a run, checked when they are read.
+
+Values are of these types exactly: a text is no number. Files are returned as plain dictionaries.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, PositiveInt, ValidationError, model_validator
+
+from mgs.errors import InputError
+from mgs.files import reading
+from mgs.run.ending import RunEnd
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+
+
+class Config(_Strict):
+    """config.json. settings: those of `mgs.run.settings.NbvSettings`, checked apart."""
+
+    settings: dict[str, Any]
+    frames: list[str]
+    versions: dict[str, str] = {}
+
+
+class _End(_Strict):
+    reason: RunEnd
+    views: int
+    name: str = ""
+    limit: float = 0.0
+    uncertainty: float = 0.0
+    psnr: float = 0.0
+    information_gain: float = 0.0
+    metres: float = 0.0
+    given_up: int = 0
+
+
+class _Line(_Strict, extra="allow"):
+    """A line of steps.jsonl. All other keys are numbers, as PSNR."""
+
+    __pydantic_extra__: dict[str, float | None]
+    step: int
+    images: int
+    coverage: float
+    seeds: list[int] | None = None
+    seed_names: list[str] = []
+    frame: int | None = None
+    name: str | None = None
+    information_gain: float | None = None
+    iterations: int = 0
+    stop_reason: str = ""
+    exposure: dict[str, list[float]] = {}
+    prediction: dict[str, float] = {}
+    indicators: dict[str, float | None] = {}
+    warnings: list[str] = []
+    seconds: dict[str, float] = {}
+    ended: _End | None = None
+
+
+class _Inputs(_Strict):
+    """Hashes of the inputs (`mgs.run.inputs`)."""
+
+    prior: str
+    cameras: dict[str, str]
+    files: dict[str, dict[str, str | None]]
+    policy: str | None = None
+
+
+class Record(_Strict, extra="forbid"):
+    """Text in checkpoint.npz: all of a state but its arrays."""
+
+    taken: list[int]
+    steps: list[_Line]
+    inputs: _Inputs
+    antialiased: bool
+
+    @model_validator(mode="after")
+    def _agree(self) -> Record:
+        """The first line is that of the seeds; each other one is that of one more view."""
+        seeds = (self.steps[0].seeds or []) if self.steps else []
+        chosen = self.steps[1:]
+        if self.taken != [*seeds, *(line.frame for line in chosen)] or not seeds:
+            raise ValueError("its frames are not those of its steps")
+        for step, line in enumerate(self.steps):
+            if (line.step, line.images) != (step, len(seeds) + step):
+                raise ValueError(f"step {step} has the number {line.step}, {line.images} images")
+        if any(line.information_gain is None for line in chosen):
+            raise ValueError("a chosen view has no information gain")
+        return self
+
+
+class _View(_Strict, extra="allow"):
+    __pydantic_extra__: dict[str, float | None]
+    name: str
+    trained: bool
+    psnr: float | None
+    ssim: float | None
+
+
+class _Fit(_Strict):
+    predicted_decrease: float
+    converged: bool
+
+
+class Metrics(_Strict):
+    """metrics.json (`mgs.evaluation.evaluate_model`, `mgs.report.evaluation.evaluate_run`)."""
+
+    images: PositiveInt
+    all: dict[str, float | None]
+    held_out: dict[str, float | None]
+    views: list[_View]
+    test: dict[str, float | None] = {}
+    test_views: list[_View] = []
+    fit: _Fit | None = None
+    pictures: bool = True
+    of: str = ""
+
+
+def checked(model: type[BaseModel], text: str) -> dict[str, Any]:
+    """Parse JSON of a model. Raises ValueError if it is not of this model."""
+    try:
+        model.model_validate_json(text)
+        return dict(json.loads(text))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = [str(part) for part in first["loc"]]
+        raise ValueError(": ".join([".".join(where)] * bool(where) + [first["msg"]])) from None
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def read_checked(model: type[BaseModel], path: Path, cure: str) -> dict[str, Any]:
+    """Read a JSON file. Raises InputError with the cure if it is missing or not of this model."""
+    with reading(path):
+        text = path.read_text(encoding="utf-8", errors="replace")
+    try:
+        return checked(model, text)
+    except ValueError as error:
+        raise InputError(f"{path}: is damaged ({error}); {cure}") from None
