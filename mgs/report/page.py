@@ -20,7 +20,7 @@ import numpy as np
 
 from mgs.data.frames import Frame
 from mgs.data.up import upright
-from mgs.files import atomic_path
+from mgs.files import write_text
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.page_facts import (
     links,
@@ -86,9 +86,8 @@ def write_page(
             "uncertainty": colour_scale(UNCERTAINTY_COLOURS),
         },
     )
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    return len(text.encode("utf-8"))
+    write_text(path, text)
+    return path.stat().st_size
 
 
 def draw_pictures(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mgs.data.frames import Frame
 from mgs.errors import InputError
-from mgs.files import reading
+from mgs.files import read_text
 from mgs.report.figures import Curves
 from mgs.run.folder import STEPS, Run, open_run, text_of
 
@@ -50,10 +50,8 @@ def compare_runs(runs: Sequence[str | PathLike[str]]) -> dict[str, Run]:
 
 def _check_lines(run: Run) -> None:
     """Raises InputError if steps.jsonl is not that of the run; its last step may be missing."""
-    path, text = run.folder / STEPS, ""
-    if path.is_file():
-        with reading(path):
-            text = path.read_text(encoding="utf-8", errors="replace")
+    path = run.folder / STEPS
+    text = read_text(path) if path.is_file() else ""
     if not (text and text_of(run.steps).startswith(text)):
         resume = f"`mgs nbv --resume {run.folder}`"
         raise InputError(f"{path}: is missing or damaged; write it anew with {resume}")

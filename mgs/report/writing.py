@@ -12,7 +12,7 @@ from mgs.data.dataset import TEST_FOLDER
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.evaluation import read_comparison
-from mgs.files import atomic_path, write_json
+from mgs.files import write_json, write_text
 from mgs.report import figures
 from mgs.report.runs import (
     check_finished,
@@ -69,8 +69,7 @@ def write_report(
         figures.psnr_figure(paths["psnr"], panels)
 
     rows = comparison_rows(compared)
-    with atomic_path(out / "table.md") as temporary:
-        temporary.write_text(markdown_table(rows), encoding="utf-8")
+    write_text(out / "table.md", markdown_table(rows))
     write_json(out / "table.json", rows)
     return [*paths.values(), out / "table.md", out / "table.json"]
 

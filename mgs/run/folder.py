@@ -41,7 +41,7 @@ from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame
 from mgs.data.up import Up, unit_up, upright
 from mgs.errors import InputError, Notice
-from mgs.files import atomic_path, parsing, read_json, reading, write_json
+from mgs.files import atomic_path, parsing, read_json, reading, write_json, write_text
 from mgs.gaussians import ARRAYS, Gaussians
 from mgs.notebook import cloud, html, thumbnails
 from mgs.policy.from_file import label
@@ -297,8 +297,7 @@ def write_checkpoint(out: Path, state: State) -> None:
 
 def write_steps(out: Path, state: State) -> None:
     """Write steps.jsonl from the state, atomically."""
-    with atomic_path(out / STEPS) as temporary:
-        temporary.write_text(text_of(state.steps), encoding="utf-8")
+    write_text(out / STEPS, text_of(state.steps))
 
 
 def text_of(steps: Sequence[dict[str, Any]]) -> str:

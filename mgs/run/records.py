@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, PositiveInt, ValidationError, model_validator
 
 from mgs.errors import InputError
-from mgs.files import reading
+from mgs.files import read_text
 from mgs.run.ending import RunEnd
 
 
@@ -136,8 +136,7 @@ def checked(model: type[BaseModel], text: str) -> dict[str, Any]:
 
 def read_checked(model: type[BaseModel], path: Path, cure: str) -> dict[str, Any]:
     """Read a JSON file. Raises InputError with the cure if it is missing or not of this model."""
-    with reading(path):
-        text = path.read_text(encoding="utf-8", errors="replace")
+    text = read_text(path)
     try:
         return checked(model, text)
     except ValueError as error:
