@@ -1,0 +1,158 @@
+"""Upper bounds and branch and bound against every set of few candidates, SciPy, and definitions."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+from mgs.errors import InputError
+from mgs.policy import certificate, criteria, directional, relaxation
+from mgs.policy.certificate import best_set, upper_bound
+from mgs.policy.directional import Views
+
+LAM, POSES, POINTS = 0.02**2, 9, 40
+KINDS = ["d", "i", "eq7"]
+
+
+def case(kind, seed=0, order=None):
+    """Relaxation of a random pool, and the gain of a set by the definition of its criterion."""
+    rng = np.random.default_rng(seed)
+    order = np.arange(POSES) if order is None else order
+    points = 0.5 * rng.normal(size=(POINTS, 3))
+    seen = rng.choice([0.0, 1.0], (POSES + 8, POINTS)) * 10 ** rng.uniform(
+        -4, 0, (POSES + 8, POINTS)
+    )
+    every = Views(rng.normal(size=(POSES + 8, 3)) * 3 + [0, 0, 4], seen.astype(np.float32))
+    views, taken, dome = (
+        Views(every.positions[some], every.seen[some])
+        for some in (order, slice(POSES, POSES + 2), slice(POSES + 2, None))
+    )
+    if kind in "di":
+        model, around = ((1, 0.3), None) if kind == "d" else ((2, 0.2), dome)
+        made = relaxation.directional(points, LAM, *model, taken, views, around)
+
+        def gain(some):
+            total, so_far = 0.0, taken
+            for v in some:
+                one = Views(views.positions[[v]], views.seen[[v]])
+                total += directional.gains(points, LAM, *model, so_far, one, around)[0]
+                so_far = Views(*(np.concatenate(pair) for pair in zip(so_far, one, strict=True)))
+            return total
+
+        return made, gain
+    F, lam = (
+        rng.uniform(0, 3, (POSES, POINTS, 4))[order] * (views.seen > 0)[..., None],
+        np.full(4, 1.5),
+    )
+    H = rng.choice([0.0, 1.0, 2.0], (POINTS, 4))
+    if kind == "coverage":
+        return (F, H, lam), lambda some: criteria.coverage_greedy(F[list(some)].sum(0), H, lam)
+    made = relaxation.d_optimal(F, H, lam)
+    return made, lambda some: criteria.d_optimal(F[list(some)].sum(0), H, lam)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("k", [1, 2, 4, POSES])
+def test_every_set_is_below_the_bound_and_branch_and_bound_finds_the_best(kind, k):
+    made, gain = case(kind, k)
+    every = {some: gain(some) for some in combinations(range(POSES), k)}
+    largest = max(every.values())
+    bound = upper_bound(made, k)
+    assert bound.value >= largest * (1 - 1e-9)
+    assert bound.weights.sum() == pytest.approx(k)
+    for some in list(every)[:: max(len(every) // 7, 1)]:
+        assert made.gain(some) == pytest.approx(every[some], rel=1e-6, abs=1e-9)
+    best = best_set(made, min(every, key=lambda some: every[some]), gap=1e-9)
+    assert every[tuple(best.views)] == pytest.approx(largest)
+    assert best.bound == pytest.approx(largest, rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_bound_is_the_optimum_that_scipy_finds(kind):
+    made, _ = case(kind)
+    found = minimize(
+        lambda x: -made.tangent(x)[0],
+        np.full(POSES, 3 / POSES),
+        jac=lambda x: -made.tangent(x)[1],
+        bounds=[(0, 1)] * POSES,
+        constraints={"type": "eq", "fun": lambda x: x.sum() - 3},
+        method="SLSQP",
+        options={"ftol": 1e-12, "maxiter": 200},
+    )
+    bound = upper_bound(made, 3, tolerance=1e-7)
+    assert bound.value == pytest.approx(-found.fun, rel=1e-5)
+    assert bound.stopped == "gap"
+    assert 0 <= bound.gap <= 1e-7
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradient_and_curvature_are_those_of_differences(kind):
+    made, _ = case(kind, 3)
+    x, d = np.linspace(0.1, 0.9, POSES), np.random.default_rng(1).normal(size=POSES)
+    ahead, behind = (made.tangent(x + h * d) for h in (1e-4, -1e-4))
+    assert made.tangent(x)[1] @ d == pytest.approx((ahead[0] - behind[0]) / 2e-4, rel=1e-5)
+    bend = -made.curvature(x) @ d
+    assert bend == pytest.approx(
+        (ahead[1] - behind[1]) / 2e-4, rel=1e-4, abs=1e-6 * abs(bend).max()
+    )
+
+
+@pytest.mark.parametrize("k", [1, 2, 4, POSES])
+def test_no_set_observes_more_than_the_bound_of_coverage(k):
+    information, gain = case("coverage", k)
+    best = certificate.best_coverage(*information, k, gap=0)
+    largest = max(gain(some) for some in combinations(range(POSES), k))
+    assert best.gain == gain(best.views) <= largest <= best.bound * (1 + 1e-9)
+    assert largest <= 1.1 * best.gain
+
+
+@settings(max_examples=15)
+@given(st.sampled_from(KINDS), st.integers(0, 10_000), st.randoms(use_true_random=False))
+def test_a_bound_grows_with_k_and_does_not_depend_on_the_order(kind, seed, random):
+    made, _ = case(kind, seed)
+    values = [upper_bound(made, k).value for k in range(1, POSES + 1)]
+    assert np.all(np.diff(values) >= -1e-3 * values[-1])
+    assert values[-1] >= made.gain(range(POSES)) * (1 - 1e-9)
+    order = random.sample(range(POSES), POSES)
+    moved = upper_bound(case(kind, seed, order)[0], 4)
+    assert moved.value == pytest.approx(values[3], rel=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_duplicates_have_equal_prices_and_reruns_equal_bits(kind):
+    order = [0, 1, 2, 3, 3, 5, 6, 7, 8]
+    bounds = [upper_bound(case(kind, 5, order)[0], 3) for _ in range(2)]
+    assert bounds[0].prices[3] == pytest.approx(bounds[0].prices[4], rel=1e-12)
+    for one, other in zip(*bounds, strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_a_coarse_start_and_few_steps_change_the_gap_and_never_the_truth(monkeypatch):
+    made, gain = case("i", 2)
+    largest = max(gain(some) for some in combinations(range(POSES), 3))
+    monkeypatch.setattr(relaxation, "COARSE", 4)
+    coarse, _ = case("i", 2)
+    assert len(coarse.coarse.base) < len(coarse.base) / 2
+    assert upper_bound(coarse, 3).value == pytest.approx(upper_bound(made, 3).value, rel=2e-3)
+    monkeypatch.setattr(certificate, "STEPS", 1)
+    for kept in (made, case("i", 2)[0]):
+        assert upper_bound(kept, 3).value >= largest
+    assert upper_bound(made, 3, tolerance=0).stopped == "steps"
+    assert upper_bound(made, 3, tolerance=0, seconds=0).stopped == "time"
+    assert best_set(made, [0, 1, 2], seconds=0).bound >= largest
+
+
+def test_bad_input_has_one_line():
+    made, _ = case("d")
+    for k in (0, POSES + 1):
+        with pytest.raises(InputError, match=f"{k} of {POSES}"):
+            upper_bound(made, k)
+    F = np.ones((3, 2, 1))
+    with pytest.raises(InputError, match="none of the 3"):
+        relaxation.d_optimal(0 * F, F[0], np.ones(1))
+    F[1, 0] = np.nan
+    with pytest.raises(InputError, match=r"candidate 1 .*not finite"):
+        relaxation.d_optimal(F, F[0], np.ones(1))
