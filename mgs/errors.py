@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import TypeVar
 
@@ -35,15 +34,6 @@ def missing(module: str | None) -> str:
     return f'this needs {name}, which is not installed; `pip install "mgs[{EXTRAS[name]}]"`'
 
 
-FLAGS = {"rates": "--rate", "seeds": "--seed-views", "seed": "--random-seed"}
-"""Settings whose option has another name."""
-
-
-def flag(setting: str) -> str:
-    """Option of a setting on the command line."""
-    return FLAGS.get(setting) or f"--{setting.replace('_', '-')}"
-
-
 def printable(text: str) -> str:
     """Text for a terminal, a page or a figure: control characters and half characters, which names
     of files and frames may have, are escaped."""
@@ -60,47 +50,12 @@ def printable_lines(text: str) -> str:
 class InputError(ValueError):
     """Bad input. The message is one line: what is wrong, where, and how to correct it.
 
-    The command line prints `line`, without a traceback, and exits with code 2. In Python the same
-    message names arguments and functions in place of options and commands.
+    It names settings as Python, config.json and the command line do, and escapes control
+    characters. The command line prints it without a traceback and exits with code 2.
     """
 
-    @property
-    def line(self) -> str:
-        """The message for the command line, `printable`."""
-        return printable(str(self.args[0]))
-
     def __str__(self) -> str:
-        return in_python(self.line)
-
-
-ARGUMENTS = {option: setting for setting, option in FLAGS.items()} | {
-    "--from": "source",
-    "--prior-noise": "noise",
-}
-"""Options whose argument in Python has another name."""
-
-FUNCTIONS = {
-    r"`mgs nbv --resume (\S+) --policy (\S+)`": r"`mgs.resume_nbv('\1', policy='\2')`",
-    r"`mgs nbv --resume (\S+)`": r"`mgs.resume_nbv('\1')`",
-    r"`mgs nbv (\S+) --out (\S+)`": r"`mgs.run_nbv('\1', '\2')`",
-    r"`mgs eval (\S+)`": r"`mgs.evaluate('\1')`",
-    r"`mgs prior DATASET --out (\S+)`": r"`mgs.save_prior('\1', mgs.build_prior(dataset))`",
-}
-"""Commands in messages -> calls that do the same."""
-
-
-def in_python(line: str) -> str:
-    """A message with Python's arguments and functions in place of options and commands."""
-    for command, call in FUNCTIONS.items():
-        line = re.sub(command, call, line)
-
-    def argument(found: re.Match[str]) -> str:
-        option = found[0]
-        if option.startswith("`"):
-            return option  # another command
-        return ARGUMENTS.get(option) or option.removeprefix("--").replace("-", "_")
-
-    return re.sub(r"`[^`]*`|(?<![^\s(/])--[a-z][a-z-]+", argument, line)
+        return printable(str(self.args[0]))
 
 
 class Notice(UserWarning):
@@ -108,7 +63,7 @@ class Notice(UserWarning):
 
 
 def row_named(table: Mapping[str, Row], name: str, what: str) -> Row:
-    """Look a name up in a table. what: the option for the message, as in --preset.
+    """Look a name up in a table. what: the setting, for the message.
 
     Raises InputError, which lists the names of the table, if it has no such name.
     """

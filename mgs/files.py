@@ -269,7 +269,7 @@ def _parsed(path: str | Path, kind: str, parse: Callable[[bytes], Any]) -> Any:
         ) from None
 
 
-THERE = "is there already; choose another place, or replace it with --force"
+THERE = "is there already; choose another place, or replace it with `force`"
 """End of the message of every command whose output exists."""
 
 
@@ -311,7 +311,7 @@ class Ours:
             why = f"it holds {other[0]}" if other else f"it has no {self.names[0]}"
             why = f"this command did not make it, since {why}"
         if why:
-            raise InputError(f"{folder}: --force leaves it alone: {why}; choose another folder")
+            raise InputError(f"{folder}: `force` leaves it alone: {why}; choose another folder")
 
 
 def resolved_parents(path: str | Path) -> list[Path]:

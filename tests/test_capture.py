@@ -30,8 +30,8 @@ from mgs.view.subject import read_subject
 TINY = RenderPreset(width=64, height=48, frames=8, spp=2)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=0))
 TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 0\n"
-RUN = ["--seed-views", "3", "--budget", "3", "--passes", "3", "--evaluate-every", "1"]
-RUN += ["--random-seed", "1"]
+RUN = ["--seeds", "3", "--budget", "3", "--set", "train.passes=3", "--set", "evaluate_every=1"]
+RUN += ["--seed", "1"]
 KILLED = """
 import os, signal
 from mgs import runtime
@@ -301,9 +301,9 @@ def test_a_survey_with_noise_of_an_on_demand_dataset(poses, tmp_path):
 
 def test_bad_options_are_refused(small, tmp_path, capsys):
     """With one line, before anything is made."""
-    begin = ["nbv", "--capture", "boulder", "--seed-views", 3]
+    begin = ["nbv", "--capture", "boulder", "--seeds", 3]
     line = refused(capsys, [*begin, "--budget", 6, "--out", tmp_path / "out"], tmp_path)
-    assert "--budget 6 exceeds its 5" in line
+    assert "has 5 candidates, fewer" in line
     line = refused(capsys, [*begin, "--out", occupied(tmp_path / "full")], tmp_path)
     assert "is there already" in line
 
@@ -317,7 +317,7 @@ def test_commands_say_which_image_an_on_demand_dataset_lacks(fresh, tmp_path, ca
     shutil.rmtree(fresh.root / "survey")
     out = tmp_path / "run"
     line = refused(capsys, ["nbv", fresh.root, "--out", out, *RUN], fresh.root)
-    assert "give one with --prior" in line
+    assert "give one with `prior`" in line
     assert not out.exists()
 
 

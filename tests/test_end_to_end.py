@@ -24,7 +24,7 @@ from mgs.synth.rendering import write_contact_sheet
 
 pytestmark = pytest.mark.usefixtures("coarse_priors")
 
-VIEWS = ["--seed-views", "3", "--budget", "4", "--passes", "6", "--random-seed", "1"]
+VIEWS = ["--seeds", "3", "--budget", "4", "--set", "train.passes=6", "--seed", "1"]
 STRUCK = """
 import os, signal
 from mgs.run import operations
@@ -60,7 +60,7 @@ def dataset(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(dataset, coarse_priors):
     out = dataset.parent / "run"
-    command("nbv", dataset, "--out", out, "--gaussians", 300, *VIEWS, "--evaluate-every", 2)
+    command("nbv", dataset, "--out", out, "--gaussians", 300, *VIEWS, "--set", "evaluate_every=2")
     return out
 
 
@@ -86,7 +86,7 @@ def test_interrupted_in_the_middle_of_a_step_then_resumed(dataset, run, tmp_path
     out = tmp_path / "run"
     arguments = ["nbv", dataset, "--out", out, "--prior", run / "prior", *VIEWS]
     process = subprocess.run(
-        [sys.executable, "-c", STRUCK, *arguments, "--evaluate-every", "2"],
+        [sys.executable, "-c", STRUCK, *arguments, "--set", "evaluate_every=2"],
         capture_output=True,
         text=True,
     )

@@ -14,6 +14,7 @@ from mgs.policy.directional import Views, gains
 from mgs.policy.pool_gains import PoolGains
 from mgs.run import folder as run_folder
 from mgs.run.problem import Problem
+from mgs.run.settings import FlightLimits
 
 POSITIONS = arrays(np.float64, (9, 3), elements=st.floats(-50, 50, width=32))
 RADII = st.sampled_from([0.0, 1.0, 20.0])
@@ -129,9 +130,9 @@ def metres(dataset, taken):
 
 
 LIMITS = [
-    {"flight_length": 30.0, "batch": 2},
-    {"flight_time": 40.0, "speed": 1.0, "hover": 3.0},
-    {"flight_length": 19.0, "policy": "random"},
+    {"flight": {"length": 30.0}, "batch": 2},
+    {"flight": {"time": 40.0, "speed": 1.0, "hover": 3.0}},
+    {"flight": {"length": 19.0}, "policy": "random"},
 ]
 
 
@@ -140,8 +141,9 @@ def test_a_flight_never_exceeds_its_limits_and_resumes_the_same(loaded, tmp_path
     given = {"budget": 9, "seeds": 3, **limits}
     state = run(tmp_path / "run", loaded, **given)
     flown, pictures = metres(loaded, state.taken), len(state.taken)
-    assert flown <= limits.get("flight_length", np.inf)
-    assert flown / limits.get("speed", 2) + 3 * pictures <= limits.get("flight_time", np.inf)
+    flight = FlightLimits(**limits["flight"])
+    assert flown <= (flight.length or np.inf)
+    assert flown / flight.speed + 3 * pictures <= (flight.time or np.inf)
     assert state.steps[-1]["ended"] == {
         "reason": "flight", "views": pictures - 3, "metres": pytest.approx(flown)
     }  # fmt: skip
@@ -158,17 +160,18 @@ def test_a_flight_never_exceeds_its_limits_and_resumes_the_same(loaded, tmp_path
 
 def test_a_limit_that_binds_nothing_changes_no_view_of_one_step(loaded, tmp_path):
     free = run(tmp_path / "free", loaded, budget=1)
-    wide = run(tmp_path / "wide", loaded, budget=1, flight_length=1e6)
+    wide = run(tmp_path / "wide", loaded, budget=1, flight={"length": 1e6})
     assert wide.taken == free.taken
 
 
 def test_poses_that_are_not_allowed_are_never_taken(dataset, prior, tmp_path, capsys):
     """Twelve poses on a circle of 3 m; the sphere's samples reach from -1 to 1 m."""
-    given = ["--seed-views", 3, "--budget", 2, "--prior", prior]
-    command("nbv", dataset, *given, "--no-fly", 2.9, "--out", tmp_path / "run")
-    assert "0 of 12 poses are ruled out by --no-fly and --clearance" in said(capsys)[0]
+    given = ["--seeds", 3, "--budget", 2, "--prior", prior]
+    command("nbv", dataset, *given, "--set", "flight.no_fly=2.9", "--out", tmp_path / "run")
+    assert "0 of 12 poses are ruled out by flight.no_fly and flight.clearance" in said(capsys)[0]
     assert len(steps(tmp_path / "run")) == 3
-    settings = run_folder.open_run(tmp_path / "run").settings.model_copy(update={"no_fly": 2.0})
+    settings = run_folder.open_run(tmp_path / "run").settings
+    settings = settings.model_copy(update={"flight": FlightLimits(no_fly=2.0)})
     problem = Problem(run_folder.open_run(tmp_path / "run").dataset, settings, tiny.operations())
     opposite = problem.flight.legs[0, 6]
     assert 6 < opposite == pytest.approx(2 * np.sqrt(5) + 2 * (np.pi - 2 * np.arccos(2 / 3)), 0.01)

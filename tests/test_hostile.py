@@ -103,7 +103,7 @@ def test_a_terminal_of_ascii_and_no_home():
         "import typer; from mgs.cli import app; from mgs import runtime\n"
         "def show():\n    runtime.start(); import mitsuba as mi; mi.Float(1, 2) + 1\n"
         "    print('1 m²')\n"
-        "app.show = show; app.COMMANDS['show'] = 'app.show'; app.main(['show'])"
+        "app.show = show; app.COMMANDS['show'] = ('app.show', ''); app.main(['show'])"
     )
     env = {key: value for key, value in os.environ.items() if key != "HOME"}
     ended = subprocess.run(

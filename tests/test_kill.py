@@ -41,9 +41,9 @@ main()
 
 TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 20\n"
 UNEQUAL = rb'"(commit|\w*seconds\w*)":\s*(\{[^}]*\}|"[^"]*"|[-+.\de]+)'
-LOOP = "--seed-views 2 --budget 2 --passes 3 --random-seed 1"
+LOOP = "--seeds 2 --budget 2 --set train.passes=3 --seed 1"
 COMMANDS = {
-    "nbv": f"nbv {{data}} --prior {{prior}} --out {{out}} {LOOP} --evaluate-every 1",
+    "nbv": f"nbv {{data}} --prior {{prior}} --out {{out}} {LOOP} --set evaluate_every=1",
     "capture": f"nbv --capture {{scene}} --gaussians 150 --out {{out}} {LOOP}",
     "synth-orbit": "synth-orbit {out} --scene {scene} --frames 6 --size 64x48 --spp 2",
     "import": "import {data} --mesh {data}/rock.glb --out {out}",

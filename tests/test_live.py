@@ -215,7 +215,7 @@ def test_poses_given_up_in_an_outage_are_asked_for_again(
                 mgs.run_nbv(poses, out, live=live.Live(failing, tries=1), **settings)
         else:
             run = mgs.run_nbv(poses, out, live=live.Live(failing, tries=1), **settings)
-            assert "8 poses gave no picture, --resume asks" in why_ended(
+            assert "8 poses gave no picture, resuming asks" in why_ended(
                 run.state.steps[-1]["ended"]
             )
             assert mgs.resume_nbv(out).state.taken == run.state.taken
@@ -356,7 +356,7 @@ def test_bad_options_are_one_line(capsys, pristine, poses, prior, tmp_path):
         ([program, "true {out}"], "has no {pose}"),
         ([program, "true '{pose} {out}"], "No closing quotation"),
         ([program, "nosuchprogram {pose} {out}"], "there is no program nosuchprogram"),
-        ([program, "true {pose} {out}", "--capture-failure", "never"], "choose skip or stop"),
+        ([program, "true {pose} {out}", "--set", "capture.failure=never"], "capture.failure"),
         ([program, "true {pose} {out}", "--capture-folder", tmp_path], "give either"),
     ):
         assert message in refused(capsys, [*begin, *arguments], tmp_path)
@@ -374,8 +374,15 @@ def test_the_simulated_drone(tmp_path, capfd):
     command("synth-orbit", world, "--on-demand", *orbit)
     tool = Path(__file__).parent.parent / "tools/drone.py"
     program = f"{sys.executable} {tool} {world} {{pose}} {{out}} --fail 0.4 --noise 0.02"
-    flying = ["--capture-command", program, "--capture-tries", 4, "--capture-timeout", 200]
-    settings = ["--seed-views", 3, "--budget", 2, "--passes", 2, "--gaussians", 200]
+    flying = [
+        "--capture-command",
+        program,
+        "--set",
+        "capture.tries=4",
+        "--set",
+        "capture.timeout=200",
+    ]
+    settings = ["--seeds", 3, "--budget", 2, "--set", "train.passes=2", "--gaussians", 200]
     command("nbv", world, *settings, *flying, "--out", run)
     assert "try 1 of 4" in capfd.readouterr().err
     assert len(steps(run)) == 3

@@ -85,7 +85,7 @@ def test_force_replaces_what_the_command_made_and_nothing_else(capsys, dataset, 
     nbv = ["nbv", dataset, "--prior", prior, "--out", out, "--budget", 1, "--force"]
     assert "is there already" in refused(capsys, nbv, out)
     nbv[nbv.index(out)] = run
-    command(*nbv, "--seed-views", 3, "--passes", 1, "--warm-passes", 1)
+    command(*nbv, "--seeds", 3, "--set", "train.passes=1", "--set", "warm_passes=1")
     assert not (run / "renders").exists()
     assert len(steps(run)) == 2
 

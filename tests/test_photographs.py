@@ -436,9 +436,13 @@ REFUSED: dict[str, tuple[Callable[[Path], object], list[str], str]] = {
     "few": (few, [], "7 photographs without depth are too few; take at least 8"),
     "no overlap": (apart, [], "the photographs do not overlap"),
     "no object": (no_object, [], "points lie in one cluster above the ground; give masks"),
-    "a surface at random": (bare, ["--from", "random", "--holes", "0.1"], "has no surface"),
-    "hull without masks": (bare, ["--from", "hull"], "has no masks; "),
-    "depth without depth": (few, ["--from", "depth"], "has no depth images; take --from hull"),
+    "a surface at random": (bare, ["--source", "random", "--holes", "0.1"], "has no surface"),
+    "hull without masks": (bare, ["--source", "hull"], "has no masks; "),
+    "depth without depth": (
+        few,
+        ["--source", "depth"],
+        "has no depth images; take the",
+    ),
 }
 
 
@@ -456,7 +460,7 @@ def test_a_world_in_which_nothing_would_be_drawn_is_one_line(tmp_path, capsys):
     command("import", tmp_path / "src", "--out", tmp_path / "d", "--unit", "0.002")
     command("prior", tmp_path / "d", "--gaussians", "300")
     capsys.readouterr()
-    message = "m from it, and nothing nearer than 0.01 is drawn; import the data with --unit M"
+    message = "m from it, and nothing nearer than 0.01 is drawn; import the data with `unit`"
     out = tmp_path / "run"
     assert message in refused(capsys, ["nbv", tmp_path / "d", "--out", out, "--budget", 1], out)
 
@@ -466,7 +470,7 @@ def test_poses_alone_are_fitted_from_random_points(tmp_path, capsys):
     command("prior", tmp_path / "d", "--gaussians", "300")
     assert "300 random points" in capsys.readouterr().out
     fitted = ["fit", tmp_path / "d", "--passes", "2", "--out", tmp_path / "run"]
-    assert "pass --means free" in refused(capsys, [*fitted, "--means", "frozen"], tmp_path / "run")
+    assert "let means be free" in refused(capsys, [*fitted, "--means", "frozen"], tmp_path / "run")
     command(*fitted)
     command("eval", tmp_path / "run")
     capsys.readouterr()
@@ -522,9 +526,17 @@ def test_a_fit_with_adaptive_density_is_a_run_as_3dgs(tmp_path, capsys, monkeypa
         monkeypatch.setattr(density, f"ADAPTION_{name}", value)
     fitted = ["fit", tmp_path / "d", "--density", "adaptive", "--out", tmp_path / "run"]
     capsys.readouterr()
-    line = refused(capsys, [*fitted, "--most-gaussians", 0], tmp_path / "run")
-    assert "--most-gaussians 0: must be at least 1" in line
-    command(*fitted, "--passes", 8, "--most-gaussians", 310, "--rate", "mean=0.01")
+    line = refused(capsys, [*fitted, "--set", "train.most_gaussians=0"], tmp_path / "run")
+    assert "train.most_gaussians = 0: must be at least 1" in line
+    command(
+        *fitted,
+        "--passes",
+        8,
+        "--set",
+        "train.most_gaussians=310",
+        "--set",
+        "train.rates.mean=0.01",
+    )
     settings = read_json(tmp_path / "run/config.json")["settings"]
     train = settings["train"]
     assert (settings["sh"], train["means"], train["optimiser"]) == (3, "free", "adam")

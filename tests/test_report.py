@@ -153,7 +153,7 @@ def test_figures_are_written_as_asked_for_and_those_left_out_are_named(runs, tmp
     assert names == written | {"table.md", "table.json"}
     assert (tmp_path / "report/gain.pdf").read_bytes().startswith(b"%PDF")
     said = capsys.readouterr().out
-    left_out = "PSNR against images is left out: make all runs with --evaluate-every to have it"
+    left_out = "PSNR against images is left out: make all runs with evaluate_every to have it"
     assert left_out in said
     assert said.count("left out") == 1
     ending = r"gain\.eps: figures are written as png, pdf, svg; choose another ending"
@@ -238,12 +238,12 @@ UNFIT = {
     ),
     "view not measured": (edit("metrics.json", views=[], test_views=[]), "not evaluated on kf_"),
     "other pictures": (edit("metrics.json", pictures=False), "no picture of this model"),
-    "no pictures": (lambda run: shutil.rmtree(run / "renders"), "draw it with `mgs.evaluate"),
+    "no pictures": (lambda run: shutil.rmtree(run / "renders"), "draw it with `mgs eval"),
     "another dataset": (lambda run: change_settings(run, dataset="/"), "another dataset"),
     "frames changed": (edit("config.json", frames=[]), "its frames differ"),
-    "budget of words": (lambda run: change_settings(run, budget="many"), "settings.budget: "),
+    "budget of words": (lambda run: change_settings(run, budget="many"), "budget = 'many': "),
     "budget raised": (lambda run: change_settings(run, budget=7), "with 8 of 10 views; go on"),
-    "unfinished": (unfinished, "is unfinished, with 5 of 8 views; go on with `mgs.resume_nbv"),
+    "unfinished": (unfinished, "is unfinished, with 5 of 8 views; go on with `mgs nbv --resume"),
     "no step": (remove("checkpoint.npz"), "has no finished step yet; continue it"),
     "no lines": (remove("steps.jsonl"), "steps.jsonl: is missing or damaged"),
     "no frame": (lambda run: change_steps(run, no_line_has("frame")), "frames are not those"),

@@ -342,9 +342,9 @@ def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, m
     assert "Not done yet" not in text
     line = rows()["random, draw 2"]["command"]
     assert line.startswith("mgs nbv cells/dataset/boulder-0/circle-1/8x48x36/dataset --prior ")
-    assert line.endswith("--policy random --seed-views 4 --budget 2 --random-seed 1000")
+    assert line.endswith("--policy random --seeds 4 --budget 2 --seed 1000")
     done(capsys, out, "--only", "table1", "--batch", 2)
-    ending = "--policy d-optimal --batch 2 --seed-views 4 --budget 2 --random-seed 0"
+    ending = "--policy d-optimal --batch 2 --seeds 4 --budget 2 --seed 0"
     assert rows()["d-optimal"]["command"].endswith(ending)
     batches = [settings.get("batch") for settings in asked]
     assert batches == [None] * 8 + [2] * 5  # 3DGS is no run

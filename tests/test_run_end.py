@@ -100,13 +100,13 @@ def test_one_line_says_why_a_run_ended(dataset, prior, tmp_path, capsys):
         command(*arguments)
         return capsys.readouterr().out
 
-    start = ["nbv", dataset, "--prior", prior, "--budget", "2", "--passes", "1"]
+    start = ["nbv", dataset, "--prior", prior, "--budget", "2", "--set", "train.passes=1"]
     early, whole = runs = [tmp_path / name for name in ("early", "whole")]
-    shown = mgs(*start, "--out", early, "--stop-gain", "1e3")
+    shown = mgs(*start, "--out", early, "--set", "stop_gain=1e3")
     ended = steps(early)[-1]["ended"]
     gain = f"would gain {ended['information_gain']:.4g} {GAIN_UNIT} after 0 chosen views"
     next_view = f"the next view, {ended['name']}"
-    line = f"the run has ended: {next_view}, {gain}, less than --stop-gain 1000"
+    line = f"the run has ended: {next_view}, {gain}, less than stop_gain = 1000"
     assert shown.count(line) == 1
     assert mgs("nbv", "--resume", early).count(line) == 1
     shown = mgs(*start, "--out", whole, "--policy", "random", "--batch", "2")
@@ -129,5 +129,5 @@ def test_one_line_says_why_a_run_ended(dataset, prior, tmp_path, capsys):
 def test_reasons_in_words():
     assert why_ended({"reason": "budget", "views": 1}) == "its budget is spent, 1 chosen view"
     left = {"reason": "uncertainty", "views": 2, "uncertainty": 0.5, "limit": 0.6}
-    limit = "no more than --stop-uncertainty 0.6"
+    limit = "no more than stop_uncertainty = 0.6"
     assert f"of the prior's variance is left after 2 chosen views, {limit}" in why_ended(left)

@@ -60,7 +60,7 @@ def test_views_are_planned_together_and_flown_in_a_short_order(run, site):
     assert all(view.information_gain < alone[view.name] for view in chosen[1:])
     azimuths = [view.azimuth for view in found.plan]
     assert azimuths in (sorted(azimuths), sorted(azimuths, reverse=True))
-    short = suggest(opened, ring, 12, flight_length=0.8 * found.metres)
+    short = suggest(opened, ring, 12, flight={"length": 0.8 * found.metres})
     assert 0 < len(short.plan) < 12
     assert short.metres <= 0.8 * found.metres
 
@@ -81,9 +81,18 @@ def test_a_dataset_is_one_command_and_its_flight_plan_is_read_by_pymavlink(run, 
     out, data = tmp_path / "next", open_run(run).dataset.root
     plans = [tmp_path / f"next.{kind}" for kind in ("plan", "waypoints", "kml")]
     written = [word for path in plans for word in ("--plan", path)]
-    place = ["--origin", "47,8,400,90", "--no-fly", 1.5, "--hover", 2, "--speed", 1.5]
+    place = [
+        "--origin",
+        "47,8,400,90",
+        "--set",
+        "flight.no_fly=1.5",
+        "--set",
+        "flight.hover=2",
+        "--set",
+        "flight.speed=1.5",
+    ]
     command("suggest", data, "--dome", 30, "--views", 3, "--out", out, *written, *place)
-    assert "ruled out by --no-fly or --clearance" in said(capsys)[0]
+    assert "ruled out by flight.no_fly or flight.clearance" in said(capsys)[0]
     assert len(json.loads((out / "suggestions.json").read_text())["plan"]) == 3
     poses = [camera for _, camera in load_cameras(out)]
     assert len(load_dataset(out)) == len(poses) == 3
@@ -151,7 +160,7 @@ def test_a_plan_around_a_cylinder_does_not_cross_the_object(run, tmp_path, capsy
     base = ["suggest", run, "--poses", path, "--views", 2, *plan]
     assert "crosses the object, so no flight plan" in refused(capsys, base)
     assert not (tmp_path / "a.plan").exists()
-    command(*base, "--no-fly", 1.2)
+    command(*base, "--set", "flight.no_fly=1.2")
     assert (tmp_path / "a.plan").is_file()
 
 
@@ -211,15 +220,15 @@ def test_a_csv_that_is_no_list_of_poses_is_one_line(run, tmp_path, capsys, text,
 
 BAD = {
     "--poses {data}": "can be flown (8 taken already)",
-    "--ring 3 --views 4": "--views 4 of 3 candidates",
-    "--dome 5 --flight-length 0.1": "within the limits",
-    "--dome 5 --ring 5": "give one of them",
-    "--plan a.plan": "--plan needs --origin",
+    "--set ring=3 --views 4": "views 4 of 3 candidates",
+    "--dome 5 --set flight.length=0.1": "within the limits",
+    "--dome 5 --set ring=5": "give one of them",
+    "--plan a.plan": "`plan` needs `origin`",
     "--plan a.txt --origin 1,2,3": "written as .plan, .waypoints, .kml",
-    "--origin 47,8": "--origin '47,8': expected LATITUDE",
-    "--elevations 50,20": "--elevations '50,20': expected",
-    "--dome 5 --radius nan": "--radius nan: must be",
-    "--gaussians 9": "is a run with its model; leave out --gaussians",
+    "--origin 47,8": "origin '47,8': expected LATITUDE",
+    "--set elevations=50,20": "elevations = [50, 20]: expected",
+    "--dome 5 --set radius=nan": "radius = nan: ",
+    "--gaussians 9": "is a run with its model; leave out `gaussians`",
 }
 
 

@@ -156,7 +156,7 @@ def test_what_is_taken_as_up_is_said(tmp_path):
     trimesh.creation.icosphere(subdivisions=2).export(path)
     for up in (None, "y"):
         rock_of(SCENE, 0, path, up, notes.append)
-    assert "+Z taken as up, since its format does not say (--mesh-up y turns it)" in notes[0]
+    assert "+Z taken as up, since its format does not say (`mesh_up` = y turns it)" in notes[0]
     assert "+Y is up, as --mesh-up says" in notes[1]
 
 

@@ -18,13 +18,13 @@ from importlib import import_module
 from inspect import cleandoc
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from mgs import __version__
+from mgs.cli.renamed import renewed
 from mgs.errors import InputError, Notice, missing, printable
 
 INTERRUPTED = 130
@@ -43,32 +43,32 @@ CURES = {
 """Errors of the system that the user can correct, and how. All others are errors of the program."""
 
 COMMANDS = {
-    "doctor": "doctor.doctor",
-    "synth-orbit": "synth_orbit.synth_orbit",
-    "dataset": "dataset.dataset",
-    "import": "import_data.import_data",
-    "survey": "survey.survey",
-    "prior": "prior.prior",
-    "nbv": "nbv.nbv",
-    "fit": "fit.fit",
-    "suggest": "suggest.suggest",
-    "eval": "models.evaluate",
-    "diagnose": "models.diagnose",
-    "report": "report.report",
-    "view": "pictures.view",
-    "render": "pictures.render",
-    "export": "share.export",
-    "video": "share.video",
-    "prune": "models.prune",
-    "refit": "models.refit",
-    "demo": "demo.demo",
-    "bench": "bench.bench",
-    "reproduce": "studies.reproduce",
-    "chart": "studies.chart",
-    "stress": "studies.stress",
-    "parsimony": "studies.parsimony",
+    "doctor": ("doctor.doctor", "Check this machine and what is installed."),
+    "synth-orbit": ("synth_orbit.synth_orbit", "Render a dataset: an orbit around a rock."),
+    "dataset": ("dataset.dataset", "Check a dataset, or make its masks."),
+    "import": ("import_data.import_data", "Make a dataset of your own images and cameras."),
+    "survey": ("survey.survey", "Simulate a survey flight with a noisy depth camera."),
+    "prior": ("prior.prior", "Build the prior: a mesh of the object, and samples of it."),
+    "nbv": ("nbv.nbv", "Choose the next best views."),
+    "fit": ("fit.fit", "Fit a model to all images of a dataset."),
+    "suggest": ("suggest.suggest", "Rank candidate poses, and plan the next flight."),
+    "eval": ("models.evaluate", "Measure PSNR and SSIM of models."),
+    "diagnose": ("models.diagnose", "Draw maps of information and uncertainty."),
+    "report": ("report.report", "Compare runs by figures and a table, or by one HTML page."),
+    "view": ("pictures.view", "Show a run or a model in the browser."),
+    "render": ("pictures.render", "Draw a model through given cameras."),
+    "export": ("share.export", "Write a model for other programs."),
+    "video": ("share.video", "Make a video of a run."),
+    "prune": ("models.prune", "Remove Gaussians that the images hardly need."),
+    "refit": ("models.refit", "Fit a run again with no more parameters than it needs."),
+    "demo": ("demo.demo", "Run all steps on a small rock."),
+    "bench": ("bench.bench", "Time the splatting kernels."),
+    "reproduce": ("studies.reproduce", "Reproduce the results."),
+    "chart": ("studies.chart", "Draw seconds against PSNR."),
+    "stress": ("studies.stress", "Count where methods fail."),
+    "parsimony": ("studies.parsimony", "Measure how much model a scene needs."),
 }
-"""File and function of all commands, in about the order in which they are used."""
+"""Commands in about the order in which they are used: file and function, and a line of help."""
 
 RESUMABLE = ("synth-orbit", "import", "demo", "reproduce", "chart", "stress", "parsimony")
 """Commands that continue where they stopped when they are given again."""
@@ -78,6 +78,21 @@ def _help(docstring: str | None) -> str:
     """Join the lines of each paragraph, so that the terminal breaks them."""
     paragraphs = cleandoc(docstring or "").split("\n\n")
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+
+
+class _Command(TyperCommand):
+    """A command; the help of one with --set ends with a table of the settings."""
+
+    keys: Sequence[tuple[str, str, str]] = ()
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help of the command."""
+        super().format_help(ctx, formatter)
+        if self.keys:
+            from mgs.cli.printing import settings_table
+            from mgs.cli.terminal import Terminal
+
+            Terminal().print(settings_table(self.keys))
 
 
 class _Commands(Mapping[str, Any]):
@@ -90,15 +105,19 @@ class _Commands(Mapping[str, Any]):
         return iter(COMMANDS)
 
     def __getitem__(self, name: str) -> Any:
-        file, function = COMMANDS[name].split(".")
-        found = getattr(import_module(f"mgs.cli.{file}"), function)
+        file, function = COMMANDS[name][0].split(".")
+        called = getattr(import_module(f"mgs.cli.{file}"), function)
         alone = typer.Typer(add_completion=False)
-        alone.command(name, help=_help(found.__doc__))(found)
-        return typer.main.get_command(alone)
+        alone.command(name, cls=_Command, help=_help(called.__doc__))(called)
+        command: Any = typer.main.get_command(alone)
+        keys = getattr(called, "keys", ())
+        own = {parameter.name for parameter in command.params} | {"dataset", "prior"}
+        command.keys = [row for row in keys if row[0].removeprefix("train.") not in own]
+        return command
 
 
 class _Program(TyperGroup):
-    """The program: its own help reads the commands' docstrings without importing them."""
+    """The program, whose own help imports no command."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
@@ -106,17 +125,8 @@ class _Program(TyperGroup):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Print the help of the program."""
-        self.commands = {name: TyperCommand(name, help=_docstring(name)) for name in COMMANDS}
+        self.commands = {name: TyperCommand(name, help=row[1]) for name, row in COMMANDS.items()}
         super().format_help(ctx, formatter)
-
-
-def _docstring(command: str) -> str:
-    """First paragraph of a command's help, read from the source."""
-    file, function = COMMANDS[command].split(".")
-    source = Path(__file__).with_name(f"{file}.py").read_text(encoding="utf-8")
-    start = source.index(f"def {function}(")
-    quoted = source[source.index('    """', start) :].split('"""')[1]
-    return _help(quoted).split("\n\n")[0]
 
 
 app = typer.Typer(name="mgs", cls=_Program, add_completion=False, pretty_exceptions_enable=False)
@@ -148,12 +158,11 @@ def main(arguments: list[str] | None = None) -> None:
     Always raises SystemExit, except that errors of the program itself pass through.
     """
     arguments = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
-    if "--help" in arguments:
-        _import_help()
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may lack characters of the tables
         sys.stdout.reconfigure(errors="replace")
     warnings.simplefilter("always", Notice)
     warnings.showwarning = _print_warning  # type: ignore[assignment]
+    arguments = renewed(arguments)
     try:
         code = app(arguments, prog_name="mgs", standalone_mode=False)
         sys.stdout.flush()
@@ -162,7 +171,7 @@ def main(arguments: list[str] | None = None) -> None:
             raise
         raise _stop(_system_error(error), 2) from None
     except InputError as error:
-        raise _stop(error.line, 2) from None
+        raise _stop(str(error), 2) from None
     except typer.TyperException as error:
         message = error.format_message().replace("Value error, ", "")
         raise _stop(" ".join(message.split()), 2) from None
@@ -178,19 +187,6 @@ def main(arguments: list[str] | None = None) -> None:
     if code == INTERRUPTED:  # typer turns Ctrl-C into this exit code and prints nothing
         raise _stop(f"interrupted{_hint(arguments)}", INTERRUPTED)
     raise SystemExit(code or 0)
-
-
-def _import_help() -> None:
-    """Import typer's help without two parts of rich that no help of ours uses, a third of its
-    time."""
-    unused = {"rich.markdown": "Markdown", "rich.traceback": "Traceback"}
-    absent = {name: ModuleType(name) for name in unused if name not in sys.modules}
-    for name, module in absent.items():
-        setattr(module, unused[name], object)
-    sys.modules.update(absent)
-    import_module("typer.rich_utils")
-    for name in absent:
-        del sys.modules[name]
 
 
 def _print_warning(message: Any, category: type, filename: str, line: int, *_: Any) -> None:
@@ -209,9 +205,14 @@ def _hint(arguments: Sequence[str]) -> str:
     runs = [after for option, after in pairwise(options) if option in ("--out", "--resume")]
     if command not in ("nbv", "fit") or not runs or not (Path(runs[-1]) / "config.json").is_file():
         return ""
-    live = [pair for pair in pairwise(options) if pair[0].startswith("--capture-")]
+    live = [pair for pair in pairwise(options) if _of_capture(*pair)]
     again = [part for pair in live for part in pair]
     return f"; continue with: mgs nbv {shlex.join(['--resume', runs[-1], *again])}"
+
+
+def _of_capture(option: str, value: str) -> bool:
+    """Whether an option is about live capture, which a run that is resumed needs again."""
+    return option.startswith("--capture-") or (option == "--set" and value.startswith("capture."))
 
 
 def _from_interrupt(error: BaseException | None) -> bool:

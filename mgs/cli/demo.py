@@ -165,6 +165,6 @@ def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
     for folder, found in recorded.items():
         if found != seed:
             raise InputError(
-                f"{folder}: was made with --random-seed {found}, not {seed}; "
+                f"{folder}: was made with `seed` {found}, not {seed}; "
                 "give that seed, or another folder"
             )

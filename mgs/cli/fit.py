@@ -3,37 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-from mgs.cli.nbv import (
-    MORE_HELP,
-    resume_and_print,
-    settings_of,
-    start_and_print,
-    with_settings_as_options,
+from mgs.cli.nbv import resume_and_print, start_and_print
+from mgs.cli.options import (
+    DatasetFolder,
+    Force,
+    Gaussians,
+    Settings,
+    given,
+    merged,
+    option,
+    parse_gaussians,
+    parse_settings,
+    setting,
+    with_keys,
 )
-from mgs.cli.options import DatasetFolder, Force, option, parse_gaussians
+from mgs.run.settings import NbvSettings
 
-PANELS = {
-    "Fitting": (
-        "passes", "means", "sh", "density", "most_gaussians", "loss", "exposure", "antialiased",
-        "alpha_weight", "optimiser", "rates",
-    ),
-    "Advanced": ("pixel_noise", "prior_std", "seed"),
-}  # fmt: skip
-"""Settings with an option of the same name, as `mgs.cli.nbv.PANELS`."""
-
-DEFAULTS = {
-    "passes": " Default: 30 with adaptive density or free means from photographs, else 10.",
-    "means": " Default: free from photographs or with adaptive density, else frozen.",
-    "sh": " Default: 3 with adaptive density, 1 with free means from photographs, else 0.",
-    "loss": " Default: squared with frozen means, l1-dssim with free ones from photographs.",
-    "antialiased": " Default with adaptive density: --no-antialiased.",
-    "density": " The defaults of adaptive are all those of 3DGS.",
-}
+PASSES = " Default: 30 with adaptive density or free means from photographs, else 10."
+MEANS = " Default: free from photographs or with adaptive density, else frozen."
+SH = " Default: 3 with adaptive density, 1 with free means from photographs, else 0."
+DENSITY = " Default: fixed. The defaults of adaptive are all those of 3DGS."
+LOSS = " Default: squared with frozen means, l1-dssim with free ones from photographs."
 """Help of the settings that `mgs.run.nbv.start_fit` decides by the prior."""
 
 
+@with_keys(NbvSettings, "train", "sh", "exposure", "pixel_noise", "prior_std", "seed")
 def fit(
     dataset: DatasetFolder,
     out: Annotated[Path, option("New folder for the run.")],
@@ -41,12 +37,16 @@ def fit(
         Path | None,
         option("Folder of `mgs prior`. Default: DATASET/prior, or one built in the run."),
     ] = None,
-    gaussians: Annotated[
-        str | None,
-        option("Build a prior of this many Gaussians in the run folder.", metavar="N|auto"),
-    ] = None,
+    gaussians: Gaussians = None,
+    passes: Annotated[int | None, setting(NbvSettings, "train.passes", PASSES)] = None,
+    means: Annotated[str | None, setting(NbvSettings, "train.means", MEANS)] = None,
+    sh: Annotated[int | None, setting(NbvSettings, "sh", SH)] = None,
+    density: Annotated[str | None, setting(NbvSettings, "train.density", DENSITY)] = None,
+    loss: Annotated[str | None, setting(NbvSettings, "train.loss", LOSS)] = None,
+    exposure: Annotated[bool | None, setting(NbvSettings, "exposure")] = None,
+    seed: Annotated[int | None, setting(NbvSettings, "seed")] = None,
+    settings: Settings = None,
     force: Force = False,
-    **options: Any,
 ) -> None:
     """Fit a model to all images of a dataset, and measure it.
 
@@ -60,9 +60,18 @@ def fit(
     from mgs.run.nbv import start_fit
 
     console = Terminal()
-    given = {name: options[name] for name in options if options[name] not in (None, [])}
-    asked = {"prior": prior, "gaussians": parse_gaussians(gaussians), "force": force}
-    run = start_and_print(dataset, out, console, start_fit, **asked, **settings_of(given))
+    train = given(passes=passes, means=means, density=density, loss=loss)
+    options = given(sh=sh, exposure=exposure, seed=seed) | {"train": train}
+    run = start_and_print(
+        dataset,
+        out,
+        console,
+        start_fit,
+        prior=prior,
+        gaussians=parse_gaussians(gaussians),
+        force=force,
+        **merged(parse_settings(settings, fit), options),
+    )
     numbers = run.prior.numbers
     if numbers["from"] == "random" and prior is None:
         console.print(
@@ -71,6 +80,3 @@ def fit(
             soft_wrap=True,
         )
     resume_and_print(run, console, run.settings.policy)
-
-
-with_settings_as_options(fit, PANELS, MORE_HELP | DEFAULTS)

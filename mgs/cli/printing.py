@@ -47,6 +47,15 @@ def fits(console: Terminal, table: Table) -> bool:
     return console.measure(table, options=unlimited).maximum <= console.width
 
 
+def settings_table(keys: Sequence[tuple[str, str, str]]) -> Table:
+    """Table of settings: key, default and description of each."""
+    table = Table("--set KEY=VALUE", "", box=box.SIMPLE_HEAD, pad_edge=False)
+    for key, default, text in keys:
+        shown = f" Default: {default}." if default and "Default" not in text else ""
+        table.add_row(key, text + shown)
+    return table
+
+
 def print_quality(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print the rows of `mgs.report.tables.comparison_rows` as a table, for 80 columns.
 

@@ -57,11 +57,10 @@ def prior(
         option(
             "Source of the surface: depth, points, hull (of the masks), mesh (--mesh) or random. "
             "Default: the first of depth, points and hull that the dataset has, else random.",
-            "--from",
         ),
     ] = None,
     points: Annotated[
-        Path | None, option("PLY file of points for --from points, world coordinates.")
+        Path | None, option("PLY file of points for --source points, world coordinates.")
     ] = None,
     up: Annotated[
         str | None,
@@ -109,7 +108,7 @@ def prior(
     axis = None if up is None else parse_up(up)
     if mesh is not None and (source not in (None, "mesh") or points is not None):
         raise InputError(
-            "prior: --mesh gives the surface, and --from or --points build one; give one of them"
+            "prior: --mesh gives the surface, and --source or --points build one; give one of them"
         )
     loaded = load_dataset(dataset)
     folder = out if out is not None else below(dataset, "prior")
@@ -170,7 +169,7 @@ def _built(
     except NoSurface as refused:
         picture = folder.with_name(f"{folder.name}-refused.png")
         draw_refused(picture, refused.points, refused.kept, np.array(dataset.up))
-        raise InputError(f"{refused.line} (the points: {picture})") from None
+        raise InputError(f"{refused} (the points: {picture})") from None
 
 
 def _random(numbers: dict[str, Any]) -> str:

@@ -78,7 +78,7 @@ def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
         echo(f"wrote {file}")
     chosen = any(run.settings.budget for run in compared.values())
     if chosen and not any(file.stem == "psnr" for file in written):
-        echo("PSNR against images is left out: make all runs with --evaluate-every to have it")
+        echo("PSNR against images is left out: make all runs with evaluate_every to have it")
 
 
 def _write_page(runs: list[Path], html: Path) -> None:

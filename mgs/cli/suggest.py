@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 from rich.table import Table
 
 from mgs import runtime
-from mgs.cli.nbv import PANELS, with_settings_as_options
-from mgs.cli.options import Force, argument, option, parse_gaussians
+from mgs.cli.options import (
+    Force,
+    Settings,
+    argument,
+    given,
+    option,
+    parse_gaussians,
+    parse_settings,
+    setting,
+    with_keys,
+)
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
+from mgs.run.settings import FlightLimits, NbvSettings, Positive, validated
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,6 +34,8 @@ if TYPE_CHECKING:
     from mgs.run.candidates import Named
     from mgs.run.folder import Run
     from mgs.run.suggest import Suggestion, View
+
+Degrees = Annotated[float, Field(ge=-90, le=90)]
 
 DOME = 100
 """Candidates where none are given."""
@@ -35,6 +47,34 @@ FILES = ("suggestions.json", "suggestions.png", "transforms.json")
 """Names in the folder --out."""
 
 
+class Candidates(BaseModel):
+    """Settings of candidates, and limits of the flight."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    ring: Annotated[int, Field(ge=1)] | None = None
+    """Candidates: this many poses on a ring."""
+    grid: Annotated[int, Field(ge=1)] | None = None
+    """Candidates: about this many poses of a cubic lattice."""
+    radius: Positive | None = None
+    """Radius of dome, ring or grid. Default: median distance of the images."""
+    elevations: tuple[Degrees, Degrees] | None = None
+    """Lowest and highest elevation, degrees. Default: 10,80 with dome, ring or grid, else any."""
+    safe_distance: Positive | None = None
+    """Least distance from the prior's mesh. Default: half that of the images with dome, ring or
+    grid, else 0."""
+    flight: FlightLimits = FlightLimits()
+    """Limits of the flight and of its poses."""
+
+    @field_validator("elevations")
+    @classmethod
+    def _rise(cls, band: tuple[float, float] | None) -> tuple[float, float] | None:
+        if band and band[0] > band[1]:
+            raise ValueError("expected lowest, highest, as in 10,80")
+        return band
+
+
+@with_keys(Candidates)
 def suggest(
     source: Annotated[Path, argument("Dataset folder, or folder of a run.", metavar="DATASET|RUN")],
     poses: Annotated[
@@ -42,11 +82,12 @@ def suggest(
         option("Candidates: a transforms.json without images, or a CSV with columns x,y,z."),
     ] = None,
     dome: Annotated[int | None, option("Candidates: poses on a dome.", min=1, metavar="N")] = None,
-    ring: Annotated[int | None, option("Candidates: poses on a ring.", min=1, metavar="N")] = None,
-    grid: Annotated[
-        int | None, option("Candidates: about N poses of a cubic lattice.", min=1, metavar="N")
-    ] = None,
-    views: Annotated[int, option("Views to plan together, in flying order.", min=1)] = 1,
+    views: Annotated[
+        int,
+        option(
+            "Views to plan together, in flying order; with a limit of the flight, at most.", min=1
+        ),
+    ] = 1,
     out: Annotated[
         Path | None,
         option("New folder for suggestions.json, transforms.json and suggestions.png."),
@@ -59,23 +100,9 @@ def suggest(
         str | None,
         option("Where the world's origin is: LAT,LON,ALT or, if +Y is not north, ...,BEARING."),
     ] = None,
-    radius: Annotated[
-        float | None,
-        option("Radius of --dome, --ring or --grid. Default: median distance of the images."),
-    ] = None,
-    elevations: Annotated[
+    policy: Annotated[
         str | None,
-        option(
-            "Lowest and highest elevation, degrees. "
-            "Default: 10,80 with --dome, --ring or --grid, else any."
-        ),
-    ] = None,
-    safe_distance: Annotated[
-        float | None,
-        option(
-            "Least distance from the prior's mesh. "
-            "Default: half that of the images with --dome, --ring or --grid, else 0."
-        ),
+        setting(NbvSettings, "policy", " Default: that of the run, or of `mgs nbv`."),
     ] = None,
     prior: Annotated[
         Path | None, option("Folder of `mgs prior`. Default: DATASET/prior, or one built now.")
@@ -84,8 +111,8 @@ def suggest(
         str | None, option("Build a prior of this many Gaussians.", metavar="N|auto")
     ] = None,
     preset: Annotated[str | None, option("As in `mgs nbv`: fast, balanced or accurate.")] = None,
+    settings: Settings = None,
     force: Force = False,
-    **options: Any,
 ) -> None:
     """Rank candidate poses by what a picture from each would add; plan the next flight.
 
@@ -103,24 +130,26 @@ def suggest(
         check_plan_path(path)
         check_new_file(path, force)
     if plan and place is None:
-        raise InputError("suggest: --plan needs --origin LAT,LON,ALT, the place of the world's 0")
-    settings = {name: value for name, value in options.items() if value is not None}
-    band = _elevations(elevations)
+        raise InputError(
+            "suggest: `plan` needs `origin`, the place of the world's 0 as LAT,LON,ALT"
+        )
+    values = parse_settings(settings, suggest)
+    asked = validated(Candidates, values)
+    changes = given(flight=values.get("flight"), policy=policy)
     ours = Ours(FILES, [path for path in (source, poses, prior) if path]) if force else None
     if out is not None:
         check_new_folder(out, ours)
     runtime.start()
     with TemporaryDirectory() as scratch, progress_bar("reading", console) as progress:
         fit = {"prior": prior, "gaussians": parse_gaussians(gaussians), "preset": preset}
-        fit |= {"policy": options["policy"]}
+        fit |= {"policy": policy}
         run = _run(source, Path(scratch) / "run", fit, progress)
         if plan and run.dataset.unit != "m":
             raise InputError(
                 f"{source}: its lengths have no unit, and a flight plan has metres; import the "
-                "data with --unit"
+                "data with `unit`"
             )
-        shapes = {"dome": dome, "ring": ring, "grid": grid}
-        candidates, safe, band = _candidates(run, poses, shapes, radius, band, safe_distance)
+        candidates, safe, band = _candidates(run, poses, dome, asked)
         from mgs.run.suggest import suggest as suggested
 
         found = suggested(
@@ -130,12 +159,12 @@ def suggest(
             safe_distance=safe,
             elevations=band,
             progress=progress,
-            **settings,
+            **changes,
         )
         crossed = _crossed(run, found)
         if crossed and plan:
             raise InputError(
-                f"suggest: {crossed}, so no flight plan is written; give --no-fly METRES"
+                f"suggest: {crossed}, so no flight plan is written; give flight.no_fly"
             )
         if out is not None:
             from mgs.report.suggestion import write_suggestion
@@ -143,34 +172,10 @@ def suggest(
             with atomic_folder(out, ours) as unfinished:
                 write_suggestion(unfinished, run, found)
         for path in plan or ():
-            _write_plan(path, run, found, place, settings)
+            _write_plan(path, run, found, place, asked.flight)
     _print(console, found, views, run, crossed)
     for written in [*([out] if out else []), *(plan or ())]:
         console.print(f"wrote {written}", soft_wrap=True)
-
-
-with_settings_as_options(
-    suggest,
-    {"Flight": PANELS["Flight"], "Choosing": ("policy",)},
-    {
-        "flight_length": " --views is then an upper limit.",
-        "policy": " Default: that of the run, or of `mgs nbv`.",
-    },
-)
-
-
-def _elevations(text: str | None) -> tuple[float, float] | None:
-    if text is None:
-        return None
-    try:
-        low, high = (float(part) for part in text.split(","))
-        if not -90 <= low <= high <= 90:
-            raise ValueError
-    except ValueError:
-        raise InputError(
-            f"--elevations {text!r}: expected LOWEST,HIGHEST, degrees from -90 to 90, as in 10,80"
-        ) from None
-    return low, high
 
 
 def _run(source: Path, scratch: Path, settings: dict[str, Any], progress: Any) -> Run:
@@ -182,21 +187,15 @@ def _run(source: Path, scratch: Path, settings: dict[str, Any], progress: Any) -
     if holds_run(source):
         for name in ("prior", "gaussians", "preset"):
             if settings[name] is not None:
-                raise InputError(f"suggest: {source} is a run with its model; leave out --{name}")
+                raise InputError(f"suggest: {source} is a run with its model; leave out `{name}`")
         return open_run(source)
-    given = {key: value for key, value in settings.items() if value is not None}
     count = len(load_dataset(source))
-    run = start_run(source, scratch, seeds=count, budget=0, progress=progress, **given)
+    run = start_run(source, scratch, seeds=count, budget=0, progress=progress, **given(**settings))
     return resume_nbv(run, progress=progress)
 
 
 def _candidates(
-    run: Run,
-    poses: Path | None,
-    shapes: dict[str, int | None],
-    radius: float | None,
-    band: tuple[float, float] | None,
-    safe: float | None,
+    run: Run, poses: Path | None, dome: int | None, asked: Candidates
 ) -> tuple[Sequence[Named], float, tuple[float, float] | None]:
     """Candidates, their least distance from the mesh, and their elevations."""
     import numpy as np
@@ -204,26 +203,24 @@ def _candidates(
     from mgs.data.meshes import distances_to_mesh
     from mgs.run.candidates import Site, place_poses, read_poses
 
-    shape = {name: count for name, count in shapes.items() if count is not None}
-    if len(shape) + (poses is not None) > 1:
-        raise InputError("suggest: --poses, --dome, --ring, --grid: give one of them")
-    for name, value in {"--safe-distance": safe, "--radius": radius}.items():
-        if value is not None and not 0 < value < math.inf:
-            raise InputError(f"{name} {value}: must be a positive length")
+    shapes = given(dome=dome, ring=asked.ring, grid=asked.grid)
+    if len(shapes) + (poses is not None) > 1:
+        raise InputError("suggest: `poses`, `dome`, `ring`, `grid`: give one of them")
     site = Site(run.prior, run.taken[-1].camera)
     left = [frame for frame in run.dataset.frames if frame not in run.taken]
+    safe, band = asked.safe_distance, asked.elevations
     if poses is not None:
         return read_poses(poses, site), safe or 0.0, band
-    if not shape and left:
+    if not shapes and left:
         return [(frame.name, frame.camera) for frame in left], safe or 0.0, band
-    ((kind, count),) = shape.items() or {"dome": DOME}.items()
+    ((kind, count),) = shapes.items() or {"dome": DOME}.items()
     eyes = np.stack([frame.camera.position for frame in run.taken])
     band = band or (10.0, 80.0)
     if safe is None:
         mesh = run.prior.mesh
         safe = float(distances_to_mesh(eyes, mesh.vertices, mesh.faces).min()) / 2
     far = float(np.median(np.linalg.norm(eyes - site.centre, axis=1)))
-    return place_poses(kind, count, radius or far, band, site), safe, band
+    return place_poses(kind, count, asked.radius or far, band, site), safe, band
 
 
 def _crossed(run: Run, found: Suggestion) -> str:
@@ -245,13 +242,12 @@ def _crossed(run: Run, found: Suggestion) -> str:
     return ""
 
 
-def _write_plan(path: Path, run: Run, found: Suggestion, place: Any, settings: Any) -> None:
+def _write_plan(path: Path, run: Run, found: Suggestion, place: Any, limits: FlightLimits) -> None:
     """Write a flight plan; home is on the ground under the first image."""
     import numpy as np
 
     from mgs.data.flight_plan import Stop, write_flight_plan
     from mgs.data.up import levelled
-    from mgs.run.settings import NbvSettings
     from mgs.run.suggest import taken_in_order
 
     turn = levelled(run.prior.up)
@@ -265,9 +261,7 @@ def _write_plan(path: Path, run: Run, found: Suggestion, place: Any, settings: A
         if view is not None:
             turned = replace(view.camera, world_to_camera=view.camera.world_to_camera @ pose)
             stops.append(Stop(turn @ view.camera.position, view.name, turned))
-    defaults = NbvSettings.model_fields
-    hover, speed = (settings.get(key, defaults[key].default) for key in ("hover", "speed"))
-    write_flight_plan(path, stops, place, hover, speed)
+    write_flight_plan(path, stops, place, limits.hover, limits.speed)
 
 
 def _print(console: Terminal, found: Suggestion, views: int, run: Run, crossed: str) -> None:
@@ -292,7 +286,7 @@ def _print(console: Terminal, found: Suggestion, views: int, run: Run, crossed: 
         f"{plan} and back"
     )
     if crossed:
-        console.print(f"{crossed}; give --no-fly METRES to plan around it")
+        console.print(f"{crossed}; give flight.no_fly to plan around it")
 
 
 def _cells(view: View, unit: str) -> tuple[str, ...]:

@@ -48,17 +48,17 @@ def synth_orbit(
         option("Up axis of --mesh. Default: y for GLB (as glTF says) and OBJ, else z."),
     ] = None,
     preset: Annotated[
-        str, option("quick: 32 frames of 320x240. paper: 100 frames of 640x480.", "--scale")
+        str, option("quick: 32 frames of 320x240. paper: 100 frames of 640x480.")
     ] = "quick",
     spp: Annotated[
         int | None,
-        option("Samples per pixel, rounded up to a full grid. Default: as --scale says.", min=1),
+        option("Samples per pixel, rounded up to a full grid. Default: as --preset says.", min=1),
     ] = None,
     frames: Annotated[
-        int | None, option("Number of views on the orbit. Default: as --scale says.", min=1)
+        int | None, option("Number of views on the orbit. Default: as --preset says.", min=1)
     ] = None,
     size: Annotated[
-        str | None, option("Image size WIDTHxHEIGHT, pixels. Default: as --scale says.")
+        str | None, option("Image size WIDTHxHEIGHT, pixels. Default: as --preset says.")
     ] = None,
     test_views: Annotated[
         int, option("Number of test views on a dome around the rock, in OUT/test.", min=0)
@@ -105,7 +105,7 @@ def synth_orbit(
     if mesh_up is not None and mesh is None:
         raise InputError("--mesh-up: says how a mesh stands, but there is none; give --mesh too")
     given = {"spp": spp, "frames": frames, **_parse_size(size)}
-    images = row_named(PRESETS, preset, "--scale")
+    images = row_named(PRESETS, preset, "preset")
     images = replace(images, **{key: value for key, value in given.items() if value is not None})
     noise = PoseNoise(pose_noise, rotation_noise) if pose_noise or rotation_noise else None
     views = f"{images.frames} frames" + (", none rendered" if on_demand else "")

@@ -177,7 +177,7 @@ def colour_topic(path: Path, reader: Any, topic: str | None) -> str:
         return topic
     if topic is not None or len(colours) != 1:
         listed = ", ".join(colours) or "none"
-        raise InputError(f"{path}: its topics of colour images are {listed}; give one as --images")
+        raise InputError(f"{path}: its topics of colour images are {listed}; give one as `images`")
     return colours[0]
 
 
@@ -201,7 +201,7 @@ def _lens(path: Path, reader: Any, topic: str) -> tuple[Any, np.ndarray, str]:
     if D.any() and (info.distortion_model not in LENSES or len(D) > 8):
         raise InputError(
             f"{path}: the lens of {topic} is {info.distortion_model}, which is not supported; "
-            "give the topic of its rectified images as --images"
+            "give the topic of its rectified images as `images`"
         )
     K[:2, 2] += 0.5  # from pixel centres at whole numbers to ours
     D = np.concatenate([D, np.zeros(max(0, 5 - len(D)))])

@@ -84,7 +84,7 @@ def check_dataset(
                         through.append(seen_through(*before, frame, depth))
                     before = frame, depth, mask
         except InputError as error:
-            problems.append(error.line)
+            problems.append(str(error))
         progress(index + 1, len(frames))
     common = [share for share in through if np.isfinite(share)]
     median = float(np.median(common)) if common else float("nan")

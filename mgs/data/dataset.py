@@ -96,7 +96,7 @@ class Dataset:
         if not folder.is_dir():
             raise InputError(
                 f"{self.root}: has neither images nor a survey to build a prior of; "
-                "give one with --prior"
+                "give one with `prior`"
             )
         return load_dataset(folder)
 
@@ -208,7 +208,7 @@ def posed_camera(
     except np.linalg.LinAlgError:
         raise InputError(f"{where} has a singular transform_matrix; correct the pose") from None
     except InputError as error:
-        raise InputError(f"{where}: {error.line}") from None
+        raise InputError(f"{where}: {error}") from None
 
 
 def finite_number(where: str, what: str, value: Any) -> float:

@@ -78,7 +78,7 @@ def parse_origin(text: str) -> Origin:
             raise ValueError
     except (TypeError, ValueError):
         raise InputError(
-            f"--origin {text!r}: expected LATITUDE,LONGITUDE,ALTITUDE, and optionally the bearing "
+            f"origin {text!r}: expected LATITUDE,LONGITUDE,ALTITUDE, and optionally the bearing "
             "of the world's +Y, in degrees and metres"
         ) from None
     return origin
@@ -104,8 +104,7 @@ def check_plan_path(path: Path) -> None:
     """Raise InputError if no flight plan is written with this suffix."""
     if path.suffix.lower() not in WRITERS:
         raise InputError(
-            f"--plan {path}: flight plans are written as {', '.join(WRITERS)}; "
-            "choose another ending"
+            f"plan {path}: flight plans are written as {', '.join(WRITERS)}; choose another ending"
         )
 
 

@@ -92,7 +92,7 @@ def shrunk(
     width, height = camera.width // factor, camera.height // factor
     if factor < 1 or not width or not height:
         raise InputError(
-            f"import: --downscale {factor} leaves nothing of {camera.width}x{camera.height}; "
+            f"import: downscale {factor} leaves nothing of {camera.width}x{camera.height}; "
             "give 1 or more"
         )
 

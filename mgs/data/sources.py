@@ -87,9 +87,7 @@ class Source:
     def in_metres(self, unit: float) -> Source:
         """Scale cameras and points by `unit` metres. Raises InputError unless it is positive."""
         if not 0 < unit < np.inf:
-            raise InputError(
-                f"import: --unit {unit} must be a positive number of metres; correct it"
-            )
+            raise InputError(f"import: unit {unit} must be a positive number of metres; correct it")
         shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
         return replace(self, shots=shots, sparse=self.sparse and self.sparse.scaled(unit), unit="m")
 
@@ -103,7 +101,7 @@ class Source:
         kept = [shot for shot in self.shots if shot.name not in names]
         if not kept:
             raise InputError(
-                f"import: --test-every {every} of {len(self.shots)} images leaves none to choose "
+                f"import: test_every {every} of {len(self.shots)} images leaves none to choose "
                 "from; correct it"
             )
         return replace(self, shots=kept), replace(self, shots=apart, sparse=None)
@@ -175,7 +173,7 @@ def read_source(
     if not result.shots:
         raise InputError(
             f"{source}: none of the {result.missing} images it lists exists; "
-            "restore them or give --images"
+            "restore them or give `images`"
         )
     for name, count in Counter(shot.name for shot in result.shots).items():
         if count > 1:

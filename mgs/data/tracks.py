@@ -71,7 +71,7 @@ class Spacing:
         """Spacing of a text as 0.5s or 0.2m. Raises InputError for anything else."""
         found = re.fullmatch(r"(\d+\.?\d*|\.\d+)(s|m)", text.strip())
         if not found:
-            raise InputError(f"--keyframes {text!r}: expected seconds or metres, as 0.5s or 0.2m")
+            raise InputError(f"keyframes {text!r}: expected seconds or metres, as 0.5s or 0.2m")
         return cls(float(found[1]), found[2] == "m")
 
     def choose(self, shots: Sequence[tuple[float, np.ndarray]]) -> list[int]:

@@ -33,7 +33,7 @@ def up_of_cameras(cameras: Sequence[Camera]) -> Up:
     found = axes[2] if len(cameras) > 2 and values[1] > LEVEL * np.sqrt(len(cameras)) else upward
     if np.linalg.norm(found) < 1e-6 or abs(found @ upward) < 1e-6:
         raise InputError(
-            "up: the cameras are held every way round, and have no up in common; give --up X,Y,Z"
+            "up: the cameras are held every way round, and have no up in common; give `up` as X,Y,Z"
         )
     found = found * np.sign(found @ upward) / np.linalg.norm(found)
     return unit_up(found)
@@ -49,7 +49,7 @@ def unit_up(vector: Sequence[float] | np.ndarray) -> Up:
     if given.shape != (3,) or not np.isfinite(given).all() or length == 0:
         raise InputError(
             "up: must be three finite numbers that are not all zero; "
-            "correct --up, or `up` of transforms.json"
+            "correct `up`, here or in transforms.json"
         )
     x, y, z = (given / length + 0.0).tolist()
     return x, y, z

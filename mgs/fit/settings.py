@@ -75,10 +75,11 @@ class TrainSettings(BaseModel):
     rates: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = RATES
     """Learning rate by kind of parameter, 0: not learned; `mean`, in metres, only if means move."""
     antialiased: bool = True
-    """Make Gaussians that are smaller than a pixel fainter, so that near and far views agree
-    (default). 3DGS and the paper do not."""
+    """Make Gaussians that are smaller than a pixel fainter, so that near and far views agree. 3DGS
+    and the paper do not."""
     alpha_weight: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 0.0
-    """Weight of alpha as a fourth channel in the loss, (sigma_rgb / sigma_alpha)^2; 0: not used."""
+    """Weight of alpha as a fourth channel in the loss, (sigma_rgb / sigma_alpha)^2; 0: not used.
+    Default of a run: 0.1 where all frames have a mask or alpha, else 0."""
     decay: Positive = 0.1
     """Factor by which the rates fall over `passes`."""
     steady_rates: tuple[str, ...] = ()

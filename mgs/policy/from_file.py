@@ -103,18 +103,18 @@ def load(name: str) -> Policy:
     path = file_of(name)
     if not path.is_file():
         raise InputError(
-            f"--policy {name}: no such file {path}; correct the path "
+            f"policy {name}: no such file {path}; correct the path "
             "(for a run, `policy` in its config.json)"
         )
     try:
         module = _executed(path, path.read_bytes())
     except (Exception, SystemExit) as error:
-        raise InputError(f"--policy {name}: {_failed(path, error)}") from error
+        raise InputError(f"policy {name}: {_failed(path, error)}") from error
     wanted = name.rpartition(":")[2]
     function = getattr(module, wanted, None)
     if not callable(function):
         raise InputError(
-            f"--policy {name}: {path} has no function {wanted}; give the name of one that it has"
+            f"policy {name}: {path} has no function {wanted}; give the name of one that it has"
         )
     return by_parameter_name(name, function, path)
 
@@ -141,7 +141,7 @@ def by_parameter_name(name: str, function: Callable[..., Any], path: Path | None
     ]
     if unknown := [parameter for parameter in parameters if parameter not in known]:
         raise InputError(
-            f"--policy {name}: unknown parameter {unknown[0]}; choose from {', '.join(known)}"
+            f"policy {name}: unknown parameter {unknown[0]}; choose from {', '.join(known)}"
         )
     shared = {p: CONTEXT_ARGUMENTS[p] for p in parameters if p in CONTEXT_ARGUMENTS}
     single = {p: CANDIDATE_ARGUMENTS[p] for p in parameters if p in CANDIDATE_ARGUMENTS}
@@ -160,7 +160,7 @@ def by_parameter_name(name: str, function: Callable[..., Any], path: Path | None
         except (Exception, SystemExit) as error:
             if path is None:
                 raise
-            raise InputError(f"--policy {name}: {_failed(path, error)}") from error
+            raise InputError(f"policy {name}: {_failed(path, error)}") from error
 
     return policy
 

@@ -167,7 +167,7 @@ def check_policy(name: str) -> None:
     own = from_file.in_file(name) or from_file.is_function(name)
     if not own and name not in policy_names():
         raise InputError(
-            f"--policy {name}: unknown; choose one of {', '.join(policy_names())}, "
+            f"policy {name}: unknown; choose one of {', '.join(policy_names())}, "
             "or add your own (docs/howto/policy.md)"
         )
 
@@ -185,7 +185,7 @@ def policy_named(name: str) -> Policy:
     if from_file.in_file(name):
         return from_file.load(name)
     if from_file.is_function(name):
-        raise InputError(f"--policy {name}: is a Python function; give it again in Python")
+        raise InputError(f"policy {name}: is a Python function; give it again in Python")
     check_policy(name)
     if name in CRITERIA:
         return _of_criterion(CRITERIA[name])

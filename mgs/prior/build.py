@@ -258,7 +258,7 @@ def prior_from_mesh(
     not. Raises InputError if the mesh cannot be read or sampled, and for settings that only a cloud
     has: noise, holes, poisson_depth and density.
     """
-    settings.refuse_shaping("--mesh gives one")
+    settings.refuse_shaping("`mesh` gives one")
     mesh = read_mesh(path)
     if settings.density is not None:
         raise InputError(

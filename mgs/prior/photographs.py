@@ -68,16 +68,16 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
     if asked in there:
         return asked
     if asked not in (None, *SOURCES):
-        raise InputError(f"--from {asked!r}: is unknown; choose one of {', '.join(SOURCES)}")
+        raise InputError(f"source {asked!r}: is unknown; choose one of {', '.join(SOURCES)}")
     lacks = {"depth": "no depth images", "points": f"no points ({CLOUD})", "hull": "no masks"}
     missing = lacks.get(asked, "no mesh of its own")
     ways = {
         "depth": "import data with depth",
-        "hull": "import with --masks DIR for --from hull",
-        "points": "give --points CLOUD.ply",
-        "mesh": "give --mesh MESH",
+        "hull": "import with `masks`, then take the source hull",
+        "points": "give `points`",
+        "mesh": "give `mesh`",
     }
-    cures = [f"take --from {name}" for name in there if name != "random"]
+    cures = [f"take the source {name}" for name in there if name != "random"]
     cures += [way for name, way in ways.items() if name not in there]
     raise InputError(f"{dataset.root}: has {missing}; {', or '.join(cures)}")
 
@@ -132,7 +132,7 @@ def surface_of(
     except InputError as error:
         points_kept = segmented.cloud.points
         kept = cKDTree(segmented.rock_points).query(points_kept)[0] == 0
-        raise NoSurface(error.line, points_kept, kept) from None
+        raise NoSurface(str(error), points_kept, kept) from None
     numbers = {
         "points": len(cloud.points),
         "points_kept": len(segmented.cloud.points),

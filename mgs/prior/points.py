@@ -153,7 +153,7 @@ def segment_points(
     if has_masks(frames):
         share, count = mask_share(points, frames, MASK_SLACK)
         kept = (share >= MASK_SHARE) & (count >= LEAST_TRACK)
-        where = "inside the masks; give masks and poses that fit, or --from hull"
+        where = "inside the masks; give masks and poses that fit, or take the source hull"
     else:
         on_stage("ground plane and clusters")
         plane = _plane_or_none(cloud, frames, dataset.up, settings)

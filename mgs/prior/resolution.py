@@ -68,7 +68,7 @@ def resolution(
     if not known.any():
         raise InputError(
             "prior: no frame has the mesh in its image, so nothing says how many Gaussians; "
-            "give --gaussians N"
+            "give `gaussians`"
         )
     area = float(areas[known].sum())
     typical = float(np.sqrt(area / (areas[known] / pixel[known] ** 2).sum()))

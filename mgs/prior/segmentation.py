@@ -106,7 +106,7 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
     if share < PLANE_MIN_SHARE:
         raise InputError(
             f"cloud: no ground plane (the best holds {share:.0%} of the cloud); "
-            "photograph more ground, or give --mesh"
+            "photograph more ground, or give `mesh`"
         )
     away = np.linalg.norm(cloud.points - target.point, axis=1)
     around = cloud.points[away < PLANE_REACH * target.distance]
@@ -116,7 +116,7 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
         if core.sum() < 3:
             raise InputError(
                 "cloud: no ground around what the cameras look at; "
-                "photograph more ground, or give --mesh"
+                "photograph more ground, or give `mesh`"
             )
         spread = np.abs(residual[core] - np.median(residual[core]))
         sigma = SIGMA_FROM_MAD * float(np.median(spread))

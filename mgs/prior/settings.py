@@ -51,11 +51,11 @@ class PriorSettings:
         why: end of the message, what the surface is made of instead.
         """
         options = {
-            "--prior-noise": self.noise > 0,
-            "--holes": self.holes > 0,
-            "--poisson-depth": self.poisson_depth is not None,
+            "noise": self.noise > 0,
+            "holes": self.holes > 0,
+            "poisson_depth": self.poisson_depth is not None,
         }
-        if given := " and ".join(option for option, is_given in options.items() if is_given):
+        if given := " and ".join(f"`{option}`" for option, is_given in options.items() if is_given):
             raise InputError(
                 f"prior: {given} shape a mesh that is built of a cloud, but {why}; leave out either"
             )
@@ -64,32 +64,30 @@ class PriorSettings:
         if isinstance(self.gaussians, int) and self.gaussians < 2:
             raise InputError(
                 f"prior: {self.gaussians} Gaussians are too few for a model; "
-                "ask for more with --gaussians"
+                "ask for more with `gaussians`"
             )
         if self.spacing is not None and not self.spacing > 0:
-            raise InputError(f"prior: spacing {self.spacing} m must be positive; correct --spacing")
+            raise InputError(f"prior: spacing {self.spacing} m must be positive")
         if self.gaussians is not None and self.spacing is not None:
             raise InputError(
-                "prior: --gaussians and --spacing fix the same number; give one of them"
+                "prior: `gaussians` and `spacing` fix the same number; give one of them"
             )
         if self.density is not None and not 0 < self.density < np.inf:
             raise InputError(f"prior: density {self.density} must be positive; correct it")
         if self.poisson_depth is not None and not 3 <= self.poisson_depth <= 12:
             raise InputError(
                 f"prior: Poisson depth {self.poisson_depth} is not within 3 to 12; "
-                "correct --poisson-depth"
+                "correct `poisson_depth`"
             )
         if not 0 <= self.noise < np.inf:
-            raise InputError(
-                f"prior: noise {self.noise} m must be 0 or more; correct --prior-noise"
-            )
+            raise InputError(f"prior: noise {self.noise} m must be 0 or more; correct `noise`")
         if not 0 <= self.holes <= 0.9:
             raise InputError(
                 f"prior: holes {self.holes} is a share of the rock's points, 0 to 0.9; "
-                "correct --holes"
+                "correct `holes`"
             )
         if not 0 <= self.backing <= 1:
             raise InputError(
                 f"prior: backing {self.backing} is a number of Gaussians per sample, 0 to 1; "
-                "correct --backing"
+                "correct `backing`"
             )

@@ -65,7 +65,7 @@ def poisson_mesh(
     if solid is None or solid.is_empty():
         raise InputError(
             f"prior: Poisson at depth {depth} gives nothing above the ground; "
-            "give more frames, or --from hull"
+            "give more frames, or take the source hull"
         )
     mesh = _from_solid(solid)
     limit = 1e-6 * np.ptp(mesh.vertices, axis=0).max()
@@ -146,7 +146,7 @@ def _closed_solid(
                 return solid, depth
     raise InputError(
         f"prior: Poisson at depth {depth} gives no closed surface; "
-        "try another --poisson-depth, more frames, or --from hull"
+        "try another `poisson_depth`, more frames, or take the source hull"
     )
 
 
@@ -208,13 +208,13 @@ def _checked_count(samples: float) -> int:
         raise InputError(
             f"prior: N = {Decimal(samples):.4g} samples take about {needed / 10**9:.3g} GB of "
             f"memory, and this machine has {there / 1e9:.3g} GB; "
-            "ask for fewer Gaussians (or a larger --spacing)"
+            "ask for fewer Gaussians (or a larger `spacing`)"
         )
     count = round(samples)
     if count < 2:
         raise InputError(
             f"prior: {count} samples are too few for a model; "
-            "ask for more Gaussians (or a smaller --spacing)"
+            "ask for more Gaussians (or a smaller `spacing`)"
         )
     return count
 

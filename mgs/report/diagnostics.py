@@ -203,7 +203,7 @@ def choose_views(
         for name in wanted:
             if name not in by_name:
                 raise InputError(
-                    f"--views {name}: no such frame; "
+                    f"views {name}: no such frame; "
                     f"the dataset has {frames[0].name} to {frames[-1].name}"
                 )
         return [by_name[name] for name in wanted]

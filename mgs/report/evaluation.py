@@ -193,7 +193,7 @@ def evaluate(
                 dataset = run.dataset
                 trained = list(trained) or [frame.name for frame in run.taken]
     if dataset is None:
-        raise InputError(f"{path or 'the model'}: is in no run folder; give its --dataset")
+        raise InputError(f"{path or 'the model'}: is in no run folder; give its `dataset`")
     views = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     names, tests = list(trained), views.test_views()
     if unknown := sorted(set(names) - {frame.name for frame in views.frames}):

@@ -142,7 +142,7 @@ def place_poses(
         offsets = _lattice(count, radius, elevations)
         if not len(offsets):
             raise InputError(
-                f"--grid {count}: has no pose within --elevations; raise it, or widen them"
+                f"grid {count}: has no pose within `elevations`; raise it, or widen them"
             )
     else:
         band = elevations if shape == "dome" else ((low + high) / 2,) * 2

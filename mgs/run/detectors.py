@@ -241,14 +241,14 @@ DETECTORS: dict[str, Detector] = {
         0.15,  # good runs of few and small images: up to 0.11 in fits with one more view
         lambda v, limit: (
             f"the fit was stopped while its loss still fell by {percent(v, 1)} a pass "
-            f"(limit {percent(limit, 1)}); raise --passes, and --warm-passes for later fits"
+            f"(limit {percent(limit, 1)}); raise `train.passes`, and `warm_passes` for later fits"
         ),
     ),
     "worse": Detector(
         0.18,  # good runs of many views: up to 0.134, because a step raises other images' losses
         lambda v, limit: (
             f"every pass of the fit had a loss at least {percent(v)} above its start; "
-            "lower the learning rates (--rate)"
+            "lower the learning rates (`train.rates`)"
         ),
     ),
     "prior": Detector(
@@ -271,7 +271,7 @@ DETECTORS: dict[str, Detector] = {
         lambda v, limit: (
             "exposure drifts: one image as a whole is brighter or darker than the model fitted to "
             f"all, by {percent(v)} of the spread of its pixels (limit {percent(limit)}); "
-            "try --exposure"
+            "try `exposure`"
         ),
     ),
     "pose": Detector(
@@ -293,7 +293,7 @@ DETECTORS: dict[str, Detector] = {
         4.0,  # means that were free on 2 and 4 views moved by 1.3 and 1.7, and did no harm
         lambda v, limit: (
             f"the means have left the prior's surface: they moved by {v:.1f} standard deviations "
-            f"of their prior (rms; limit {limit:.1f}); lower --rate mean=METRES"
+            f"of their prior (rms; limit {limit:.1f}); lower `train.rates.mean`"
         ),
     ),
     "coverage": Detector(

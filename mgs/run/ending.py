@@ -99,21 +99,21 @@ def why_ended(ended: Mapping[str, Any]) -> str:
     if ended["reason"] == RunEnd.BUDGET:
         return f"its budget is spent, {views}"
     if ended["reason"] == RunEnd.UNCERTAINTY:
-        limit = f"no more than --stop-uncertainty {ended['limit']:g}"
+        limit = f"no more than stop_uncertainty = {ended['limit']:g}"
         return f"{ended['uncertainty']:.4g} of the prior's variance is left after {views}, {limit}"
     if ended["reason"] == RunEnd.PSNR:
         return (
             f"the masked PSNR of the views not taken is predicted to be {ended['psnr']:.1f} dB "
-            f"after {views}, no less than --stop-psnr {ended['limit']:g}"
+            f"after {views}, no less than stop_psnr = {ended['limit']:g}"
         )
     if ended["reason"] == RunEnd.FLIGHT:
         way = f"the flight is {ended['metres']:.1f} m long with the way home"
         if count := ended.get("given_up"):
             lost = f"{count} pose{'' if count == 1 else 's'} gave no picture"
-            return f"no pose is left in reach, {views}; {lost}, --resume asks for them again; {way}"
+            return f"no pose is left in reach, {views}; {lost}, resuming asks for them again; {way}"
         return f"no pose is left that the flight's limits allow, {views}; {way}"
     gain, limit = (
         f"{ended['information_gain']:.4g} {GAIN_UNIT}",
-        f"less than --stop-gain {ended['limit']:g}",
+        f"less than stop_gain = {ended['limit']:g}",
     )
     return f"the next view, {ended['name']}, would gain {gain} after {views}, {limit}"

@@ -1,7 +1,7 @@
 """Limits of a flight: which poses a camera may take, and how far it still comes.
 
-A flight starts at the first view taken, its home, and ends there. `NbvSettings.flight_length` and
-`flight_time` limit the whole flight, `no_fly` and `clearance` each pose.
+A flight starts at the first view taken, its home, and ends there. `FlightLimits.length` and `time`
+limit the whole flight, `no_fly` and `clearance` each pose.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 
 from mgs.policy import tour
 from mgs.policy.criteria import Array
-from mgs.run.settings import NbvSettings
+from mgs.run.settings import FlightLimits
 
 
 def allowed_poses(
-    positions: Array, centre: Array, ground: float, settings: NbvSettings
+    positions: Array, centre: Array, ground: float, limits: FlightLimits
 ) -> NDArray[np.bool_]:
     """Whether the camera may be at each position [V,3]: outside `no_fly`, above `clearance`.
 
     centre: middle of the object [3]. ground: height of its lowest point. Metres, +Z up.
     """
     out = np.linalg.norm(positions[:, :2] - centre[:2], axis=1)
-    allowed = out >= (settings.no_fly or 0.0)
-    if settings.clearance is not None:
-        allowed &= positions[:, 2] >= ground + settings.clearance
+    allowed = out >= (limits.no_fly or 0.0)
+    if limits.clearance is not None:
+        allowed &= positions[:, 2] >= ground + limits.clearance
     return np.asarray(allowed)
 
 
@@ -39,7 +39,7 @@ class Flight:
     tours: those planned, by the views taken and the candidates.
     """
 
-    settings: NbvSettings
+    limits: FlightLimits
     legs: NDArray[np.float64]
     home: int
     skipped: int = 0
@@ -47,9 +47,9 @@ class Flight:
 
     def share(self, metres: float | Array, pictures: int) -> NDArray[np.float64]:
         """Share of the limits that a flight of this length and number of pictures takes."""
-        seconds = np.asarray(metres) / self.settings.speed + self.settings.hover * pictures
-        of_length = np.asarray(metres) / (self.settings.flight_length or np.inf)
-        return np.maximum(of_length, seconds / (self.settings.flight_time or np.inf))
+        seconds = np.asarray(metres) / self.limits.speed + self.limits.hover * pictures
+        of_length = np.asarray(metres) / (self.limits.length or np.inf)
+        return np.maximum(of_length, seconds / (self.limits.time or np.inf))
 
     def flown(self, taken: Sequence[int]) -> float:
         """Metres from the start to the last view taken."""

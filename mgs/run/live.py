@@ -106,7 +106,7 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
         if live is None:
             raise InputError(
                 f"{dataset.root}: frame {frame.name} has no image; "
-                "give --capture-command or --capture-folder"
+                "give `capture_command` or `capture_folder`"
             )
         folder, reason = live.folder or below(dataset.root, "flight"), ""
         for attempt in range(1, live.tries + 1):
@@ -124,7 +124,7 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
             return as_captured(frame)
         raise InputError(
             f"{frame.name}: no picture after {live.tries} tries ({reason}); "
-            "mend it and continue the run with --resume"
+            "mend it and resume the run"
         )
 
     return capture

@@ -115,25 +115,23 @@ def start_run(
     """
     out = Path(out)
     if (dataset is None) == (capture is None):
-        raise InputError("nbv: give either a DATASET or --capture SCENE")
+        raise InputError("nbv: give either a DATASET or `capture` SCENE")
     if capture is not None and live is not None:
-        raise InputError(
-            "nbv: --capture renders images, and --capture-command or -folder awaits them; give one"
-        )
+        raise InputError("nbv: `capture` renders images, and live capture awaits them; give one")
     if holds_run(out) and not force:
         raise InputError(f"{out}: a run {THERE}; `mgs nbv --resume {out}` continues it")
     given = dataset if isinstance(dataset, Dataset) else None
     root = given.root if given else out / DATASET if dataset is None else Path(str(dataset))
     if prior is not None and gaussians is not None:
-        raise InputError("nbv: --gaussians builds a prior; leave it out, or leave out --prior")
+        raise InputError("nbv: `gaussians` builds a prior; leave it out, or leave out `prior`")
     if (prior, gaussians, source) == (None,) * 3 and (root / "prior/prior.json").is_file():
         prior = root / "prior"
-    row = None if preset is None else row_named(PRESETS, preset, "--preset")
+    row = None if preset is None else row_named(PRESETS, preset, "preset")
     loaded = given
     if given is None and capture is None:
         loaded = load_dataset(root, to_capture=live is not None)
     if live is not None and not (loaded and loaded.on_demand):
-        raise InputError(f"{root}: all its images exist; leave out --capture-command or -folder")
+        raise InputError(f"{root}: all its images exist; leave out live capture")
     images = root if live is None else out / DATASET
     where = Path(prior) if isinstance(prior, str | Path) else out / "prior"
     policy = settings.get("policy", NbvSettings.model_fields["policy"].default)
@@ -157,15 +155,15 @@ def start_run(
             save_prior(unfinished / "prior", built)
         _check_near(built, frames, where)
         if built.numbers.get("from") == "random" and complete.train.means != "free":
-            free = "pass --means free, or give depth, points or masks"
+            free = "let means be free (`train.means`), or give depth, points or masks"
             raise InputError(f"{where}: starts at random points, not on a surface; {free}")
         if complete.exposure and built.numbers.get("triangulated") == 0:
             raise InputError(
-                f"--exposure: {where} has no surface on which to compare photographs; leave it "
+                f"exposure: {where} has no surface on which to compare photographs; leave it "
                 "out, or give points or masks"
             )
         complete = complete.with_spacing(built.spacing, loose)
-        if complete.flies or complete.no_fly or complete.clearance is not None:
+        if complete.flies or complete.flight.no_fly or complete.flight.clearance is not None:
             Problem(
                 frames, complete, operations_of(frames, built, complete), policy=scores
             ).check_seeds()
@@ -248,7 +246,7 @@ def _check_near(prior: Prior, dataset: Dataset, where: Path) -> None:
     if nearest < NEAR:
         raise InputError(
             f"{where}: the cameras are {nearest:.2g} {dataset.unit} from it, and nothing nearer "
-            f"than {NEAR} is drawn; import the data with --unit M, the metres in a length of 1, "
+            f"than {NEAR} is drawn; import the data with `unit`, the metres in a length of 1, "
             "and build the prior again"
         )
 
@@ -312,7 +310,7 @@ def check_named(run: Run, policy: str | Callable[..., Any] | None) -> None:
     """Raises InputError where a run's policy is a user's own and `policy` is not the same."""
     own = run.settings.policy
     if policy is not None and name_of(policy) != own:
-        raise InputError(f"--policy {name_of(policy)}: is not the policy of {run.folder}, {own}")
+        raise InputError(f"policy {name_of(policy)}: is not the policy of {run.folder}, {own}")
     if is_function(own):
         call = f"mgs.resume_nbv({str(run.folder)!r}, policy={label(own)})"
         if policy is None or isinstance(policy, str):

@@ -59,8 +59,8 @@ def rated(
     if np.isnan(scores).any() or np.isinf(scores[best]):
         raise InputError(f"{where} a score that is NaN or infinite (docs/howto/policy.md)")
     if (problem.settings.travel is not None or problem.settings.flies) and scores[best] < 0:
-        option = "--travel" if problem.settings.travel is not None else "--flight-length"
-        raise InputError(f"{where} negative scores, which {option} cannot divide; leave it out")
+        option = "travel" if problem.settings.travel is not None else "flight.length"
+        raise InputError(f"{where} negative scores, which `{option}` cannot divide; leave it out")
     return [(context.candidate_frames[k], float(scores[k])) for k in order]
 
 

@@ -124,7 +124,9 @@ class Problem:
         kinds = {kind: at for kind, at in operations.groups.items() if kind != "mean"}
         self.prior_lam = criteria.regularisation(kinds, settings.pixel_noise, settings.prior_std)
         self.lam = settings.regularisation(operations.groups)
-        self.allowed = allowed_poses(self.positions, self.centre, operations.ground, settings)
+        self.allowed = allowed_poses(
+            self.positions, self.centre, operations.ground, settings.flight
+        )
         self.skipped = 0
         self.seeds = self._spread_seeds() if seeds is None else list(seeds)
         with_alpha = settings.train.alpha_weight > 0
@@ -146,27 +148,28 @@ class Problem:
         free, count = np.flatnonzero(self.allowed), self.settings.seeds
         if len(free) < count:
             raise InputError(
-                f"{self.dataset.root}: --no-fly and --clearance allow {len(free)} of its "
-                f"{len(self.frames)} poses, fewer than {count} seeds; lower one of them"
+                f"{self.dataset.root}: flight.no_fly and flight.clearance allow "
+                f"{len(free)} of its {len(self.frames)} poses, fewer than {count} seeds; "
+                "lower one of them"
             )
         return [int(free[k]) for k in poses.seed_views(self.positions[free], self.centre, count)]
 
     def check_seeds(self) -> None:
         """Raises InputError where the flight over the seeds and home exceeds the limits."""
-        flight, settings = self.flight, self.settings
+        flight, limits = self.flight, self.settings.flight
         metres = flight.metres(self.seeds)
         if flight.share(metres, len(self.seeds)) > 1:
-            seconds = metres / settings.speed + settings.hover * len(self.seeds)
+            seconds = metres / limits.speed + limits.hover * len(self.seeds)
             raise InputError(
                 f"nbv: the flight over {len(self.seeds)} seeds and home takes {metres:.1f} m and "
-                f"{seconds:.0f} s; raise --flight-length or --flight-time, or lower --seed-views"
+                f"{seconds:.0f} s; raise `flight.length` or `flight.time`, or lower `seeds`"
             )
 
     @cached_property
     def flight(self) -> Flight:
         """Legs between all poses, and the limits of the flight; its home is the first seed."""
-        matrix = tour.legs(self.positions, self.centre[:2], self.settings.no_fly or 0.0)
-        return Flight(self.settings, matrix, self.seeds[0], self.skipped)
+        matrix = tour.legs(self.positions, self.centre[:2], self.settings.flight.no_fly or 0.0)
+        return Flight(self.settings.flight, matrix, self.seeds[0], self.skipped)
 
     @cached_property
     def start(self) -> Gaussians:
@@ -300,8 +303,8 @@ class Problem:
                 count = sum(frame.given_up for frame in self.frames)
                 raise InputError(
                     f"{self.dataset.root}: too few poses are left for the seeds, {count} gave no "
-                    "picture; mend the capture and continue with --resume, or start again with "
-                    "fewer --seed-views"
+                    "picture; mend the capture and resume the run, or start again with "
+                    "fewer `seeds`"
                 )
             nearest = poses.nearest_poses(self.positions[others], self.positions[failed], 1)[0]
             self.seeds = [others[nearest] if i == failed else i for i in self.seeds]

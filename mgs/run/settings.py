@@ -1,6 +1,7 @@
 """Settings of a run: validated once, frozen, written whole beside the results.
 
-The docstring of a field is the help of its option of `mgs nbv`. Needs neither Mitsuba nor Dr.Jit.
+The docstring of a field is the help of its option or key (`mgs nbv --help`). Needs neither Mitsuba
+nor Dr.Jit.
 """
 
 from __future__ import annotations
@@ -8,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from reprlib import repr
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from mgs.errors import InputError, flag, row_named
+from mgs.errors import InputError, row_named
 from mgs.files import read_json, read_toml
 from mgs.fit.settings import (
     ALPHA_WEIGHT,
@@ -48,6 +50,25 @@ PRESETS = {
 }
 
 
+class FlightLimits(BaseModel):
+    """Limits of a flight, which starts and ends at the first view taken, and of its poses."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    length: Scale | None = None
+    """Longest flight in metres, from the first image and back to it. Default: no limit."""
+    time: Scale | None = None
+    """Longest flight in seconds, with `speed` and `hover`. Default: no limit."""
+    speed: Scale = 2.0
+    """Speed between pictures, metres per second."""
+    hover: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 3.0
+    """Seconds that a picture takes."""
+    no_fly: Scale | None = None
+    """Radius in metres of an upright cylinder around the object that the flight must not enter."""
+    clearance: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    """Lowest height of a pose above the object's lowest point, metres."""
+
+
 class Mission(BaseModel):
     """Limits of a run: how many views it takes, where the camera may go, and when it ends."""
 
@@ -63,18 +84,8 @@ class Mission(BaseModel):
     """Choose among this many candidates, the nearest to the last view. Default: all."""
     travel: Scale | None = None
     """Distance that costs as much as an image; scores are divided by 1 + distance / METRES."""
-    flight_length: Scale | None = None
-    """Longest flight in metres, from the first image and back to it. Default: no limit."""
-    flight_time: Scale | None = None
-    """Longest flight in seconds, at --speed, with --hover at each picture. Default: no limit."""
-    speed: Scale = 2.0
-    """Speed between pictures, metres per second."""
-    hover: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 3.0
-    """Seconds that a picture takes."""
-    no_fly: Scale | None = None
-    """Radius in metres of an upright cylinder around the object that the flight must not enter."""
-    clearance: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
-    """Lowest height of a pose above the object's lowest point, metres."""
+    flight: FlightLimits = FlightLimits()
+    """Limits of the flight and of its poses."""
     stop_gain: Positive | None = None
     """End the run if the chosen view's information gain (Eq. 7, ½ nat per parameter) is lower."""
     stop_uncertainty: Annotated[float, Field(gt=0, lt=1)] | None = None
@@ -85,7 +96,7 @@ class Mission(BaseModel):
     @property
     def flies(self) -> bool:
         """Whether the flight has a limit, so that views are planned as a tour."""
-        return self.flight_length is not None or self.flight_time is not None
+        return self.flight.length is not None or self.flight.time is not None
 
 
 class NbvSettings(ModelSettings, Mission):
@@ -99,6 +110,27 @@ class NbvSettings(ModelSettings, Mission):
     """Policy that scores candidate views: a name, or FILE.py:FUNCTION of your own."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR each time after this many views; 0: only at the end. Does not affect choices."""
+
+    @model_validator(mode="after")
+    def _go_together(self) -> NbvSettings:
+        means, density = self.train.means, self.train.density
+        fixed = [f"estimator {self.estimator}"] if self.estimator != "exact" else []
+        fixed += ["policy paper"] if self.policy == "paper" else []
+        if means != "frozen" and fixed:
+            raise ValueError(
+                f"train.means {means}: {fixed[0]} has no information about means; leave out either"
+            )
+        if density == "adaptive" and (means != "free" or self.budget > 0):
+            raise ValueError(
+                f"train.density {density}: needs free means and all images at once; "
+                "give `mgs fit --means free`"
+            )
+        if self.flies and self.travel is not None:
+            raise ValueError(
+                f"travel {self.travel:g}: a flight with a limit has its own travel cost; "
+                "leave out `travel`"
+            )
+        return self
 
     def with_spacing(self, spacing: float, loose: float = 1.0) -> NbvSettings:
         """The settings with a rate and a prior std of learned means, from the samples' spacing, m.
@@ -134,27 +166,31 @@ def with_defaults(
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def validated(model: type[Model], values: dict[str, Any], file: Path | None = None) -> Model:
-    """Build settings from options, or from `settings` of a file.
+def validated(
+    model: type[Model], values: dict[str, Any], file: Path | None = None, within: str = ""
+) -> Model:
+    """Build settings from values, or from `settings` of a file.
 
-    Raises InputError for the first invalid value; it names the option, or the file and the key.
+    within: key of these values, if they are part of other settings. Raises InputError for the first
+    invalid value; it names the setting, and the file if there is one.
     """
     try:
         return model(**values)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        parts = [str(part) for part in first["loc"]]
         message = first["msg"].removeprefix("Value error, ")
         for bound, words in BOUNDS.items():
             if bound in first.get("ctx", {}):
                 message = f"must be {words} {first['ctx'][bound]:g}"
+        key = ".".join([part for part in (within, *map(str, first["loc"])) if part])
+        if first["type"] == "extra_forbidden":
+            message = f"{key}: unknown setting; this release of mgs has no such key"
+        elif first["loc"]:
+            message = f"{key} = {repr(first['input'])}: {message}"
         if file is not None:
-            if file.suffix != ".json":
-                raise InputError(f"{file}: {'.'.join(parts)}: {message}; correct it") from None
-            key = ".".join(["settings", *parts])
-            message = f"{file}: {key}: {message}; correct it, or start the run anew"
-            raise InputError(message) from None
-        raise InputError(f"{option_of(parts, first['input'])}: {message}") from None
+            cure = "start the run anew" if file.suffix == ".json" else "leave it out"
+            message = f"{file}: {message}; correct it, or {cure}"
+        raise InputError(message) from None
 
 
 def settings_in(file: Path) -> dict[str, Any]:
@@ -177,35 +213,10 @@ def settings_in(file: Path) -> dict[str, Any]:
 BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 """Words for the limits of pydantic's numbers."""
 
-NO_OPTION = (
-    "warm_rate",
-    "tolerance",
-    "decay",
-    "steady_rates",
-    "sh_steps",
-    "directional_rate",
-    "dataset",
-    "prior",
-)
-"""Settings without an option of their own."""
-
-
-def option_of(parts: list[str], value: Any) -> str:
-    """Name a setting and its value as on the command line, or by key where it has no option."""
-    key, *kind = [part for part in parts if part != "train"]
-    known = NbvSettings.model_fields.keys() | TrainSettings.model_fields.keys()
-    if key in NO_OPTION or key not in known:
-        return f"setting {'.'.join(parts)} = {value!r}"
-    option = flag(key)
-    return f"{option} {kind[0]}={value}" if kind else f"{option} {value}"
-
 
 def check_settings(settings: NbvSettings, frames: int) -> None:
-    """Raises InputError where settings do not go together, or a dataset has too few frames.
-
-    Unknown are: a policy, an estimator without a diagonal, an optimiser, a loss; an estimator or a
-    policy that has no columns of learned means; seeds and budget beyond the number of frames.
-    """
+    """Raises InputError for the name of an unknown policy, estimator (or one without a diagonal),
+    optimiser, loss or density control, and where a dataset has too few frames."""
     from mgs.fit.density import DENSITIES  # loads Dr.Jit, as the next three
     from mgs.fit.losses import LOSSES
     from mgs.fit.optimisers import OPTIMISERS
@@ -214,28 +225,15 @@ def check_settings(settings: NbvSettings, frames: int) -> None:
     diagonal = [name for name in ESTIMATORS if name != "block"]
     check_policy(settings.policy)
     if settings.estimator not in diagonal:
-        known = ", ".join(diagonal)
-        raise InputError(f"--estimator {settings.estimator}: unknown; choose one of {known}")
-    fixed = [f"--estimator {settings.estimator}"] if settings.estimator != "exact" else []
-    fixed += ["--policy paper"] if settings.policy == "paper" else []
-    if settings.train.means != "frozen" and fixed:
-        message = f"{fixed[0]} has no information about means; leave out either"
-        raise InputError(f"--means {settings.train.means}: {message}")
-    row_named(OPTIMISERS, settings.train.optimiser, "--optimiser")
-    row_named(LOSSES, settings.train.loss, "--loss")
-    control = row_named(DENSITIES, settings.train.density, "--density")
-    if control and (settings.train.means != "free" or settings.budget > 0):
-        needs = "needs free means and all images at once; give `mgs fit --means free`"
-        raise InputError(f"--density {settings.train.density}: {needs}")
-    if settings.flies and settings.travel is not None:
-        raise InputError(
-            f"--travel {settings.travel:g}: a flight with a limit has its own travel cost; "
-            "leave out --travel"
-        )
-    left, where = frames - settings.seeds, settings.dataset
-    if left < 0:
-        few = f"has {frames} frames, fewer than {settings.seeds} seeds; lower --seed-views"
+        names = ", ".join(diagonal)
+        raise InputError(f"estimator {settings.estimator!r}: unknown; choose one of {names}")
+    row_named(OPTIMISERS, settings.train.optimiser, "train.optimiser")
+    row_named(LOSSES, settings.train.loss, "train.loss")
+    row_named(DENSITIES, settings.train.density, "train.density")
+    count, where = frames - settings.seeds, settings.dataset
+    if count < 0:
+        few = f"has {frames} frames, fewer than {settings.seeds} seeds; lower `seeds`"
         raise InputError(f"{where}: {few}")
-    if settings.budget > left:
-        many = f"--budget {settings.budget} exceeds its {left} candidates; lower --budget"
+    if settings.budget > count:
+        many = f"has {count} candidates, fewer than the budget of {settings.budget}; lower `budget`"
         raise InputError(f"{where}: {many}")

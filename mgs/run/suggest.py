@@ -106,7 +106,7 @@ def suggest(
     """
     policy, own = settings.pop("policy", None) or run.policy, run.settings.policy
     if policy is None and (in_file(own) or is_function(own)):
-        raise InputError(f"{run.folder}: its policy is a program, {own}; name it with --policy")
+        raise InputError(f"{run.folder}: its policy is a program, {own}; name it with `policy`")
     settings |= {} if policy is None else {"policy": name_of(policy)}
     images = taken_in_order(run)
     site, taken = Site(run.prior, images[-1].camera), [frame.camera for frame in images]
@@ -122,7 +122,7 @@ def suggest(
     blind = [i for i, seen in weights.items() if not seen.any()]
     _drop(dropped, "sees nothing of the object", blind, problem)
     ruled_out = [i for i in weights if not problem.allowed[i] and i not in blind]
-    _drop(dropped, "ruled out by --no-fly or --clearance", ruled_out, problem)
+    _drop(dropped, "ruled out by flight.no_fly or flight.clearance", ruled_out, problem)
     free = [i for i in weights if problem.allowed[i]]
     _check_left(len(poses), len(free), dropped, views, known.flies)
     order = rated(problem, problem.context(state, free, fisher))
@@ -133,11 +133,11 @@ def suggest(
     ]
     plan, frames = _plan(problem, state, fisher, described)
     way = [0, *frames, 0]
-    radius, axis = known.no_fly or 0.0, problem.centre[:2]
+    radius, axis = known.flight.no_fly or 0.0, problem.centre[:2]
     ends = [problem.positions[i] for i in way]
     corners = [tour.leg_corners(a, b, axis, radius) @ problem.turn for a, b in pairwise(ends)]
     metres = tour.tour_length(problem.flight.legs, way)
-    seconds = metres / known.speed + known.hover * len(plan)
+    seconds = metres / known.flight.speed + known.flight.hover * len(plan)
     return Suggestion(ranking, plan, metres, seconds, dropped, corners)
 
 
@@ -152,7 +152,9 @@ def _settings(run: Run, taken: int, views: int, given: dict[str, Any]) -> NbvSet
     """Settings of the run for a batch of `views` after all views taken."""
     fixed = {"seeds": taken, "budget": views, "batch": max(views, 2)}
     free = dict.fromkeys(["travel", "nearest", "stop_gain", "stop_uncertainty", "stop_psnr"])
-    settings = validated(NbvSettings, run.settings.model_dump() | free | given | fixed)
+    own = run.settings.model_dump()
+    limits = {"flight": own["flight"] | given.get("flight", {})}
+    settings = validated(NbvSettings, own | free | given | limits | fixed)
     check_settings(settings, taken + views)
     return settings
 
@@ -166,7 +168,7 @@ def _check_left(count: int, left: int, dropped: dict[str, int], views: int, flie
         )
     if left < views and not flies:
         raise InputError(
-            f"suggest: --views {views} of {left} candidates ({reasons}); lower it, or give more"
+            f"suggest: views {views} of {left} candidates ({reasons}); lower it, or give more"
         )
 
 
@@ -221,8 +223,8 @@ def _plan(
     if problem.settings.flies:
         if not problem.reachable(state.taken):
             raise InputError(
-                "suggest: no candidate is within the limits of the flight; raise --flight-length "
-                "or --flight-time"
+                "suggest: no candidate is within the limits of the flight; raise `flight.length` "
+                "or `flight.time`"
             )
         stops = list(plan_flight(problem, state, fisher))
         problem.settings = problem.settings.model_copy(update={"batch": len(stops)})

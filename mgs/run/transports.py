@@ -59,12 +59,12 @@ def command(text: str, timeout: float) -> Transport:
     try:
         words = shlex.split(text)
     except ValueError as error:
-        raise InputError(f"--capture-command {text!r}: {error}; correct the quotes") from None
+        raise InputError(f"capture_command {text!r}: {error}; correct the quotes") from None
     missing = [field for field in ("{pose}", "{out}") if not any(field in word for word in words)]
     if missing:
-        raise InputError(f"--capture-command {text!r}: has no {missing[0]}; add it")
+        raise InputError(f"capture_command {text!r}: has no {missing[0]}; add it")
     if shutil.which(words[0]) is None:
-        raise InputError(f"--capture-command {text!r}: there is no program {words[0]}")
+        raise InputError(f"capture_command {text!r}: there is no program {words[0]}")
 
     def deliver(pose: Path, out: Path) -> None:
         for old in answers(out).values():

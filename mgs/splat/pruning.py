@@ -75,7 +75,7 @@ def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float) -> Prun
     `render`, and if the noise is not positive.
     """
     if not 0 < noise < np.inf:
-        raise InputError(f"prune: noise {noise} must be positive, linear RGB; correct --noise")
+        raise InputError(f"prune: noise {noise} must be positive, linear RGB; correct `noise`")
     before, covered = _images(gaussians, cameras)
     kept, predicted, actual, allowed = np.arange(len(gaussians)), 0.0, 0.0, noise**2 * covered
     for _ in range(ROUNDS):

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mgs.data.dataset import load_dataset
-from mgs.errors import flag
 from mgs.fit.settings import COLOURS_ALONE, PASSES, WARM_PASSES
 from mgs.plotting import drawing
 from mgs.run.nbv import run_nbv
@@ -134,10 +133,11 @@ class Point:
     def command(self, dataset: Path, prior: Path, seeds: int) -> str:
         """Command line that makes this model."""
         given = self.settings(seeds)
-        options = given | given.pop("train") | {"alpha_weight": 0}
+        passes = given.pop("train")["passes"]
+        given |= {"train.passes": passes, "train.alpha_weight": 0}
         words = ["mgs", "nbv", str(dataset), "--prior", str(prior), "--out", "RUN"]
-        for name, value in options.items():
-            words += [flag(name), str(value)]
+        for key, value in given.items():
+            words += ["--set", f"{key}={value}"]
         return shlex.join(words)
 
 

@@ -20,6 +20,7 @@ from mgs.policy.poses import smallest_angle
 from mgs.run.loop import fit_views
 from mgs.run.planning import planned_flight, rated
 from mgs.run.problem import Problem
+from mgs.run.settings import FlightLimits
 from mgs.run.state import Fitted
 from mgs.study.case import Rock
 from mgs.study.output import Content, Panel, draw_panels, table
@@ -53,7 +54,7 @@ def one_by_one(problem: Problem) -> list[int]:
 
 def cut(problem: Problem) -> list[int]:
     """Views in the order of a choice without a limit, as many as a short tour can take."""
-    flight, order = problem.flight, one_by_one(problem.with_settings(flight_length=None))
+    flight, order = problem.flight, one_by_one(problem.with_settings(flight=FlightLimits()))
     flown = [short_tour(problem, order[:count]) for count in range(1, len(order) + 1)]
     return max((way for way in flown if flight.share(flight.metres(way), len(way)) <= 1), key=len)
 
@@ -126,7 +127,7 @@ def fly_and_judge(root: Path, out: Path, dataset: str, prior: str, frames: int) 
     flights = [flight(EVEN, None, evenly_spaced(problem, n)) for n in EVEN_IMAGES if n <= frames]
     for policy, (fly, settings) in FLIERS.items():
         for length in LENGTHS:
-            limited = problem.with_settings(flight_length=length * whole, **settings)
+            limited = problem.with_settings(flight=FlightLimits(length=length * whole), **settings)
             flights.append(flight(policy, length, fly(limited)))
     return {"whole": whole, "flights": flights}
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from mgs.errors import flag
 from mgs.policy import from_file as policy_file
 from mgs.run.inputs import policy_record
 from mgs.study.case import Case, Rock, Size
@@ -170,9 +169,11 @@ class Run:
         if self.policy in ALL_3DGS:
             return ""
         folders = self.cells()[-1].arguments
-        options = " ".join(f"{flag(key)} {value}" for key, value in self.settings().items())
+        options = " ".join(
+            f"{'--' + key.replace('_', '-')} {value}" for key, value in self.settings().items()
+        )
         where = f"{folders['dataset']} --prior {folders['prior']} --out RUN"
-        return f"mgs nbv {where} --alpha-weight 0 {options}"
+        return f"mgs nbv {where} --set train.alpha_weight=0 {options}"
 
 
 def table_runs(size: ReproduceSize) -> dict[str, Run]:

@@ -56,7 +56,7 @@ class SurveySettings:
     def __post_init__(self) -> None:
         if not (0 <= self.sensor <= MOST_ERROR and 0 <= self.drift <= MOST_ERROR):
             raise InputError(
-                f"survey: --sensor-noise {self.sensor:g} and --drift {self.drift:g} are factors "
+                f"survey: sensor_noise {self.sensor:g} and drift {self.drift:g} are factors "
                 f"of 0 or more, at most {MOST_ERROR:g}; correct them"
             )
 

@@ -35,8 +35,8 @@ class PoseNoise:
     def __post_init__(self) -> None:
         if not (0 <= self.position <= MOST_NOISE and 0 <= self.rotation <= 180):
             raise InputError(
-                f"synth-orbit: --pose-noise {self.position:g} must be 0 to {MOST_NOISE:g} metres, "
-                f"and --rotation-noise {self.rotation:g} 0 to 180 degrees"
+                f"synth-orbit: pose_noise {self.position:g} must be 0 to {MOST_NOISE:g} metres, "
+                f"and rotation_noise {self.rotation:g} 0 to 180 degrees"
             )
 
 

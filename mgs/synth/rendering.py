@@ -190,7 +190,7 @@ def _check_cost(
     views, pixels = preset.frames + test_views, preset.width * preset.height
     samples = pixels * spp
     what = f"{views:,} views of {preset.width}x{preset.height} with {spp:,} samples per pixel"
-    instead = "lower --frames, --test-views, --size or --spp"
+    instead = "lower `frames`, `test_views`, `size` or `spp`"
     hours = views * (VIEW_SECONDS + SAMPLE_SECONDS * samples) / 3600
     needed = views * pixels * PIXEL_BYTES
     free = shutil.disk_usage(next(p for p in out.resolve().parents if p.exists())).free
@@ -221,12 +221,12 @@ def rock_of(
     extents = " x ".join(f"{x:.2f}" for x in rock.extents)
     up, suffix = mesh_up or up_axis(mesh), Path(mesh).suffix.lower()
     if mesh_up:
-        reason = "is up, as --mesh-up says"
+        reason = "is up, as `mesh_up` says"
     elif suffix in GLTF:
         reason = f"is up, as in all {suffix[1:].upper()} files"
     else:
         other = "y" if up == "z" else "z"
-        reason = f"taken as up, since its format does not say (--mesh-up {other} turns it)"
+        reason = f"taken as up, since its format does not say (`mesh_up` = {other} turns it)"
     say(
         f"{mesh}: +{up.upper()} {reason}; scaled {scale:.4g} times to the scene's rock size, "
         f"now {extents} m"

@@ -69,7 +69,7 @@ def load_rock(
     scale = settings.size / float(mesh.extents.max())
     mesh = _stand(mesh, settings)
     if mesh.bounds[1, 2] <= 0:
-        raise InputError(f"{path}: is flat on the ground; give a rock with a height, or --mesh-up")
+        raise InputError(f"{path}: is flat on the ground; give a rock with a height, or `mesh_up`")
     return mesh, scale
 
 

@@ -39,7 +39,7 @@ class Rock(_Strict):
     """The rock: body, weathering, colour."""
 
     size: Positive = 1.8
-    """Longest side of its bounding box, metres; a mesh given by --mesh is scaled to it too."""
+    """Longest side of its bounding box, metres; a mesh given by `mesh` is scaled to it too."""
     buried: Annotated[float, Field(ge=0, lt=1)] = 0.12
     """Share of its height below the ground."""
     lobes: Annotated[tuple[Lobe, ...], Field(min_length=1)] = (Lobe(radii=(1.0, 0.8, 0.72)),)
@@ -184,5 +184,5 @@ def sensor_of(dataset: Path) -> Sensor:
         return Sensor.model_validate(recorded.get("scene", {}).get("sensor", {}))
     except (ValidationError, AttributeError):
         raise InputError(
-            f"{path}: its scene.sensor is damaged; correct it or give --sensor-noise and --drift"
+            f"{path}: its scene.sensor is damaged; correct it or give `sensor_noise` and `drift`"
         ) from None

@@ -71,7 +71,7 @@ def check_address(host: str, port: int) -> None:
     except OSError as error:
         reason = error.strerror or str(error)
         raise InputError(
-            f"--host {host} --port {port}: cannot be served there ({reason}); "
+            f"host {host} port {port}: cannot be served there ({reason}); "
             "choose another port or host"
         ) from None
 
@@ -116,7 +116,7 @@ class Viewer:
         self.port = self.server.get_port()
         if port not in (0, self.port):  # taken since the check: viser then takes the next one
             self.close()
-            raise InputError(f"--port {port}: is in use; choose another one")
+            raise InputError(f"port {port}: is in use; choose another one")
         self.clients: dict[int, _Client] = {}
         self.frusta: dict[str, Any] = {}
         self.selected: str | None = None

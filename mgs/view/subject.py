@@ -73,7 +73,7 @@ def read_subject(path: str | Path, follow: bool = False) -> Subject:
     if path.is_dir():
         return scaled(_read_run(open_run(path), follow))
     if follow:
-        raise InputError(f"{path}: --follow needs the folder of a run")
+        raise InputError(f"{path}: `follow` needs the folder of a run")
     if not path.is_file():
         raise InputError(f"{path}: no such run folder or PLY file")
     return scaled(Subject(path.name, load_gaussians(path), up=upward(path), unit="unit"))
