@@ -156,3 +156,28 @@ def test_bad_input_has_one_line():
     F[1, 0] = np.nan
     with pytest.raises(InputError, match=r"candidate 1 .*not finite"):
         relaxation.d_optimal(F, F[0], np.ones(1))
+
+
+@pytest.mark.parametrize("kind", ["d", "i"])
+def test_a_certificate_holds_for_every_set(kind):
+    made, gain = case(kind, 4)
+    plan = certificate.greedy(made, 1.0, most=3)
+    held = certificate.certify(made, plan)
+    largest, fewer = (max(gain(some) for some in combinations(range(POSES), k)) for k in (3, 2))
+    assert gain(plan) >= held.share * largest * (1 - 1e-6)
+    assert held.share >= 0.9
+    assert fewer <= held.fewer * gain(plan)
+    assert held.of_all == pytest.approx(gain(plan) / gain(range(POSES)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_greedy_takes_as_many_views_as_a_share_of_all_needs(kind):
+    made, gain = case(kind, 6)
+    views, every = certificate.greedy(made, 0.8), gain(range(POSES))
+    assert gain(views) >= 0.8 * every > gain(views[:-1])
+    assert len(set(views)) == len(views)
+    for k in range(len(views)):
+        assert gain(views[: k + 1]) == pytest.approx(
+            max(gain([*views[:k], v]) for v in range(POSES) if v not in views[:k])
+        )
+    assert sorted(certificate.greedy(made, 1.0)) == list(range(POSES))

@@ -15,6 +15,7 @@ from __future__ import annotations
 import heapq
 import time
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -59,18 +60,14 @@ class Bound(NamedTuple):
 class Best(NamedTuple):
     """A set of candidates, its gain, and the `bound` that no set of as many exceeds.
 
-    nodes: number of relaxations solved.
+    nodes: number of relaxations solved. prices: those of the relaxation without integers [C].
     """
 
     views: list[int]
     gain: float
     bound: float
     nodes: int
-
-    @property
-    def share(self) -> float:
-        """Least share of the largest gain that the set has."""
-        return self.gain / self.bound if self.bound > 0 else 1.0
+    prices: Floats
 
 
 def upper_bound(
@@ -136,7 +133,7 @@ def best_set(
                 heapq.heappush(heap, (-bound.value, pushed, low, high, start))
     best = max(gains, key=lambda views: gains[views])
     bound_of_all = max([gains[best], closed, *(-node[0] for node in heap)])
-    return Best(list(best), gains[best], bound_of_all, nodes)
+    return Best(list(best), gains[best], bound_of_all, nodes, root.prices)
 
 
 def best_coverage(
@@ -170,7 +167,7 @@ def best_coverage(
     weights = x if found.x is None else found.x[: len(F)]
     views = sorted(int(v) for v in np.argsort(-weights, kind="stable")[:k])
     gain = coverage_greedy(F[views].sum(axis=0), H, lam)
-    return Best(views, gain, max(gain, float(bound)), found.mip_node_count or 0)
+    return Best(views, gain, max(gain, float(bound)), found.mip_node_count or 0, x)
 
 
 def _noted(
@@ -284,3 +281,61 @@ def _newton_step(H: Floats, slope: Floats, x: Floats, lo: Floats, hi: Floats) ->
         y[i], y[j] = min(y[i] + t, hi[i]), max(y[j] - t, lo[j])
         g -= t * (H[i] - H[j])
     return np.asarray(y - x)
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What a plan of k of C candidates is worth, by its criterion; it says nothing about PSNR.
+
+    share: gain of the plan over the bound of any k. fewer: bound of any k - 1 over that gain; None
+    for one view. of_all: gain of the plan over that of all candidates. prices: of the bound of any
+    k [C] (`Bound`), over its value.
+    """
+
+    views: int
+    candidates: int
+    share: float
+    fewer: float | None
+    of_all: float
+    prices: list[float]
+
+    def sentence(self, criterion: str) -> str:
+        """The certificate in words; shares are rounded to the safe side."""
+        k, C = self.views, self.candidates
+        share = np.floor(1000 * self.share + 1e-6) / 10
+        fewer = np.ceil(1000 * (self.fewer or 1)) / 10
+        text = f"These {k} views have at least {share:.1f} % of the gain that any {k} of the {C}"
+        text = f"{text} candidates could have" if share < 100 else f"No {k} of the {C} candidates"
+        if share == 100:
+            text += " have a larger gain than these"
+        if fewer < 100:
+            text += f", and no {k - 1} can have more than {fewer:.1f} % of theirs"
+        return f"{text} (by {criterion}, which is not PSNR)."
+
+
+def certify(relaxation: Relaxation, plan: Sequence[int], seconds: float = SECONDS) -> Certificate:
+    """Certificate of a plan: `best_set` for as many views, and `upper_bound` for one less.
+
+    Raises InputError as `upper_bound`.
+    """
+    k, gain, count = len(plan), relaxation.gain(plan), relaxation.candidates
+    best = best_set(relaxation, plan, seconds=seconds)
+    fewer = upper_bound(relaxation, k - 1, seconds=seconds).value / gain if k > 1 else None
+    of_all = gain / relaxation.gain(range(count))
+    prices = (best.prices / best.bound).tolist()
+    return Certificate(k, count, gain / best.bound, fewer, of_all, prices)
+
+
+def greedy(relaxation: Relaxation, share: float, most: int | None = None) -> list[int]:
+    """Candidates by greedy choice, until they have `share` of the gain of all of them together.
+
+    most: number of views after which it stops anyway.
+    """
+    views, enough = list[int](), share * relaxation.gain(range(relaxation.candidates))
+    while len(views) < (most or relaxation.candidates):
+        gains = relaxation.added(views)
+        gains[views] = -1
+        views.append(int(gains.argmax()))
+        if relaxation.gain(views) >= enough:
+            break
+    return views
