@@ -143,7 +143,7 @@ def test_covariances_have_the_scales_and_the_axes(run):
     axes = Rotation.from_quat(g.quats, scalar_first=True).as_matrix()
     variances = np.exp(2 * flat.log_scales)
     expected = axes @ (variances[:, :, None] * axes.transpose(0, 2, 1))
-    found = layers.covariances(SimpleNamespace(gaussians=flat))
+    found = layers.covariances(flat)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6 * variances.max())
 
 

@@ -10,12 +10,15 @@ from __future__ import annotations
 import hmac
 import logging
 import secrets
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
 from http.cookies import SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
+
+from mgs.errors import InputError
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
 """Hosts that only this machine reaches."""
@@ -26,6 +29,20 @@ COOKIE = "mgs_token"
 def plain(text: str) -> str:
     """Escape text for Markdown and HTML: every character with a meaning becomes an entity."""
     return "".join(c if c.isalnum() or c in " ,.:;/%" else f"&#{ord(c)};" for c in text)
+
+
+def bound_socket(host: str, port: int) -> socket.socket:
+    """Socket of a server at this host and port; 0: any free port. Raises InputError if no server
+    can listen there."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        reason = (error.strerror or str(error)).partition(" (while")[0]
+        raise InputError(
+            f"host {host} port {port}: cannot be served there ({reason}); "
+            "choose another port or host"
+        ) from None
 
 
 class Access:
@@ -73,16 +90,23 @@ class Access:
         return response
 
     @contextmanager
-    def guarding(self) -> Iterator[None]:
-        """Context manager in which a server of websockets answers as `answered`."""
+    def guarding(self, listening: socket.socket) -> Iterator[None]:
+        """Context manager in which a server of websockets answers as `answered`, on this socket.
+
+        By itself viser would take the next port that is free, and look for one for ever at a host
+        that is not of this machine.
+        """
         from websockets.asyncio import server
 
         serve, logger = server.serve, logging.getLogger("mgs.view")
         logger.disabled = True
 
-        def guarded(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        def guarded(
+            handler: Any, host: str, port: int, process_request: Any = None, **options: Any
+        ) -> Any:
+            options |= {"sock": listening, "logger": logger}
             answer = lambda connection, request: self.answered(connection, request, process_request)  # noqa: E731
-            return serve(*arguments, process_request=answer, **options | {"logger": logger})
+            return serve(handler, process_request=answer, **options)
 
         server.serve = guarded  # type: ignore[assignment,misc]
         try:

@@ -8,7 +8,6 @@ viser calls back from its own threads. These only record requests; everything is
 from __future__ import annotations
 
 import math
-import socket
 import time
 import warnings
 from contextlib import redirect_stdout
@@ -24,9 +23,8 @@ from mgs.colour import srgb_from_linear
 from mgs.data.up import upright
 from mgs.errors import InputError
 from mgs.report.page_plots import FRUSTUM
-from mgs.rotation import rotmat_from_quat
 from mgs.view import layers
-from mgs.view.access import Access, plain
+from mgs.view.access import Access, bound_socket, plain
 from mgs.view.subject import View, read_subject
 
 REST = 0.2
@@ -60,22 +58,6 @@ BLACK = np.zeros((2, 2, 3), np.uint8)
 """Background without an image of the kernel."""
 
 
-def check_address(host: str, port: int) -> None:
-    """Raises InputError if no server can listen at this host and port."""
-    try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-        family, kind, protocol, _, address = found[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise InputError(
-            f"host {host} port {port}: cannot be served there ({reason}); "
-            "choose another port or host"
-        ) from None
-
-
 @dataclass
 class _Client:
     """A browser window.
@@ -96,7 +78,7 @@ class Viewer:
     """Serve a run folder or a PLY until `close`. `tick` must be called repeatedly.
 
     follow: look for a new step of the run every FOLLOW seconds. Raises InputError as `read_subject`
-    and `check_address`.
+    and `bound_socket`.
     """
 
     def __init__(
@@ -107,19 +89,15 @@ class Viewer:
         self.subject = read_subject(path, follow)
         import viser
 
-        check_address(host, port)
         # A window may be closed while its image is drawn; viser then warns.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        self.access = Access(host)
-        with redirect_stdout(StringIO()), self.access.guarding():  # viser prints a greeting
-            self.server = viser.ViserServer(host, port, label="mgs", verbose=False)
-        self.port = self.server.get_port()
-        if port not in (0, self.port):  # taken since the check: viser then takes the next one
-            self.close()
-            raise InputError(f"port {port}: is in use; choose another one")
+        self.access, listening = Access(host), bound_socket(host, port)
+        self.port = listening.getsockname()[1]
+        with redirect_stdout(StringIO()), self.access.guarding(listening):  # viser greets
+            self.server = viser.ViserServer(host, self.port, label="mgs", verbose=False)
         self.clients: dict[int, _Client] = {}
         self.frusta: dict[str, Any] = {}
-        self.selected: str | None = None
+        self.selected = ""
         self.version = 0
         self.next_look = time.monotonic() + FOLLOW
         self._scene()
@@ -137,8 +115,7 @@ class Viewer:
         """Read a new step, and draw for the cameras that rest."""
         now = time.monotonic()
         if self.follow and now >= self.next_look:
-            self.next_look = now + FOLLOW
-            stamp = self._stamp()
+            self.next_look, stamp = now + FOLLOW, self._stamp()
             if stamp != self.stamp:
                 self.stamp, self.subject = stamp, read_subject(self.path, self.follow)
                 self._renew()
@@ -158,38 +135,25 @@ class Viewer:
 
     def _scene(self) -> None:
         """Set up background, light, first camera, and mesh."""
-        server, subject = self.server, self.subject
-        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        server.scene.set_up_direction(subject.up)
-        server.scene.configure_environment_map(None)
-        server.scene.world_axes.visible = False
-        server.scene.set_background_image(BLACK)
-        centre, size = self._extent()
-        server.initial_camera.look_at = centre
+        scene, subject, first = self.server.scene, self.subject, self.server.initial_camera
+        self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        scene.set_up_direction(subject.up)
+        scene.configure_environment_map(None)
+        scene.world_axes.visible = False
+        scene.set_background_image(BLACK)
+        centre, size = subject.extent
         direction = upright(subject.up).T @ np.array([1.0, -1.0, 0.8])
         if subject.views:  # from above, so that no camera is before the object
-            offset = subject.views[0].frame.camera.position - centre
+            offset = subject.eyes[0] - centre
             direction = offset + np.linalg.norm(offset) * np.array(subject.up)
-            server.initial_camera.fov = _vertical_fov(subject.views[0].frame.camera)
-        distance = size / (FILLED * np.tan(server.initial_camera.fov / 2))
+            first.fov = _vertical_fov(subject.views[0].frame.camera)
         direction /= max(float(np.linalg.norm(direction)), 1e-9)
-        server.initial_camera.position = centre + distance * direction
-        if subject.mesh is not None:
-            mesh = subject.mesh
+        first.look_at = centre
+        first.position = centre + size / (FILLED * np.tan(first.fov / 2)) * direction
+        if (mesh := subject.mesh) is not None:
             vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
-            self.mesh = server.scene.add_mesh_simple(
-                "/mesh", vertices, faces, color=(150, 160, 175), visible=False
-            )
-
-    def _extent(self) -> tuple[np.ndarray, float]:
-        """Middle of the subject, and the radius that holds 95 % of it."""
-        subject = self.subject
-        points = subject.gaussians.means if subject.gaussians is not None else None
-        if points is None or len(points) == 0:
-            eyes = np.array([view.frame.camera.position for view in subject.views] or [np.zeros(3)])
-            points = subject.mesh.vertices if subject.mesh is not None else eyes
-        centre = np.median(points, axis=0).astype(np.float64)
-        return centre, max(float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.95)), 1e-6)
+            look: dict[str, Any] = {"color": (150, 160, 175), "visible": False}
+            self.mesh = scene.add_mesh_simple("/mesh", vertices, faces, **look)
 
     def _controls(self) -> None:
         """Add the panel."""
@@ -198,30 +162,28 @@ class Viewer:
         hint = "What is drawn: by the kernel, and by the browser"
         self.layer: Any = gui.add_dropdown("Layer", names, hint=hint)
         self.legend = gui.add_markdown("")
-        self.exact = gui.add_checkbox(
-            "Exact at rest", True, hint="The kernel's own image while the camera rests"
-        )
+        hint = "The kernel's own image while the camera rests"
+        self.exact = gui.add_checkbox("Exact at rest", True, hint=hint)
         self.gaussians = gui.add_checkbox("Gaussians", True)
         for control in (self.layer, self.exact, self.gaussians):
             control.on_update(lambda _: self._again())
         if self.subject.mesh is not None:
-            show_mesh = gui.add_checkbox("Mesh of the prior", False)
-            show_mesh.on_update(lambda _: setattr(self.mesh, "visible", show_mesh.value))
+            self._switch("Mesh of the prior", False, self.mesh)
         if not self.subject.views:
             return
-        self.group = self.server.scene.add_frame("/cameras", show_axes=False)
-        self.cameras = gui.add_checkbox(
-            "Cameras", True, hint="Orange: seeds; green: chosen; grey: candidates"
-        )
-        self.cameras.on_update(lambda _: setattr(self.group, "visible", self.cameras.value))
-        self.view: Any = gui.add_dropdown(
-            "View", [view.frame.name for view in self.subject.views], hint="Or click a camera"
-        )
+        group = self.server.scene.add_frame("/cameras", show_axes=False)
+        self._switch("Cameras", True, group, "Orange: seeds; green: chosen; grey: candidates")
+        names = [view.frame.name for view in self.subject.views]
+        self.view: Any = gui.add_dropdown("View", names, hint="Or click a camera")
         self.view.on_update(lambda _: self.select(self.view.value))
-        look = gui.add_button("Look from there")
-        look.on_click(lambda event: self._look(event.client))
+        gui.add_button("Look from there").on_click(lambda event: self._look(event.client))
         self.facts = gui.add_markdown("Click a camera to see its image.")
         self.image = gui.add_image(np.zeros((3, 4, 3), np.uint8), format="jpeg", visible=False)
+
+    def _switch(self, label: str, on: bool, shown: Any, hint: str | None = None) -> None:
+        """Add a checkbox that shows and hides a part of the scene."""
+        box = self.server.gui.add_checkbox(label, on, hint=hint)
+        box.on_update(lambda _: setattr(shown, "visible", box.value))
 
     def _again(self) -> None:
         """Request that everything is drawn again."""
@@ -245,9 +207,7 @@ class Viewer:
         self.title.content = f"**{plain(subject.title)}**"
         if not subject.views:
             return
-        centre, _ = self._extent()
-        eyes = np.array([view.frame.camera.position for view in subject.views])
-        size = FRUSTUM * float(np.linalg.norm(eyes - centre, axis=1).mean())
+        size = FRUSTUM * float(np.linalg.norm(subject.eyes - subject.extent[0], axis=1).mean())
         for view in subject.views:
             self._show_camera(view, size)
         way = [view.frame.camera.position for view in subject.taken if view.role == "chosen"]
@@ -257,22 +217,19 @@ class Viewer:
 
     def _show_camera(self, view: View, size: float) -> None:
         """Show a camera as a pyramid that can be clicked, with the step of a chosen one."""
-        from viser.transforms import SO3
-
         camera, name = view.frame.camera, view.frame.name
-        pose = camera.camera_to_world
-        handle = self.server.scene.add_camera_frustum(
+        wxyz, position = _pose(camera)
+        self.frusta[name] = self.server.scene.add_camera_frustum(
             f"/cameras/views/{name}",
             _vertical_fov(camera),
             camera.width / camera.height,
             scale=(0.2 if view.role == "candidate" else 0.4) * size,
             color=SELECTED if name == self.selected else COLOURS[view.role],
-            wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
-            position=pose[:3, 3],
+            wxyz=wxyz,
+            position=position,
             **THIN,
         )
-        handle.on_click(lambda _: self._clicked(name))
-        self.frusta[name] = handle
+        self.frusta[name].on_click(lambda _: self._clicked(name))
         if view.role == "chosen":
             self.server.scene.add_label(f"/cameras/views/{name}/step", str(view.step))
 
@@ -288,7 +245,7 @@ class Viewer:
         by_name = {view.frame.name: view for view in self.subject.views}
         if name not in by_name:  # no window of ours sends it
             return
-        if self.selected in self.frusta:
+        if self.selected:
             self.frusta[self.selected].color = COLOURS[by_name[self.selected].role]
         self.selected, view = name, by_name[name]
         self.frusta[name].color = SELECTED
@@ -297,36 +254,30 @@ class Viewer:
         self.facts.content = "\n".join([f"**{plain(name)}**: {role}", "", *facts])
         try:
             image = np.round(srgb_from_linear(view.frame.rgb()) * 255).astype(np.uint8)
+            every = max(1, image.shape[1] // PREVIEW)
+            self.image.image = np.ascontiguousarray(image[::every, ::every])
+            self.image.visible = True
         except InputError as error:
             self.image.visible = False
             self.facts.content += f"\n\n{plain(str(error))}"
-            return
-        every = max(1, image.shape[1] // PREVIEW)
-        self.image.image = np.ascontiguousarray(image[::every, ::every])
-        self.image.visible = True
 
-    def _look(self, handle: Any) -> None:
+    def _look(self, client: Any) -> None:
         """Move a browser's camera to that of the selected view."""
-        if handle is None:  # the window was closed meanwhile
+        if client is None:  # the window was closed meanwhile
             return
         if self.selected != self.view.value:
             self.select(self.view.value)
-        view = next(view for view in self.subject.views if view.frame.name == self.selected)
-        from viser.transforms import SO3
-
-        camera = view.frame.camera
-        pose, centre = camera.camera_to_world, self._extent()[0]
-        eye = pose[:3, 3]
-        with handle.atomic():
-            handle.camera.wxyz = SO3.from_matrix(pose[:3, :3]).wxyz
-            handle.camera.position = eye
-            handle.camera.look_at = eye + pose[:3, 2] * float(np.linalg.norm(centre - eye))
-            handle.camera.fov = _vertical_fov(camera)
+        camera = next(v for v in self.subject.views if v.frame.name == self.selected).frame.camera
+        wxyz, eye = _pose(camera)
+        away = float(np.linalg.norm(self.subject.extent[0] - eye))
+        with client.atomic():
+            client.camera.wxyz, client.camera.position = wxyz, eye
+            client.camera.look_at = eye + away * camera.camera_to_world[:3, 2]
+            client.camera.fov = _vertical_fov(camera)
 
     def _connected(self, handle: Any) -> None:
         """Handle a browser window that was opened."""
-        client = _Client(handle, None, time.monotonic())
-        self.clients[handle.client_id] = client
+        client = self.clients[handle.client_id] = _Client(handle, None, time.monotonic())
 
         @handle.camera.on_update
         def _moved(_: Any) -> None:
@@ -347,17 +298,15 @@ class Viewer:
 
     def _draw(self, client: _Client) -> None:
         """Draw the layer for a browser whose camera rests: Gaussians, and the kernel's image."""
-        asked, subject = (client.moved, self.version), self.subject
-        known = layers.layers(subject)
+        asked, subject, known = (client.moved, self.version), self.subject, self.layer.options
         layer = self.layer.value if self.layer.value in known else known[0]
-        g = subject.gaussians
-        assert g is not None
+        g = subject.model
         if client.splats is None or layer != client.layer:
             colours = layers.gaussian_colours(subject, layer) / 255
         if client.splats is None:
-            covariances, opacities = layers.covariances(subject), g.opacities[:, None]
+            splats = layers.covariances(g), colours, g.opacities[:, None]
             client.splats = client.handle.scene.add_gaussian_splats(
-                "/gaussians", g.means, covariances, colours, opacities, visible=False
+                "/gaussians", g.means, *splats, visible=False
             )
         elif layer != client.layer:
             client.splats.rgbs = colours
@@ -371,10 +320,9 @@ class Viewer:
                 client.handle.scene.set_background_image(image, format="png", depth=depth)
         else:
             ends = layers.scale(subject, layer)
-            text = "Depth is drawn by the kernel, at rest."
-            if layer != "depth":
-                text = layers.legend(layer, ends, subject.unit)
-            self.legend.content = text
+            self.legend.content = layers.legend(layer, ends, subject.unit)
+            if layer == "depth":
+                self.legend.content = "Depth is drawn by the kernel, at rest."
             self._uncover(client)
         client.drawn = asked
 
@@ -384,6 +332,8 @@ def window_camera(camera: Any) -> Camera | None:
 
     None where what the window sent is no camera: a size, field of view or pose out of range.
     """
+    from viser.transforms import SE3, SO3
+
     width, height, wxyz = camera.image_width, camera.image_height, np.asarray(camera.wxyz, float)
     numbers = [width, height, camera.fov, *wxyz, *np.asarray(camera.position, float)]
     if not np.isfinite(numbers).all() or np.abs(numbers).max() > LARGEST_NUMBER:
@@ -393,11 +343,17 @@ def window_camera(camera: Any) -> Camera | None:
     shrink = min(1.0, math.sqrt(PIXELS / (width * height)))
     width, height = max(1, round(width * shrink)), max(1, round(height * shrink))
     focal = height / 2 / math.tan(camera.fov / 2)
-    pose = np.eye(4)
-    pose[:3, :3] = rotmat_from_quat(camera.wxyz).T
-    pose[:3, 3] = -pose[:3, :3] @ np.asarray(camera.position, np.float64)
+    turn = SO3(wxyz / np.linalg.norm(wxyz))
+    pose = SE3.from_rotation_and_translation(turn, np.asarray(camera.position, float))
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Camera(K, width, height, pose)
+    return Camera(K, width, height, pose.inverse().as_matrix().astype(np.float64))
+
+
+def _pose(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation of a camera as a quaternion (w, x, y, z), and its position."""
+    from viser.transforms import SO3
+
+    return SO3.from_matrix(camera.camera_to_world[:3, :3]).wxyz, camera.position
 
 
 def _vertical_fov(camera: Camera) -> float:

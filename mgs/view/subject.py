@@ -44,7 +44,7 @@ class Subject:
 
     gaussians: the model; None before the first finished step. scalars: name -> [N], of SCALARS;
     empty for a PLY. views: of the dataset, in its order; empty for a PLY. up, unit: of the world;
-    +Z (GLB: what it says) and "unit" for a file. scale: all lengths over those of the world.
+    a PLY's unit is "unit". scale: all lengths over those of the world.
     """
 
     title: str
@@ -57,10 +57,31 @@ class Subject:
     scale: float = 1.0
 
     @property
+    def model(self) -> Gaussians:
+        """The Gaussians of a subject that has some."""
+        assert self.gaussians is not None
+        return self.gaussians
+
+    @property
     def taken(self) -> list[View]:
         """The seeds, then the chosen views in their order."""
         taken = [view for view in self.views if view.step is not None]
         return sorted(taken, key=lambda view: view.step or 0)
+
+    @property
+    def eyes(self) -> np.ndarray:
+        """Positions of the cameras, [V,3]."""
+        return np.array([view.frame.camera.position for view in self.views]).reshape(-1, 3)
+
+    @property
+    def extent(self) -> tuple[np.ndarray, float]:
+        """Middle, and the radius that holds 95 %, of the Gaussians, else of mesh or cameras."""
+        points = self.eyes if self.mesh is None else self.mesh.vertices
+        if self.gaussians is not None and len(self.gaussians):
+            points = self.gaussians.means
+        points = points if len(points) else np.zeros((1, 3))
+        centre = np.median(points, axis=0).astype(np.float64)
+        return centre, max(float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.95)), 1e-6)
 
 
 def read_subject(path: str | Path, follow: bool = False) -> Subject:
@@ -81,22 +102,15 @@ def read_subject(path: str | Path, follow: bool = False) -> Subject:
 
 def scaled(subject: Subject) -> Subject:
     """Shrink a subject until nothing is farther than LARGEST from the middle."""
-    g, mesh = subject.gaussians, subject.mesh
-    eyes = np.array([view.frame.camera.position for view in subject.views]).reshape(-1, 3)
-    means = eyes[:0] if g is None else g.means
-    if len(means) + len(eyes) == 0:
-        return subject
-    centre = np.median(means if len(means) else eyes, axis=0)
-    of_means, of_eyes = (np.linalg.norm(points - centre, axis=1) for points in (means, eyes))
-    size = max(
-        float(np.quantile(of_means, 0.95)) if len(means) else 0.0, float(of_eyes.max(initial=0))
-    )
+    g, mesh, (centre, size) = subject.gaussians, subject.mesh, subject.extent
+    size = max(size, float(np.linalg.norm(subject.eyes - centre, axis=1).max(initial=0)))
     if size <= LARGEST:
         return subject
     scale = LARGEST / size
+    cameras = [view.frame.camera.scaled(scale) for view in subject.views]
     views = [
-        replace(view, frame=replace(view.frame, camera=view.frame.camera.scaled(scale)))
-        for view in subject.views
+        replace(view, frame=replace(view.frame, camera=camera))
+        for view, camera in zip(subject.views, cameras, strict=True)
     ]
     if g is not None:
         larger = g.log_scales + np.float32(np.log(scale))
@@ -107,15 +121,14 @@ def scaled(subject: Subject) -> Subject:
 
 def _read_run(run: Run, follow: bool) -> Subject:
     """The subject of a run, in the world's lengths."""
-    settings, dataset, name = run.settings, run.dataset, run.folder.resolve().name
-    mesh = settings.prior / "mesh.ply"
+    name, mesh = run.folder.resolve().name, run.settings.prior / "mesh.ply"
     waiting = Subject(
         f"{name}: no finished step yet",
         None,
-        views=[View(frame, "candidate", None, []) for frame in dataset.frames],
+        views=[View(frame, "candidate", None, []) for frame in run.dataset.frames],
         mesh=read_mesh(mesh) if mesh.is_file() else None,
         up=run.up,
-        unit=dataset.unit,
+        unit=run.dataset.unit,
     )
     if follow and not run.begun:
         return waiting
