@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import logit
 
 from mgs.colour import SH_C0
-from mgs.data.gltf import BINARY, JSON, MAGIC, SIZES, Gltf
+from mgs.data.gltf import BINARY, INSTANCING, JSON, MAGIC, SIZES, Gltf
 from mgs.data.up import PLUS_Z, Up, unit_up
 from mgs.errors import InputError
 from mgs.files import atomic_path, parsing, reading
@@ -31,8 +31,8 @@ SPACES = {True: "lin_rec709_display", False: "srgb_rec709_display"}
 FLOAT, VERTICES = 5126, 34962
 """Component type of the accessors, and target of the buffer views."""
 
-HANDLED = {EXTENSION, "KHR_mesh_quantization"}
-"""Extensions that are read."""
+HANDLED = f"{EXTENSION}|KHR_mesh_quantization|{INSTANCING}"
+"""Pattern of the extensions that are read."""
 
 PLAYCANVAS = "splat-transform"
 """Generator of files whose x and y point against those of the PLY that they were made of."""

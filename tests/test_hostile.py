@@ -170,8 +170,14 @@ def test_a_pipe_is_no_file(capsys, dataset, tmp_path):
 def test_a_mesh_that_names_a_pipe(tmp_path):
     """It is not opened, which would never end; the library takes a texture as missing."""
     os.mkfifo(tmp_path / "pipe.bin")
-    buffers = [{"uri": "pipe.bin", "byteLength": 36}]
-    (tmp_path / "a.gltf").write_text(json.dumps({"asset": {"version": "2.0"}, "buffers": buffers}))
+    content = {
+        "asset": {"version": "2.0"},
+        "buffers": [{"uri": "pipe.bin", "byteLength": 36}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+    }
+    (tmp_path / "a.gltf").write_text(json.dumps(content))
     with pytest.raises(InputError, match=r"pipe\.bin is no regular file"):
         load_mesh(tmp_path / "a.gltf")
     (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd pipe.bin\n")

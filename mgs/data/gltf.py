@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import struct
-from collections.abc import Callable, Iterator, Set
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -38,15 +39,15 @@ Transform = np.ndarray
 class Gltf:
     """Contents of a file: `json`, and its numbers by `accessor` and `bytes_of`.
 
-    Raises InputError if it needs an extension (`extensionsRequired`) that is not in `handled`, and
-    errors of many types if it is damaged (`mgs.files.parsing`). resolve: returns the bytes of a
-    file that is named beside it.
+    handled: pattern of the extensions that are read. resolve: returns the bytes of a file that is
+    named beside it. Raises InputError if it needs another extension (`extensionsRequired`), and
+    errors of many types if it is damaged (`mgs.files.parsing`).
     """
 
     def __init__(
         self,
         path: Path,
-        handled: Set[str],
+        handled: str,
         resolve: Callable[[str], bytes] | None = None,
     ) -> None:
         self.path, self.resolve = path, resolve
@@ -54,12 +55,17 @@ class Gltf:
         chunks = _chunks(data) if data.startswith(MAGIC) else {JSON: data}
         self.json: dict[str, Any] = json.loads(chunks[JSON])
         self.binary = chunks.get(BINARY, b"")
-        if missing := [x for x in self.json.get("extensionsRequired", []) if x not in handled]:
-            raise InputError(
-                f"{path}: needs the glTF extension {missing[0]}, which mgs does not read; "
-                "export it without"
-            )
+        for name in self.json.get("extensionsRequired", []):
+            if not re.fullmatch(handled, str(name)):
+                raise self.unread(name)
         self._buffers: dict[int, bytes] = {}
+
+    def unread(self, name: object) -> InputError:
+        """Error for an extension that is not read."""
+        return InputError(
+            f"{self.path}: needs the glTF extension {name}, which mgs does not read; "
+            "export it without"
+        )
 
     def file(self, uri: str) -> bytes:
         """Bytes of a data URI or of a file beside this one."""
@@ -113,8 +119,8 @@ class Gltf:
     def placed(self) -> Iterator[tuple[int, Transform]]:
         """Each mesh of the default scene with its transform; repeated where it is instanced. In a
         file without nodes, all meshes as they are."""
-        nodes = self.json.get("nodes") or [{"mesh": m} for m in range(len(self.json["meshes"]))]
-        scenes = self.json.get("scenes")
+        meshes, scenes = self.json.get("meshes", []), self.json.get("scenes")
+        nodes = self.json.get("nodes") or [{"mesh": index} for index in range(len(meshes))]
         if scenes and "nodes" in self.json:
             roots = scenes[self.json.get("scene", 0)].get("nodes", [])
         else:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from mgs.colour import linear_from_srgb
 from mgs.errors import InputError
 from mgs.files import parsing, reading
 from mgs.images import check_pixels, unlimited_headers
@@ -26,15 +26,8 @@ GLTF = (".glb", ".gltf")
 MESHES = (*GLTF, ".obj", ".ply", ".stl", ".off")
 """Suffixes of the mesh files that are read; the library's others include archives."""
 
-TEXTURES = (
-    "image",
-    "baseColorTexture",
-    "metallicRoughnessTexture",
-    "normalTexture",
-    "occlusionTexture",
-    "emissiveTexture",
-)
-"""Attributes of trimesh's materials that are images."""
+TEXTURES = ("image", "baseColorTexture")
+"""Attributes of trimesh's materials that are images, of files that are no glTF."""
 
 PLAIN_PLY = re.compile(
     rb"ply\nformat binary_little_endian 1.0\n(?:comment [^\n]*\n)*element vertex (\d{1,9})\n"
@@ -86,8 +79,9 @@ def face_crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
-def load_mesh(path: str | Path) -> trimesh.Trimesh:
-    """Read a triangle mesh (GLB, OBJ, PLY ...) with its texture, in the axes and units of its file.
+def load_mesh(path: str | Path, coloured: bool = True) -> trimesh.Trimesh:
+    """Read a triangle mesh (GLB, OBJ, PLY ...) in the axes and units of its file. coloured: with
+    its texture or vertex colours.
 
     Raises InputError if the file is missing or unreadable, the mesh has no faces or no area, a
     vertex is NaN, infinite or beyond FURTHEST, or a face names a vertex that does not exist.
@@ -100,9 +94,9 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     if path.suffix.lower() not in MESHES:
         raise InputError(f"{path}: not a readable mesh; give one of {', '.join(MESHES)}")
     with parsing(path, "mesh", "export it again as GLB, OBJ or PLY"), unlimited_headers():
-        mesh = _load(path)
+        mesh = _load(path, coloured)
     if not isinstance(mesh, trimesh.Trimesh):
-        raise InputError(f"{path}: has no faces; give a triangle mesh, not a point cloud")
+        raise InputError(f"{path}: has no faces; give a triangle mesh, not points or lines")
     _check(path, mesh.vertices, mesh.faces)
     return mesh
 
@@ -110,7 +104,7 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
 def _check(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     """Raise InputError as `load_mesh` for unusable vertices and faces."""
     if len(faces) == 0:
-        raise InputError(f"{path}: has no faces; give a triangle mesh, not a point cloud")
+        raise InputError(f"{path}: has no faces; give a triangle mesh, not points or lines")
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
         raise InputError(f"{path}: its vertices or faces have no three numbers; export it again")
     if not np.isfinite(vertices).all():
@@ -130,9 +124,11 @@ def _check(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
         raise InputError(f"{path}: none of its faces has an area; repair the mesh")
 
 
-def _load(path: Path) -> Any:
-    """Read a file with trimesh. Raises errors of many types."""
+def _load(path: Path, coloured: bool) -> Any:
+    """Read a file with trimesh, or a glTF. Raises errors of many types."""
     import trimesh
+
+    from mgs.data.mesh_gltf import load_gltf_mesh
 
     class Files(trimesh.resolvers.FilePathResolver):
         """Reads the files that a mesh names, but no pipe and no device, which may never end."""
@@ -143,15 +139,10 @@ def _load(path: Path) -> Any:
                     raise InputError(f"{path}: {one} is no regular file; correct the name")
             return super().get(name)
 
-    load = partial(trimesh.load, path, process=False, resolver=Files(str(path)))
-    mesh: Any = load() if path.suffix.lower() in GLTF else None
-    parts = list(mesh.graph.nodes_geometry) if isinstance(mesh, trimesh.Scene) else []
-    for part in mesh.geometry.values() if parts else ():
-        _check_textures(path, part)
-    if len(parts) == 1:  # force="mesh" below would lose the file's normals
-        transform, name = mesh.graph[parts[0]]
-        return mesh.geometry[name].apply_transform(transform)
-    mesh = load(force="mesh")
+    files = Files(str(path))
+    if path.suffix.lower() in GLTF:
+        return load_gltf_mesh(path, files.get, coloured)
+    mesh = trimesh.load(path, process=False, resolver=files, force="mesh")
     _check_textures(path, mesh)
     return mesh
 
@@ -197,7 +188,7 @@ def read_mesh(path: str | Path) -> Mesh:
     if known := _plain_ply(path):
         _check(path, *known)
     else:
-        mesh = load_mesh(path)
+        mesh = load_mesh(path, coloured=False)
         known = mesh.vertices, mesh.faces
     vertices, faces = np.asarray(known[0], np.float64), np.asarray(known[1], np.int64)
     if path.suffix.lower() in GLTF:
@@ -215,6 +206,9 @@ def read_mesh(path: str | Path) -> Mesh:
 def to_glb(mesh: trimesh.Trimesh) -> bytes:
     """GLB file of a mesh in world coordinates, with normals and texture, turned to +Y up."""
     turned: Any = mesh.copy(include_cache=True)  # the cache holds the vertex normals
+    if turned.visual.kind == "vertex":  # glTF's are linear
+        rgb = linear_from_srgb(turned.visual.vertex_colors[:, :3] / 255)
+        turned.visual.vertex_colors = np.round(255 * rgb).astype(np.uint8)
     turned.apply_transform(WORLD_FROM_GLTF.T)
     return turned.export(None, file_type="glb", include_normals=True)
 
