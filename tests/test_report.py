@@ -158,7 +158,7 @@ def test_figures_are_written_as_asked_for_and_those_left_out_are_named(runs, tmp
     assert said.count("left out") == 1
     ending = r"gain\.eps: figures are written as png, pdf, svg; choose another ending"
     with pytest.raises(InputError, match=ending):
-        figures.gain_figure(tmp_path / "gain.eps", {"random": [0.2, 0.1]})
+        figures.curves_figure(tmp_path / "gain.eps", "gain", {"gain": {}})
 
 
 def test_table(runs):
@@ -292,8 +292,8 @@ def test_a_legend_covers_no_line(tmp_path, drawn):
     """It stands beside the axes, which keep their size, whole."""
     labels = [f"random (a folder of a long name {i})" for i in range(20)]
     lines = dict.fromkeys(labels, ((4, 5, 6), (0.1, 0.2, 0.3)))
-    figures.gain_figure(tmp_path / "a.png", dict.fromkeys(labels, (0.1, 0.2, 0.3)))
-    figures.psnr_figure(tmp_path / "b.png", {"test views": lines, "masked PSNR": lines})
+    figures.curves_figure(tmp_path / "a.png", "gain", {"gain": lines})
+    figures.curves_figure(tmp_path / "b.png", "PSNR", {"test views": lines, "masked PSNR": lines})
     for figure in drawn.values():
         legend = figure.legends[0].get_window_extent()
         assert [text.get_text() for text in figure.legends[0].get_texts()] == labels

@@ -1,5 +1,6 @@
 """Films of a run: paths of cameras, the story of its views, and the files."""
 
+import resource
 import sys
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from PIL import Image
 from program import change_settings, command
 from refusals import refused
 
+from mgs.errors import InputError
 from mgs.report import story
 from mgs.report.video import PATHS, camera_path, write_film
 
@@ -58,6 +60,20 @@ def test_a_film_has_its_frames_and_their_lengths(tmp_path, ending):
             image.seek(k)
             found.append((image.convert("RGB").getpixel((4, 4))[0], image.info["duration"]))
     assert found == [(0, 200), (120, 200), (250, 600)]
+
+
+def test_a_film_that_is_cut_off_is_refused(tmp_path):
+    """As on a full disk, of which ffmpeg says nothing."""
+    pytest.importorskip("imageio_ffmpeg")
+    rng, before = np.random.default_rng(0), resource.getrlimit(resource.RLIMIT_FSIZE)
+    noise = iter(rng.integers(0, 255, (30, 64, 96, 3), np.uint8))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    try:
+        with pytest.raises(InputError, match="only 0 of 30 frames"):
+            write_film(tmp_path / "a.mp4", noise, [0.1] * 30)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,9 @@ def video(
     seconds: Annotated[
         float | None,
         option(
-            "Length, seconds. Default: 8, or 1 per view with --story or --beside truth.", min=0.1
+            "Length, seconds. Default: 8, or 1 per view with --story or --beside truth.",
+            min=0.1,
+            max=3600,
         ),
     ] = None,
     fps: Annotated[

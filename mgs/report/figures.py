@@ -17,7 +17,6 @@ import numpy as np
 from mgs.colour import srgb_from_linear
 from mgs.data.up import PLUS_Z, Up, upright
 from mgs.plotting import NO_GRID, crop, drawing, literal
-from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.calibration import BINS
 
 if TYPE_CHECKING:
@@ -186,60 +185,29 @@ def _disc(name: str, face: str, edge: str) -> Any:
     return Line2D([], [], markerfacecolor=face, markeredgecolor=edge, label=name, **look)
 
 
-def gain_figure(path: str | Path, gains: Mapping[str, Sequence[float]]) -> None:
-    """Draw the information gain (Eq. 7) of the view that each step selected (the paper's Fig. 2).
-
-    gains: label -> gain of each step after the seeds.
-    """
-    curves = {label: (range(1, len(values) + 1), values) for label, values in gains.items()}
-    panel = (curves, "chosen view", f"information gain ({GAIN_UNIT})")
-    title = "Information that each chosen view promised"
-    _curves_figure(path, [panel], 4.8, title, lambda axes: axes[0].set_ylim(bottom=0))
-
-
-def coverage_figure(path: str | Path, coverage: Curves) -> None:
-    """Draw coverage after each step (the paper's Fig. 3).
-
-    coverage: label -> (number of training images, share of Gaussians observed, 0 to 1), after the
-    seeds and after each step.
-    """
-    percent = {label: (x, 100 * np.asarray(y, float)) for label, (x, y) in coverage.items()}
-    panel = (percent, "images", "Gaussians observed (%)")
-    title = "Gaussians whose colour the images determine"
-    _curves_figure(path, [panel], 4.8, title, lambda axes: axes[0].set_ylim(top=100))
-
-
-def psnr_figure(path: str | Path, panels: Mapping[str, Curves]) -> None:
-    """Draw PSNR against the number of images, a panel for each metric.
-
-    panels: metric and set of views -> label -> (numbers of images, PSNR in dB).
-    """
-    drawn = [(curves, "images", f"{what} (dB)") for what, curves in panels.items()]
-    _curves_figure(path, drawn, 3.6 * len(panels), "Quality after each image")
-
-
-def _curves_figure(
+def curves_figure(
     path: str | Path,
-    panels: Sequence[tuple[Mapping[str, Any], str, str]],
-    width: float,
     title: str,
-    finish: Any = lambda axes: None,
+    panels: Mapping[str, Curves],
+    x: str = "images",
+    **limits: float,
 ) -> None:
-    """Write a figure of panels (curves, x label, y label), one line for each label.
+    """Draw curves beside each other, a panel for each quantity and a line for each label.
 
-    finish: called with the axes before the legend is added.
+    panels: title of the y axis -> curves. x: title of the x axis. limits: of the y axis, `bottom`
+    or `top`.
     """
     from matplotlib.ticker import MaxNLocator
 
-    with drawing(path, width, 3.1) as figure:
+    with drawing(path, max(4.8, 3.6 * len(panels)), 3.1) as figure:
+        figure.suptitle(title)
         axes = figure.subplots(1, len(panels), squeeze=False)[0]
-        for axis, (curves, x, y) in zip(axes, panels, strict=True):
+        for axis, (y, curves) in zip(axes, panels.items(), strict=True):
             for (xs, ys), style in zip(curves.values(), line_styles(curves), strict=True):
                 axis.plot(xs, ys, **style)
             axis.set(xlabel=x, ylabel=y)
+            axis.set_ylim(**limits)
             axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-        figure.suptitle(title)
-        finish(axes)
         _legend_beside(figure)
 
 

@@ -75,11 +75,13 @@ def check_measured(run: Run) -> None:
         )
 
 
-def step_curves(runs: Mapping[str, Run], key: str, factor: float = 1.0) -> Curves:
-    """A number of the steps of each run that has it, against the number of images."""
+def step_curves(
+    runs: Mapping[str, Run], key: str, factor: float = 1.0, x: str = "images"
+) -> Curves:
+    """A number of the steps of each run that has it, against another one."""
     curves = {}
     for name, run in runs.items():
-        points = [(s["images"], factor * s[key]) for s in run.steps if s.get(key) is not None]
+        points = [(s[x], factor * s[key]) for s in run.steps if s.get(key) is not None]
         if points:
             curves[name] = ([x for x, _ in points], [y for _, y in points])
     return curves

@@ -7,6 +7,7 @@ dataset's cameras. Films are MP4, or without any package beside Pillow GIF and a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from mgs.data.dataset import Dataset
 from mgs.data.up import upright
 from mgs.errors import InputError
 from mgs.files import atomic_path
+from mgs.plotting import painted
 from mgs.report.diagnostics import VISIBLE, run_scalars, view_maps
 from mgs.run.folder import Run
 
@@ -103,10 +105,8 @@ def _picture(maps: dict[str, np.ndarray]) -> np.ndarray:
 
 def _unknown(maps: dict[str, np.ndarray]) -> np.ndarray:
     """Map of the variance that is left, sRGB in [0,1] [H,W,3]."""
-    import matplotlib
-
-    colours = matplotlib.colormaps[UNKNOWN](np.clip(maps["uncertainty"], 0, 1))[..., :3]
-    return np.where(maps["A"][..., None] >= VISIBLE, colours, 0).astype(np.float32)
+    visible = maps["A"][..., None] >= VISIBLE
+    return np.where(visible, painted(maps["uncertainty"], UNKNOWN) / np.float32(255), 0)
 
 
 def _resized(image: np.ndarray, camera: Camera) -> np.ndarray:
@@ -142,7 +142,7 @@ def write_film(
     shown = _reported(frames, len(seconds), progress)
     with atomic_path(path) as temporary:
         if kind == ".mp4":
-            _write_mp4(temporary, shown, 1 / seconds[0])
+            _write_mp4(temporary, shown, len(seconds), 1 / seconds[0])
         else:
             _write_animation(temporary, shown, seconds, kind == ".gif")
 
@@ -174,17 +174,23 @@ def _ffmpeg() -> Any:
     return imageio_ffmpeg
 
 
-def _write_mp4(path: Path, frames: Film, rate: float) -> None:
-    """Write frames at a rate (1/s) as H.264."""
-    first = next(frames)
+def _write_mp4(path: Path, frames: Film, count: int, rate: float) -> None:
+    """Write `count` frames at a rate (1/s) as H.264. Raises OSError if not all are in the file,
+    which ffmpeg does not report."""
+    first, ffmpeg = next(frames), _ffmpeg()
     size = (first.shape[1], first.shape[0])
-    writer = _ffmpeg().write_frames(
+    writer = ffmpeg.write_frames(
         str(path), size, fps=rate, codec="libx264", macro_block_size=2, quality=7
     )
     writer.send(None)
     for frame in (first, *frames):
         writer.send(np.ascontiguousarray(frame))
     writer.close()
+    written = 0
+    with suppress(RuntimeError):  # no whole file
+        written, _ = ffmpeg.count_frames_and_secs(str(path))
+    if written != count:
+        raise OSError(f"only {written} of {count} frames could be written")
 
 
 def _write_animation(path: Path, frames: Film, seconds: Sequence[float], gif: bool) -> None:

@@ -13,6 +13,7 @@ from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.evaluation import read_comparison
 from mgs.files import write_json, write_text
+from mgs.policy.criteria import GAIN_UNIT
 from mgs.report import figures
 from mgs.report.runs import (
     check_finished,
@@ -66,7 +67,7 @@ def write_report(
     figures.comparison_figure(paths["comparison"], truth, renders, frame.name, captions)
     if panels := _psnr_panels(compared):
         paths["psnr"] = out / f"psnr.{kind}"
-        figures.psnr_figure(paths["psnr"], panels)
+        figures.curves_figure(paths["psnr"], "Quality after each image", panels)
 
     rows = comparison_rows(compared)
     write_text(out / "table.md", markdown_table(rows))
@@ -84,11 +85,12 @@ def _draw_choices(paths: Mapping[str, Path], runs: Mapping[str, Run]) -> None:
         choices[label] = run.indices[:seeds], run.indices[seeds:]
     world = first.up, first.dataset.unit
     figures.orbit_figure(paths["orbit"], positions, first.gaussians.means, choices, *world)
-    gains = {
-        label: [step["information_gain"] for step in run.steps[1:]] for label, run in runs.items()
-    }
-    figures.gain_figure(paths["gain"], gains)
-    figures.coverage_figure(paths["coverage"], step_curves(runs, "coverage"))
+    gains = step_curves(runs, "information_gain", x="step")
+    title, y = "Information that each chosen view promised", f"information gain ({GAIN_UNIT})"
+    figures.curves_figure(paths["gain"], title, {y: gains}, "chosen view", bottom=0)
+    title, y = "Gaussians whose colour the images determine", "Gaussians observed (%)"
+    covered = step_curves(runs, "coverage", 100)
+    figures.curves_figure(paths["coverage"], title, {y: covered}, top=100)
 
 
 def _comparison(
@@ -166,13 +168,13 @@ def _caption(run: Run, views: str, name: str) -> str:
 
 
 def _psnr_panels(runs: Mapping[str, Run]) -> dict[str, figures.Curves]:
-    """Panels of `psnr_figure`, over the test views or else all views taken; empty without PSNR."""
+    """Panels of PSNR, over the test views or else all views taken; empty without PSNR."""
     on_demand = next(iter(runs.values())).dataset.on_demand
     every = "views taken so far" if on_demand else "all views"
     for prefix, views in (("test_", "test views"), ("", every)):
         panels = {
-            f"PSNR, {views}": step_curves(runs, f"{prefix}psnr"),
-            f"masked PSNR, {views}": step_curves(runs, f"{prefix}psnr_mask"),
+            f"PSNR, {views} (dB)": step_curves(runs, f"{prefix}psnr"),
+            f"masked PSNR, {views} (dB)": step_curves(runs, f"{prefix}psnr_mask"),
         }
         if all(len(curves) == len(runs) for curves in panels.values()):
             return panels
