@@ -185,6 +185,13 @@ class Camera:
         film = self.film and self.film.scaled(factor)
         return Camera(self.K, self.width, self.height, pose, film, self.corner)
 
+    def moved(self, offset: ArrayLike) -> Camera:
+        """Same camera in a world whose positions are moved by an offset [3]."""
+        pose = self.world_to_camera.copy()
+        pose[:3, 3] = -pose[:3, :3] @ (self.position + np.asarray(offset, np.float64))
+        film = self.film and self.film.moved(offset)
+        return Camera(self.K, self.width, self.height, pose, film, self.corner)
+
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """Camera of a window of the image, all four in pixels.
 

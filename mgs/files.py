@@ -261,8 +261,8 @@ def _parsed(path: str | Path, kind: str, parse: Callable[[bytes], Any]) -> Any:
     try:
         with decoding(Path(path)):
             return parse(data)
-    except (ValueError, RecursionError, SyntaxError, csv.Error) as error:
-        # RecursionError: nested too deeply; SyntaxError: of XML
+    except (ValueError, RecursionError, SyntaxError, LookupError, csv.Error) as error:
+        # RecursionError: nested too deeply; SyntaxError: of XML; LookupError: of its encoding
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:200]
         raise InputError(
             f"{path}: not valid {kind} ({reason}); the file is damaged, write it again"

@@ -128,15 +128,17 @@ def _open_image(path: Path, decode: bool = True) -> tuple[Any, bytes]:
 
 def exif_orientation(path: str | Path) -> int:
     """EXIF orientation of an image, 1 (upright) to 8; 1 if absent. From 5 on, width and height are
-    exchanged.
+    exchanged."""
+    from PIL import ExifTags, Image
 
-    Raises InputError as `read_rgba`.
-    """
-    from PIL import ExifTags
-
-    image, _ = _open_image(Path(path))
-    found = image.getexif().get(ExifTags.Base.Orientation, 1)
-    return found if found in range(1, 9) else 1
+    try:
+        with unlimited_headers(), Image.open(path) as image:
+            if image.format == "PNG" and "exif" not in image.info:  # Pillow would decode it all
+                return 1
+            tag = image.getexif().get(ExifTags.Base.Orientation, 1)
+    except (OSError, SyntaxError, ValueError):  # reading it will say why
+        return 1
+    return tag if tag in range(1, 9) else 1
 
 
 def exif_exposure(path: str | Path) -> float | None:
@@ -146,7 +148,7 @@ def exif_exposure(path: str | Path) -> float | None:
 
     base = ExifTags.Base
     try:
-        with Image.open(path) as image:
+        with unlimited_headers(), Image.open(path) as image:
             exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
         tags = base.ExposureTime, base.ISOSpeedRatings, base.FNumber
         time, speed, number = (float(exif[tag]) for tag in tags)
@@ -169,6 +171,40 @@ def read_values(path: str | Path) -> np.ndarray:
             "give one channel of 16 bits, or EXR"
         )
     return np.asarray(image)
+
+
+def read_depth(path: str | Path, unit: float = 1e-3, float_unit: float = 1.0) -> np.ndarray:
+    """Depth in metres, float32 [H,W], from EXR, or an image in steps of `unit` metres; of a TIFF of
+    floating-point numbers in steps of `float_unit`.
+
+    Raises InputError as `read_exr` and `read_values`, for 8 bits, and where it is not plain which
+    channel of an EXR is the depth: it is named Z or depth, in a layer or not, is the only one, or
+    all of R, G and B are equal.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".exr":
+        values = read_values(path)
+        if values.dtype == np.uint8:
+            raise InputError(
+                f"{path}: a picture of 8 bits is no depth; give 16 bits, TIFF of float32, or EXR"
+            )
+        return values.astype(np.float32) * (unit if values.dtype.kind in "ui" else float_unit)
+    channels = read_exr(path)
+    named = [name for name in channels if name.rpartition(".")[2].lower() in ("z", "depth")]
+    if len(named) == 1 or len(channels) == 1:
+        return channels[(named or [*channels])[0]]
+    if "Z" in channels:
+        return channels["Z"]
+    if set(channels) <= set("RGBA") and all(
+        np.array_equal(channels[name], channels["R"], equal_nan=True)
+        for name in channels
+        if name != "A"
+    ):
+        return channels["R"]
+    raise InputError(
+        f"{path}: which of its channels is the depth is not plain ({', '.join(channels)}); "
+        "write one channel, Z"
+    )
 
 
 def read_rgba(path: str | Path) -> np.ndarray:

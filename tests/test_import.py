@@ -23,7 +23,7 @@ from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.data.frames import Frame
 from mgs.data.importers import import_source
-from mgs.data.lens import undistorter
+from mgs.data.lens import Lens, undistorter
 from mgs.data.sources import read_source
 from mgs.files import write_json
 from mgs.images import write_png
@@ -111,7 +111,8 @@ def test_colmap_gives_the_distortion_of_its_lens(dataset, tmp_path):
     lens.model, lens.params = pycolmap.CameraModelId.OPENCV, [*lens.params, *DISTORTION[:4]]
     model.write_binary(tmp_path / "sparse/0")
     for shot in read_source(tmp_path).shots:
-        assert np.allclose(shot.distortion, [*DISTORTION, 0, 0, 0])
+        assert shot.lens.model == "FULL_OPENCV"
+        assert np.allclose(shot.lens.parameters[4:], [*DISTORTION, 0, 0, 0])
 
 
 def _soft(mask: np.ndarray, full: int) -> np.ndarray:
@@ -207,13 +208,24 @@ def test_nerf_synthetic_with_alpha(dataset, tmp_path):
         assert np.array_equal(one.mask(), other.mask())
 
 
-def test_distortion_is_undone(tmp_path):
+FISHEYE = np.array([0.05, -0.01, 0.002, 0.001])
+UNDISTORTERS: dict[str, tuple[Callable[..., Any], np.ndarray, tuple[str, ...]]] = {
+    "OPENCV": (cv2.undistortPoints, DISTORTION, ("k1", "k2", "p1", "p2", "k3")),
+    "OPENCV_FISHEYE": (cv2.fisheye.undistortPoints, FISHEYE, ("k1", "k2", "k3", "k4")),
+}
+
+
+@pytest.mark.parametrize("model", UNDISTORTERS)
+def test_distortion_is_undone(tmp_path, model):
+    points, coefficients, names = UNDISTORTERS[model]
     camera = Camera(np.array([[110.0, 0, 83], [0, 108.0, 57], [0, 0, 1]]), 160, 120, np.eye(4))
     shift = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     pixels = np.indices((120, 160), np.float64)[::-1].reshape(2, -1).T[:, None]
-    seen = cv2.undistortPoints(pixels, camera.K - shift, DISTORTION).reshape(120, 160, 2)
+    seen = points(pixels, camera.K - shift, coefficients).reshape(120, 160, 2)
     distorted = synthetic.albedo(np.dstack([seen, np.ones((120, 160))]))
-    straight, undo = undistorter(camera, DISTORTION)
+    values = dict(zip(names, coefficients.tolist(), strict=True))
+    lens = Lens.of("", model, camera.K, values)
+    straight, undo = undistorter(camera, lens)
     undone = undo(distorted.astype(np.float32), True)
     rays = straight.unproject(np.ones((120, 160)))
     error = np.abs(undone - synthetic.albedo(rays))
@@ -222,14 +234,16 @@ def test_distortion_is_undone(tmp_path):
     # Half a pixel of shift, the mistake that mixes the two pixel-centre conventions, would show.
     shifted = np.abs(undone - synthetic.albedo(rays + np.array([0.5 / 110, 0.5 / 108, 0])))
     assert np.median(shifted) > 5 * np.median(error)
-    same, keep = undistorter(camera, np.zeros(5))
+    assert Lens.of("", "OPENCV", camera.K, {"k1": 0.0}) is None
+    same, keep = undistorter(camera, None)
     assert same is camera
     assert keep(undone, True) is undone
 
     source = synthetic.write_dataset(tmp_path / "src").frames[0]
-    synthetic.edit(tmp_path / "src", lambda data: data.update(LENS))
+    synthetic.edit(tmp_path / "src", lambda data: data.update(values, camera_model=model))
     copy = _import(tmp_path / "src", tmp_path / "copy").frames[0]
-    assert np.allclose(copy.camera.K, undistorter(source.camera, DISTORTION)[0].K)
+    own = Lens.of("", model, source.camera.K, values)
+    assert np.allclose(copy.camera.K, undistorter(source.camera, own)[0].K)
     assert np.isin(copy.depth(), source.depth()).all()  # never blended
     assert 0.3 < copy.mask().sum() / source.mask().sum() < 3
 
@@ -270,9 +284,9 @@ def test_what_is_missing_is_skipped_and_said(dataset, tmp_path, capsys):
     command("import", dataset.root, "--out", tmp_path / "copy")
     out, err = said(capsys)
     assert len(load_dataset(tmp_path / "copy")) == 5
-    assert "3 of 8 listed images do not exist" in err
-    assert f"{dataset.root}/sparse_pc.ply,donotexist;importedwithoutthem" in err.replace(" ", "")
-    assert " 0 points" in out
+    assert "5 frames of 8 images; left out 3 whose file is missing" in out
+    assert f"{dataset.root}/sparse_pc.ply,donotexist" in err.replace(" ", "")
+    assert "points" not in out
     assert not (tmp_path / "copy/sparse.ply").exists()
 
 
@@ -282,7 +296,7 @@ def test_images_are_set_apart_as_test_views(dataset, tmp_path, capsys):
     command(*arguments, out)
     (out / "transforms.json").unlink()  # as if it had been interrupted before its end
     command(*arguments, out)
-    assert said(capsys)[0].count("images, which are never fitted; wrote") == 2
+    assert said(capsys)[0].count("3 test views, which are never fitted") == 2
     made = load_dataset(out)
     tests = made.test_views()
     names = [frame.name for frame in dataset.frames]
@@ -292,7 +306,7 @@ def test_images_are_set_apart_as_test_views(dataset, tmp_path, capsys):
     for frame in dataset.frames[1:]:
         frame.image_path.unlink()
     assert exit_code(*arguments, tmp_path / "none") == 2
-    assert "--test-every 3 of 1 images leaves none to choose from" in said(capsys)[1]
+    assert "1 test views of 1 images leave none to choose from" in said(capsys)[1]
 
 
 def test_masks_by_projecting_a_mesh_or_from_files(dataset, tmp_path, capsys):
@@ -352,7 +366,7 @@ MASKS = ["--masks", "{source}/masks"]
 BAD: dict[str, tuple[Spoil, list[str], str]] = {
     "missing": (lambda root: root / "nowhere", [], "no such file or folder"),
     "angle of view of 0": (no_angle_of_view, [], "no usable intrinsics"),
-    "fisheye": (changed(camera_model="OPENCV_FISHEYE"), [], "not supported"),
+    "panorama": (changed(camera_model="EQUIRECTANGULAR"), [], "not supported"),
     "k4": (changed(k4=0.1), [], "has k4"),
     "nan distortion": (changed(k1=float("nan")), [], "not finite"),
     "duplicate frames": (first("file_path", "images/kf_0001.png"), [], "more than once"),

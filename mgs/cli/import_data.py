@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
 
 from mgs.cli.options import Force, argument, option, parse_up
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
-from mgs.files import Ours, clear_folder
+from mgs.files import Ours, clear_folder, scratch_folder
 
 if TYPE_CHECKING:
-    from mgs.data.sources import Shot
+    from mgs.data.dataset import Dataset
+    from mgs.data.shots import Source
 
 MANY_PIXELS = 2_000_000
 """Pixels of an image beyond which --downscale is recommended."""
@@ -39,7 +42,7 @@ def import_data(
     out: Annotated[Path, option("Folder to write: new, empty, or left by an interrupted import.")],
     images: Annotated[
         Path | None,
-        option("Folder of COLMAP's or Metashape's images (default: images), or topic of a bag."),
+        option("Folder of the images (default: SOURCE/images), or topic of a bag."),
     ] = None,
     keyframes: Annotated[
         str,
@@ -75,6 +78,12 @@ def import_data(
             metavar="N",
         ),
     ] = None,
+    pose: Annotated[
+        str | None,
+        option(
+            "Topic of a bag's poses of the camera, or of the body that carries it.", metavar="TOPIC"
+        ),
+    ] = None,
     split: Annotated[
         str, option("Split of NeRF-synthetic data to import: train, val or test.")
     ] = "train",
@@ -87,11 +96,10 @@ def import_data(
     Partial alpha is kept in rock/, images of the rock alone. Points that came with the cameras are
     kept in sparse.ply for `mgs prior`. The same command continues an interrupted import.
     """
-    from mgs.data.dataset import TEST_FOLDER
+    from mgs.data.bags import is_bag
     from mgs.data.importers import import_source
     from mgs.data.meshes import GLTF
     from mgs.data.sources import read_source
-    from mgs.images import exif_exposure
 
     console, notes = Terminal(), Terminal(stderr=True)
     if masks is not None and mesh is not None:
@@ -99,73 +107,87 @@ def import_data(
             "import: --masks and --mesh both say where masks come from; give one of them"
         )
     unpacked = out.with_name(f"{out.name}.unpacked")
-    found = read_source(source, images, split, keyframes=keyframes, unpack=unpacked)
-    found = found if unit is None else found.in_metres(unit)
-    given = parse_up(up)
-    upward, reason = found.up_or_estimate() if given is None else (given, "as --up says")
-    if force:
-        clear_folder(out, Ours(FILES, [path for path in (source, images, masks, mesh) if path]))
-    finished = os.path.isfile(out / "transforms.json")  # else the import refuses what is there
-    tests, listed = None, found.missing + len(found.shots)
-    if test_every is not None:
-        found, tests = found.set_apart(test_every)
-    with progress_bar("importing", console) as progress:
-        result = import_source(
-            found,
-            out,
-            masks=masks,
-            mesh=mesh,
-            downscale=downscale,
-            up=upward,
-            tests=tests,
-            on_frame=partial(progress, "importing"),
-        )
+    with scratch_folder(unpacked) if is_bag(source) else nullcontext():
+        found = read_source(source, images, split, keyframes=keyframes, unpack=unpacked, pose=pose)
+        found = found if unit is None else found.in_metres(unit)
+        given = parse_up(up)
+        upward, reason = found.up_or_estimate() if given is None else (given, "as --up says")
+        if force:
+            clear_folder(out, Ours(FILES, [path for path in (source, images, masks, mesh) if path]))
+        finished = os.path.isfile(out / "transforms.json")  # else the import refuses what is there
+        source_shots, tests = found.set_apart(test_every)
+        with progress_bar("importing", console) as progress:
+            result = import_source(
+                source_shots,
+                out,
+                masks=masks,
+                mesh=mesh,
+                downscale=downscale,
+                up=upward,
+                tests=tests,
+                on_frame=partial(progress, "importing"),
+            )
     if mesh is not None and mesh.suffix.lower() in GLTF:
         console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
-    if found.missing:
-        notes.print(f"mgs: {found.missing} of {listed} listed images do not exist; skipped them")
+    for note in [*found.notes, *_advice(found, result)]:
+        notes.print(f"mgs: {note}", soft_wrap=True)
+    _print_summary(console, found, tests, result, f"up {_numbers(upward)}, {reason}")
+    console.print(f"{out} is finished already" if finished else f"wrote {out}", soft_wrap=True)
+
+
+def _advice(found: Source, result: Dataset) -> Iterator[str]:
+    """Lines on what the user should know or may want to do."""
+    from mgs.images import exif_exposure
+
     if found.no_cloud:
-        notes.print(
-            f"mgs: the points that {source.name} names, {found.no_cloud}, do not exist; "
-            "imported without them"
+        yield f"the points that the source names, {found.no_cloud}, do not exist"
+    if any(found.origin):
+        yield (
+            "the cameras are far from the origin, where float32 is coarse: "
+            f"{_numbers(found.origin)} is subtracted from all positions, and added again in "
+            "flight plans"
         )
-    axis = ", ".join(f"{value:.4g}" for value in upward)
-    lengths = "metres" if result.unit == "m" else f"in {result.unit}s (no --unit was given)"
-    console.print(f"up is ({axis}): {reason}; lengths are {lengths}")
     stops = [value for shot in found.shots if (value := exif_exposure(shot.image)) is not None]
     if stops and max(stops) - min(stops) > EXPOSURE_DIFFERS:
-        notes.print(
-            f"mgs: by their EXIF, exposure differs by up to {max(stops) - min(stops):.1f} stops "
+        yield (
+            f"by their EXIF, exposure differs by up to {max(stops) - min(stops):.1f} stops "
             "between photographs; `mgs fit --exposure` estimates a gain for each"
         )
     camera = result.frames[0].camera
     if camera.width * camera.height > MANY_PIXELS:
-        notes.print(
-            f"mgs: images of {camera.width}x{camera.height} take long to fit; "
+        yield (
+            f"images of {camera.width}x{camera.height} take long to fit; "
             "--downscale 2 or more makes them smaller"
         )
-    masked = sum(frame.mask_path is not None for frame in result.frames)
-    layered = sum(frame.rock_path is not None for frame in result.frames)
-    deep = sum(frame.depth_path is not None for frame in result.frames)
-    undone = sum(shot.distortion.any() for shot in found.shots)
-    points = 0 if found.sparse is None else len(found.sparse.points)
-    console.print(
-        f"{found.kind}: {len(result)} frames, {masked} with mask, {layered} with alpha, "
-        f"{deep} with depth, {undone} undistorted, {points:,} points; "
-        + (f"{out} is finished already" if finished else f"wrote {out}")
-    )
-    if tests is not None:
-        console.print(
-            f"test views: {len(tests.shots)} images, which are never fitted; "
-            f"wrote {out / TEST_FOLDER}"
-        )
-    _tidy([*found.shots, *(tests.shots if tests else ())], unpacked)
 
 
-def _tidy(shots: Sequence[Shot], unpacked: Path) -> None:
-    """Remove the files that were unpacked of a bag."""
-    for path in (path for shot in shots for path in (shot.image, shot.depth) if path):
-        if path.parent == unpacked:
-            path.unlink(missing_ok=True)
-    with suppress(OSError):
-        unpacked.rmdir()
+def _print_summary(
+    console: Terminal, found: Source, tests: Source | None, result: Dataset, up: str
+) -> None:
+    """Print what was imported of what was listed, and in which world."""
+    frames, apart = result.frames, len(tests.shots) if tests else 0
+    total = len(found.shots) + found.left_out.total()
+    without = ", ".join(f"{count} {reason}" for reason, count in found.left_out.items())
+    counts = {
+        "with mask": sum(frame.mask_path is not None for frame in frames),
+        "with alpha": sum(frame.rock_path is not None for frame in frames),
+        "with depth": sum(frame.depth_path is not None for frame in frames),
+        "undistorted": sum(shot.lens is not None for shot in found.shots),
+        "turned by EXIF": sum(shot.turned for shot in found.shots),
+    }
+    lengths = "metres" if result.unit == "m" else f"{result.unit}s (give --unit)"
+    parts = [
+        f"{found.kind}: {len(frames)} frames of {total} images",
+        *([f"{apart} test views, which are never fitted"] if apart else []),
+        *([f"left out {without}"] if without else []),
+        *(f"{count} {what}" for what, count in counts.items() if count),
+        *([f"{len(found.sparse.points):,} points"] if found.sparse else []),
+        up,
+        f"lengths in {lengths}",
+        f"origin {_numbers(found.origin)}",
+    ]
+    console.print("; ".join(parts), soft_wrap=True)
+
+
+def _numbers(vector: Sequence[float]) -> str:
+    return f"({', '.join(f'{value:.10g}' for value in np.round(vector, 4))})"

@@ -1,24 +1,31 @@
 """ROS 1 and ROS 2 bags, read by rosbags: camera_info, colour, depth, and poses.
 
-Poses come from tf, odometry or PoseStamped, as a chain of frames from that of the images to the
-root, which becomes the world. Keyframes are unpacked into files.
+Poses are a chain of frames from that of the images to the root, which becomes the world. Its steps
+come from tf, else from odometry; a PoseStamped counts only where the user names its topic.
+Keyframes are unpacked into files.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mgs.camera import Camera
-from mgs.data.tracks import Spacing, Track, rigid
+from mgs.data.lens import Lens
+from mgs.data.shots import Shot, Source, poses_agree
+from mgs.data.tracks import Spacing, Track, posed, rigid
 from mgs.errors import InputError
-from mgs.files import atomic_path, parsing
+from mgs.files import atomic_path, parsing, read_bytes, reading
 from mgs.images import read_values, write_png
+
+STORAGE = (".mcap", ".db3")
+"""Endings of the files of a ROS 2 bag."""
 
 KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 
@@ -38,15 +45,23 @@ DEPTHS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
 DEPTH_HEADER = 12
 """Bytes before the PNG of a compressedDepth image: a number, and a and b as float32."""
 
-LENSES = ("plumb_bob", "rational_polynomial", "")
+LENSES = {
+    **dict.fromkeys(("plumb_bob", "rational_polynomial", ""), ("k1", "k2", "p1", "p2", "k3")),
+    **dict.fromkeys(("equidistant", "fisheye"), ("k1", "k2", "k3", "k4")),
+}
+"""Distortion model of a camera_info -> names of its first coefficients."""
+
+YAML_BYTES = 1 << 20
+"""Most bytes of the metadata of a bag."""
 
 SYNCHRONOUS = 0.05
 """Largest difference of the times of a colour and its depth image, seconds."""
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a ROS 1 bag file or a ROS 2 bag folder."""
-    return (path.is_file() and path.suffix == ".bag") or (path / "metadata.yaml").is_file()
+    """Whether a path is a ROS 1 bag file, or a ROS 2 bag: its folder, or a file of it."""
+    named = path.suffix in (".bag", *STORAGE) and not path.is_dir()
+    return named or (path / "metadata.yaml").exists()
 
 
 @contextmanager
@@ -61,6 +76,13 @@ def opened(path: Path) -> Iterator[Any]:
             f"{path}: is a ROS bag, and rosbags, which reads it, is not installed; "
             "`pip install mgs[ros]`"
         ) from None
+    if path.suffix in STORAGE and (path.parent / "metadata.yaml").is_file():
+        path = path.parent
+    for file in path.iterdir() if path.is_dir() else [path]:
+        with reading(file, "ROS bag"):  # no pipe, which would never end
+            pass
+    if (path / "metadata.yaml").is_file():
+        read_bytes(path / "metadata.yaml", most=YAML_BYTES)
     with (
         parsing(path, "ROS bag", "record it again"),
         AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader,
@@ -92,31 +114,68 @@ def frame_of(message: Any) -> str:
     return str(message.header.frame_id).lstrip("/")
 
 
+def message_of(pose: Any) -> np.ndarray:
+    """Matrix [4,4] of a Transform, Pose, or PoseWithCovariance."""
+    pose = getattr(pose, "pose", pose)
+    place = getattr(pose, "translation", None) or pose.position
+    turn = getattr(pose, "rotation", None) or pose.orientation
+    return rigid((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
+
+
+Samples = dict[str, list[tuple[float, np.ndarray]]]
+"""Parent -> (time, child-to-parent)."""
+
+
 class Tree:
-    """Frames of a bag: each with its parent, and the transforms to that over time."""
+    """Frames of a bag: each with its parent, and the transforms to that over time.
 
-    def __init__(self, reader: Any, camera: str) -> None:
-        samples: dict[str, list[tuple[float, np.ndarray]]] = defaultdict(list)
+    topic: of poses that take precedence; of a PoseStamped they are those of the frame that static
+    transforms make the root of the camera, or of the camera. Raises InputError where a step has two
+    sources, or the topic no poses.
+    """
+
+    def __init__(self, path: Path, reader: Any, camera: str, topic: str | None) -> None:
+        sources: dict[str, dict[str, Samples]] = defaultdict(lambda: defaultdict(dict))
+        chosen = "" if topic is None else topic
+        for name, message in messages(reader, "TFMessage", "tfMessage", "Odometry", topic=topic):
+            for each in getattr(message, "transforms", None) or [message]:
+                child = str(getattr(each, "child_frame_id", "")).lstrip("/")
+                pose = message_of(each.transform if hasattr(each, "transform") else each.pose)
+                kind = "tf" if hasattr(each, "transform") else name
+                time = 0.0 if "static" in name else seconds(each)
+                if frame_of(each) != child:
+                    steps = sources[child][kind].setdefault(frame_of(each), [])
+                    steps.append((time, pose))
+        stamped = sources.pop("", {})  # a PoseStamped names no child
         self.parents: dict[str, str] = {}
-        for topic, message in messages(reader, "TFMessage", "tfMessage", "Odometry", "PoseStamped"):
-            for time, parent, child, pose in self._edges(message, camera):
-                if parent != child and (child not in self.parents or self.parents[child] == parent):
-                    self.parents[child] = parent
-                    samples[child].append((0.0 if "static" in topic else time, pose))
-        self.tracks = {child: Track.of(given) for child, given in samples.items()}
+        self.tracks: dict[str, Track] = {}
+        self.unused: list[str] = []
+        for child, by_kind in sources.items():
+            self._add(path, child, by_kind, chosen)
+        if topic is not None and stamped:
+            body = camera
+            while body in self.parents and len(self.tracks[body].times) == 1:
+                body = self.parents[body]
+            self._add(path, body, stamped, chosen)
+        elif topic is not None and not any(topic in by_kind for by_kind in sources.values()):
+            raise InputError(f"{path}: --pose {topic} has no poses; it has {_pose_topics(reader)}")
 
-    @staticmethod
-    def _edges(message: Any, camera: str) -> Iterator[tuple[float, str, str, np.ndarray]]:
-        """(time, parent, child, child-to-parent) of a message."""
-        for each in getattr(message, "transforms", None) or [message]:
-            if hasattr(each, "transform"):
-                place, turn = each.transform.translation, each.transform.rotation
-            else:
-                pose = getattr(each.pose, "pose", each.pose)
-                place, turn = pose.position, pose.orientation
-            child = str(getattr(each, "child_frame_id", "")).lstrip("/") or camera
-            matrix = rigid((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
-            yield seconds(each), frame_of(each), child, matrix
+    def _add(self, path: Path, child: str, by_kind: dict[str, Samples], chosen: str) -> None:
+        """Add the step of a frame: by the topic that is chosen, else tf, else the only one."""
+        kind = next((name for name in (chosen, "tf") if name in by_kind), min(by_kind))
+        others = sorted({*by_kind} - {kind})
+        if others and kind not in (chosen, "tf"):
+            raise InputError(
+                f"{path}: poses of {child} come from {kind} and {others[0]}; give one as --pose"
+            )
+        self.unused += [f"{name} (tf has the poses of {child})" for name in others]
+        parent = max(by_kind[kind], key=lambda name: len(by_kind[kind][name]))
+        if len(by_kind[kind]) > 1:
+            raise InputError(
+                f"{path}: {kind} has two parents of {child}: {', '.join(sorted(by_kind[kind]))}; "
+                "give the topic of the right poses as --pose"
+            )
+        self.parents[child], self.tracks[child] = parent, Track.of(by_kind[kind][parent])
 
     def pose(self, camera: str, time: float) -> np.ndarray | None:
         """Camera-to-world [4,4]; None where a transform is not known at this time."""
@@ -130,43 +189,62 @@ class Tree:
         return pose
 
 
-def read_bag(path: Path, unpack: Path, topic: str | None, spacing: Spacing) -> list[dict[str, Any]]:
-    """Keyframes of a bag, unpacked into a folder: name, camera, distortion, timestamp, image, depth
-    and depth_unit of each, fields of `mgs.data.sources.Shot`.
+def _pose_topics(reader: Any) -> str:
+    """Topics of poses that could be given as --pose."""
+    kinds = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry")
+    found = [one.topic for one in reader.connections if one.msgtype.rpartition("/")[2] in kinds]
+    return ", ".join(sorted(set(found))) or "none"
 
-    topic: of the colour images; needed where there are several. Raises InputError where the bag has
-    no colour images, calibration or poses of them, and as `opened`.
+
+def read_bag(
+    path: Path, unpack: Path, topic: str | None, poses: str | None, spacing: Spacing
+) -> Source:
+    """Keyframes of a bag, unpacked into a folder.
+
+    topic: of the colour images; needed where there are several. poses: topic of poses, `Tree`.
+    Raises InputError where the bag has no colour images, calibration or poses of them, or they
+    never move, and as `opened`.
     """
     with opened(path) as reader:
         topic = colour_topic(path, reader, topic)
-        camera_at, distortion, frame = _lens(path, reader, topic)
-        tree = Tree(reader, frame)
+        camera_at, lens, frame = _lens(path, reader, topic)
+        tree = Tree(path, reader, frame, poses)
+        times = dict.fromkeys(seconds(message) for _, message in messages(reader, topic=topic))
+        left_out = Counter[str]()
+        there = posed(times, lambda time: tree.pose(frame, time), left_out)
+        others = _pose_topics(reader)
+        give = f"; if {others} has poses of the camera, give --pose" if others != "none" else ""
         if frame not in tree.parents:
             raise InputError(
-                f"{path}: no tf, odometry or pose leads to {frame or 'the frame'} of {topic}; "
-                "record /tf and /tf_static with it"
+                f"{path}: no tf or odometry leads to {frame or 'the frame'} of {topic}; "
+                f"record /tf and /tf_static with it{give}"
             )
-        times = [seconds(message) for _, message in messages(reader, topic=topic)]
-        posed = [(t, pose) for t in times if (pose := tree.pose(frame, t)) is not None]
-        if not posed:
+        if not there:
             raise InputError(
                 f"{path}: no image of {topic} has a pose at its time; "
                 "record poses and images together, by one clock"
             )
-        kept = dict(posed[k] for k in spacing.choose(posed))
-        shots: dict[float, dict[str, Any]] = {}
+        if len(there) > 1 and poses_agree([pose for _, pose in there]):
+            raise InputError(
+                f"{path}: the camera does not move: the transforms that lead to {frame} are "
+                f"constant; record what moves it{give}"
+            )
+        keyframes = dict(there[k] for k in spacing.choose(there))
+        shots: dict[float, Shot] = {}
+        start = next(iter(times))
         for _, message in messages(reader, topic=topic):
-            if (time := seconds(message)) in kept and time not in shots:
-                name = f"kf_{len(shots):04d}"
-                shots[time] = {
-                    "name": name,
-                    "camera": camera_at(np.linalg.inv(kept[time])),
-                    "distortion": distortion,
-                    "timestamp": time - times[0],
-                    "image": unpack_colour(path, message, unpack / name),
-                }
-        _unpack_depth(reader, unpack, frame, shots)
-    return list(shots.values())
+            if (time := seconds(message)) in keyframes and time not in shots:
+                name, camera = f"kf_{len(shots):04d}", camera_at(np.linalg.inv(keyframes[time]))
+                image = unpack_colour(path, message, unpack / name)
+                shots[time] = Shot(name, camera, lens, time - start, image)
+        notes = [f"did not use the poses of {name}" for name in tree.unused]
+        if "optical" not in frame.lower() and "optical" not in topic:
+            notes.append(
+                f"frame {frame} of {topic} is not named an optical one; the camera is taken to "
+                "look along its z axis, with y down (REP 103)"
+            )
+        notes += _unpack_depth(reader, unpack, frame, shots)
+    return Source("ROS bag", [*shots.values()], +left_out, tuple(notes), unit="m")
 
 
 def colour_topic(path: Path, reader: Any, topic: str | None) -> str:
@@ -181,8 +259,8 @@ def colour_topic(path: Path, reader: Any, topic: str | None) -> str:
     return colours[0]
 
 
-def _lens(path: Path, reader: Any, topic: str) -> tuple[Any, np.ndarray, str]:
-    """Camera of a pose, distortion, and frame of the images of a topic, by its camera_info."""
+def _lens(path: Path, reader: Any, topic: str) -> tuple[Any, Lens | None, str]:
+    """Camera of a pose, lens, and frame of the images of a topic, by its camera_info."""
     _, image = next(messages(reader, topic=topic), (None, None))
     if image is None:
         raise InputError(f"{path}: {topic} has no images; record it again")
@@ -198,15 +276,21 @@ def _lens(path: Path, reader: Any, topic: str) -> tuple[Any, np.ndarray, str]:
     if rectified:
         P = np.asarray(getattr(info, "p", getattr(info, "P", None)), np.float64)
         K, D = P.reshape(3, 4)[:, :3].copy(), np.zeros(5)
-    if D.any() and (info.distortion_model not in LENSES or len(D) > 8):
+    names = LENSES.get(info.distortion_model, ())
+    if D.any() and (not names or len(D) > 8):
         raise InputError(
             f"{path}: the lens of {topic} is {info.distortion_model}, which is not supported; "
             "give the topic of its rectified images as `images`"
         )
     K[:2, 2] += 0.5  # from pixel centres at whole numbers to ours
-    D = np.concatenate([D, np.zeros(max(0, 5 - len(D)))])
-    size = int(info.width), int(info.height)
-    return lambda pose: Camera(K, *size, pose), D, frame_of(image)
+    size, model = (int(info.width), int(info.height)), "FULL_OPENCV"
+    if len(names) == 4:
+        model = "OPENCV_FISHEYE"
+    else:
+        names = (*names, "k4", "k5", "k6")
+    values = dict(zip(names, D.tolist(), strict=False))
+    lens = None if rectified else Lens.of(f"{path}: {topic}", model, K, values)
+    return lambda pose: Camera(K, *size, pose), lens, frame_of(image)
 
 
 def unpack_colour(path: Path, message: Any, stem: Path) -> Path:
@@ -265,25 +349,33 @@ def _metres(message: Any, scratch: Path) -> np.ndarray | None:
         return np.where(steps > 0, a / (steps - b), np.float32(0))
 
 
-def _unpack_depth(
-    reader: Any, unpack: Path, frame: str, shots: dict[float, dict[str, Any]]
-) -> None:
-    """Write the depth image nearest in time to each keyframe, and add it to the keyframe.
+def _unpack_depth(reader: Any, unpack: Path, frame: str, shots: dict[float, Shot]) -> list[str]:
+    """Write the depth image nearest in time to each keyframe, and add it to the keyframe; notes for
+    the user.
 
     Only images in the frame of the colour images count: others are not aligned with them.
     """
     from mgs.images import write_exr
 
     times, gaps = np.array(list(shots)), dict.fromkeys(shots, SYNCHRONOUS)
+    notes = dict[str, None]()
     for topic, message in messages(reader, *KINDS):
-        if "depth" not in topic.lower() or frame_of(message) != frame:
+        if "depth" not in topic.lower():
+            continue
+        if frame_of(message) != frame:
+            why = f"it is of frame {frame_of(message)}, not aligned with the colour images"
+            notes[f"left out the depth of {topic}: {why} of {frame}"] = None
             continue
         time = float(times[np.argmin(np.abs(times - seconds(message)))])
         gap = abs(time - seconds(message))
         if gap >= gaps[time]:
             continue
-        file = unpack / f"{shots[time]['name']}.exr"
+        file = unpack / f"{shots[time].name}.exr"
         metres = _metres(message, file.with_suffix(".depth"))
-        if metres is not None:
-            write_exr(file, {"Z": np.nan_to_num(metres, posinf=0, neginf=0)})
-            gaps[time], shots[time]["depth"] = gap, file
+        if metres is None:
+            kind = getattr(message, "encoding", "") or message.format
+            notes[f"left out the depth of {topic}: {kind!r} is not supported"] = None
+            continue
+        write_exr(file, {"Z": np.nan_to_num(metres, posinf=0, neginf=0)})
+        gaps[time], shots[time] = gap, replace(shots[time], depth=file)
+    return [*notes]

@@ -4,29 +4,18 @@ from __future__ import annotations
 
 import struct
 from functools import cache
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud
+from mgs.data.dataset import FRAME_INTERVAL
+from mgs.data.lens import Lens
+from mgs.data.shots import Shot, Source, frame_name, natural
 from mgs.errors import InputError
 from mgs.files import parsing, reading
-
-OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-"""Coefficients of OpenCV's rational distortion model, in its order."""
-
-MODELS: dict[str, tuple[str, ...]] = {
-    "SIMPLE_PINHOLE": (),
-    "PINHOLE": (),
-    "SIMPLE_RADIAL": ("k1",),
-    "RADIAL": ("k1", "k2"),
-    "OPENCV": ("k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": OPENCV_ORDER,
-}
-"""COLMAP camera model -> its distortion coefficients, the last entries of its parameters."""
-
 
 RECORDS = {
     "cameras.bin": (24, False, "", 0),
@@ -83,7 +72,15 @@ def _bytes_of_sensors(data: bytes, place: int) -> int:
     return end - place
 
 
-def is_model(folder: Path) -> bool:
+def models_in(source: Path) -> list[Path]:
+    """Folders of COLMAP models: those of sparse/0, sparse/1 and so on; else sparse, or the folder
+    itself."""
+    parts = sorted(source.glob("sparse/*/"), key=natural)
+    found = [folder for folder in parts if _is_model(folder)]
+    return found or [folder for folder in (source / "sparse", source) if _is_model(folder)][:1]
+
+
+def _is_model(folder: Path) -> bool:
     """Whether a folder holds the three files of a model."""
     return any(
         all((folder / f"{name}.{kind}").is_file() for name in ("cameras", "images", "points3D"))
@@ -91,12 +88,43 @@ def is_model(folder: Path) -> bool:
     )
 
 
-def read_model(model: Path) -> tuple[list[tuple[str, Camera, np.ndarray]], SparseCloud | None]:
-    """Images of a model, sorted by name, and its points: ([(name, camera, distortion)], cloud).
+def read_colmap(source: Path, models: list[Path], images: Path) -> Source:
+    """The largest of the models in a folder: images sorted by name, and points.
 
-    distortion: eight coefficients in OPENCV_ORDER. Raises InputError if the model is damaged or a
-    lens is not supported.
+    images: folder of the images. Raises InputError if the model is damaged, its text has lost
+    lines, or a lens is not supported.
     """
+    sizes = {model: _image_count(model) for model in models}
+    model = max(models, key=lambda one: sizes[one])
+    notes = []
+    if len(models) > 1:
+        others = ", ".join(f"{one.name}: {sizes[one]}" for one in models if one != model)
+        notes.append(
+            f"took the largest model, {model.name}, of {sizes[model]} images; {source.name} has "
+            f"others ({others}), each in a world of its own"
+        )
+    reconstruction, names = _opened(model)
+    shots = []
+    ordered = sorted(reconstruction.images.values(), key=lambda image: names[image.image_id])
+    for index, image in enumerate(ordered):
+        name = names[image.image_id]
+        camera, lens = _camera(f"{model}: image {name!r}", image)
+        path = images / PureWindowsPath(name) if not (images / name).exists() else images / name
+        shots.append(Shot(frame_name(name), camera, lens, FRAME_INTERVAL * index, path))
+    return Source("COLMAP", shots, notes=tuple(notes), sparse=_cloud(reconstruction))
+
+
+def _image_count(model: Path) -> int:
+    """Number of images of a model."""
+    path = model / "images.bin"
+    if not path.is_file():
+        return len(_names_in_text(model / "images.txt"))
+    with reading(path), path.open("rb") as file:
+        return int.from_bytes(file.read(8), "little")
+
+
+def _opened(model: Path) -> tuple[Any, dict[int, str]]:
+    """The reconstruction of pycolmap, and the names of its images by their numbers."""
     import pycolmap
 
     for file in RECORDS:
@@ -104,32 +132,68 @@ def read_model(model: Path) -> tuple[list[tuple[str, Camera, np.ndarray]], Spars
             raise InputError(f"{model / file}: is damaged or cut off; export the model again")
     with parsing(model, "COLMAP model", "export it again"):
         reconstruction = pycolmap.Reconstruction(model)
-        return _images(model, reconstruction), _cloud(reconstruction)
+    names = {number: image.name for number, image in reconstruction.images.items()}
+    if (model / "images.bin").is_file():
+        return reconstruction, names
+    listed = _names_in_text(model / "images.txt")  # pycolmap ends names at a space
+    if set(listed) != set(names):
+        raise InputError(
+            f"{model / 'images.txt'}: lists {len(listed)} images, of which {len(names)} can be "
+            "read; the file is cut off or damaged, export it again"
+        )
+    return reconstruction, listed
 
 
-def _images(model: Path, reconstruction: Any) -> list[tuple[str, Camera, np.ndarray]]:
-    """Images of a model as in `read_model`."""
-    images = []
-    for image in sorted(reconstruction.images.values(), key=lambda image: image.name):
-        lens = image.camera
-        keys = MODELS.get(lens.model_name)
-        if keys is None:
+def _names_in_text(path: Path) -> dict[int, str]:
+    """Names of the images in an images.txt by their numbers. Each has two lines, the second for its
+    points. Raises InputError where these lines are missing."""
+    with reading(path):
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    names, points = dict[int, str](), False
+    for line in lines:
+        words = line.split(maxsplit=9)
+        if points and (len(line.split()) % 3 or not all(map(_is_number, line.split()[-3:]))):
             raise InputError(
-                f"{model}: camera model {lens.model_name} is not supported; "
-                "run COLMAP's image_undistorter first"
+                f"{path}: has no line of points after that of image {list(names.values())[-1]!r}; "
+                "each image has two lines, and the second may be empty"
             )
-        pose, world = np.eye(4), image.cam_from_world()
-        if not np.linalg.norm(world.rotation.quat) > 0.5:  # pycolmap normalises all but 0
-            raise InputError(f"{model}: image {image.name!r}: its quaternion is 0; export it again")
-        pose[:3] = world.matrix()
-        try:
-            camera = Camera(lens.calibration_matrix(), lens.width, lens.height, pose)
-        except InputError as error:
-            raise InputError(f"{model}: image {image.name!r}: {error}") from None
-        values = dict(zip(keys, lens.params[len(lens.params) - len(keys) :], strict=True))
-        distortion = np.array([values.get(key, 0.0) for key in OPENCV_ORDER])
-        images.append((image.name, camera, distortion))
-    return images
+        if points or not words or words[0].startswith("#"):
+            points = False
+            continue
+        if len(words) < 10 or not words[0].isdecimal():
+            raise InputError(f"{path}: {line[:60]!r} is no line of an image; export it again")
+        names[int(words[0])] = words[9].rstrip()
+        points = True
+    return names
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _camera(where: str, image: Any) -> tuple[Camera, Lens | None]:
+    """Camera and lens of an image of pycolmap."""
+    lens = image.camera
+    pose, world = np.eye(4), image.cam_from_world()
+    if not np.linalg.norm(world.rotation.quat) > 0.5:  # pycolmap normalises all but 0
+        raise InputError(f"{where}: its quaternion is 0; export it again")
+    pose[:3] = world.matrix()
+    names = [name.strip() for name in lens.params_info.split(",")]
+    values = dict(zip(names, lens.params, strict=True))
+    if lens.model_name in ("SIMPLE_RADIAL", "SIMPLE_RADIAL_FISHEYE"):
+        values["k1"] = values.pop("k")
+    intrinsic = ("f", "fx", "fy", "cx", "cy")
+    rest = {name: value for name, value in values.items() if name not in intrinsic}
+    K = np.eye(3) if "w" in names else lens.calibration_matrix()
+    found = Lens.of(where, lens.model_name, K, rest)
+    try:
+        return Camera(K, lens.width, lens.height, pose), found
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def _cloud(reconstruction: Any) -> SparseCloud | None:

@@ -42,18 +42,22 @@ FILES = {
 """Path fields of `Frame` -> their keys in transforms.json."""
 
 
+Position = tuple[float, float, float]
+
+
 @dataclass(frozen=True, repr=False)
 class Dataset:
     """A folder of keyframes in order of time.
 
     up: unit vector that points upwards in the world. unit: unit of length, "m", or "unit" if
-    unknown.
+    unknown. origin: position of the world's origin in the data that was imported.
     """
 
     root: Path
     frames: tuple[Frame, ...]
     up: Up = PLUS_Z
     unit: str = "m"
+    origin: Position = (0.0, 0.0, 0.0)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -124,7 +128,7 @@ def load_dataset(root: str | Path, *, to_capture: bool = False) -> Dataset:
             )
     ordered = tuple(sorted(frames, key=lambda frame: (frame.timestamp, frame.name)))
     up = unit_up(data["up"]) if data.get("up") else PLUS_Z
-    return Dataset(root, ordered, up, unit_of(path, data) or "m")
+    return Dataset(root, ordered, up, unit_of(path, data) or "m", _origin_of(path, data))
 
 
 def load_cameras(path: str | Path, like: Camera | None = None) -> list[tuple[str, Camera]]:
@@ -237,6 +241,15 @@ def unit_of(path: Path, data: dict[str, Any]) -> str | None:
     return unit or None
 
 
+def _origin_of(path: Path, data: dict[str, Any]) -> Position:
+    """Origin in a transforms.json. Raises InputError unless it is three finite numbers."""
+    given = data.get("origin", [0.0, 0.0, 0.0])
+    if not isinstance(given, list) or len(given) != 3:
+        raise InputError(f"{path}: its origin is no list of three numbers; correct it")
+    x, y, z = (finite_number(str(path), "origin", value) for value in given)
+    return x, y, z
+
+
 def _frame(
     path: Path, data: dict[str, Any], index: int, record: dict[str, Any], to_capture: bool
 ) -> Frame:
@@ -268,17 +281,19 @@ def write_transforms(
     up: Up = PLUS_Z,
     unit: str = "m",
     notes: dict[str, str] | None = None,
+    origin: Position = (0.0, 0.0, 0.0),
 ) -> None:
     """Write transforms.json into the folder `root`, with paths relative to it.
 
-    up, unit: as `Dataset`. notes: more entries, for people. Frames are either all on demand
+    up, unit, origin: as `Dataset`. notes: more entries, for people. Frames are either all on demand
     or none. Intrinsics equal to those of the first frame are written once. Write this file last:
     its presence marks a complete dataset.
     """
     root = Path(root)
     header: dict[str, Any] = {"camera_model": "OPENCV", **intrinsics(frames[0].camera)}
     # Default: +Z and metres.
-    world = {"up": list(up), "unit": unit} if (up, unit) != (PLUS_Z, "m") else {}
+    world: dict[str, Any] = {"up": list(up), "unit": unit} if (up, unit) != (PLUS_Z, "m") else {}
+    world |= {"origin": list(origin)} if any(origin) else {}
     demand = {"on_demand": True} if frames[0].on_demand else {}
     records = []
     for frame in frames:

@@ -11,7 +11,7 @@ from mgs.camera import Camera
 from mgs.data.rock_image import boundary, read_rock_image
 from mgs.errors import InputError
 from mgs.files import read_json
-from mgs.images import image_size, read_exr, read_mask, read_png
+from mgs.images import image_size, read_depth, read_mask, read_png
 
 SURVEY_FOLDER = "survey"
 """Subfolder of an on-demand dataset with its survey, itself a dataset: depth and masks only."""
@@ -53,8 +53,7 @@ class Frame:
             raise InputError(
                 f"frame {self.name}: has no depth_file_path; this command needs RGB-D frames"
             )
-        channels = read_exr(self._existing(self.depth_path))
-        depth = channels.get("Z", next(iter(channels.values())))
+        depth = read_depth(self._existing(self.depth_path))
         return np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
 
     def mask(self) -> np.ndarray:

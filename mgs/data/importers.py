@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,14 +16,21 @@ from mgs.camera import Camera
 from mgs.data.clouds import write_cloud
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, resumes, write_transforms
 from mgs.data.frames import Frame
-from mgs.data.lens import Undo, read_fitting, shrunk, undistorter
+from mgs.data.lens import Undo, read_fitting, shrunk, shrunk_to, undistorter
 from mgs.data.meshes import Mesh, read_mesh
 from mgs.data.rock_image import premultiplied, write_rock_image
-from mgs.data.sources import Shot, Source, find_image
+from mgs.data.shots import Shot, Source
+from mgs.data.sources import find_image
 from mgs.data.up import PLUS_Z, Up
-from mgs.errors import InputError
+from mgs.errors import InputError, Notice
 from mgs.files import copy_file, fingerprint, folder_locked, remove_file, write_json
-from mgs.images import read_exr, read_mask, read_rgba, read_values, write_exr, write_png
+from mgs.images import PNG_BIT_DEPTH, read_depth, read_mask, read_rgba, write_exr, write_png
+
+CHECKED = 4
+"""About the number of pictures that are checked before an import."""
+
+SMALL = 40_000
+"""Pixels of a picture in which a mesh is searched."""
 
 RECORD = "import.json"
 """Record of what is imported; an interrupted import of the same continues."""
@@ -55,11 +63,12 @@ def import_source(
     `out` holds anything else or is locked by another process. Finished frames are kept.
     """
     shots, silhouette = source.shots, None
+    every = [*shots, *(tests.shots if tests else ())]
     if masks is not None:
-        shots = [replace(shot, mask=_mask_file(masks, shot), rock=None) for shot in shots]
+        shots = [replace(shot, mask=_mask_file(masks, shot, every), rock=None) for shot in shots]
     elif mesh is not None:
         shots = [replace(shot, mask=None, rock=None) for shot in shots]
-        silhouette = silhouette_of(read_mesh(mesh))
+        silhouette = silhouette_of(in_sight(mesh, read_mesh(mesh), shots, source.origin))
     asked = {
         "kind": source.kind,
         "frames": len(shots),
@@ -76,6 +85,7 @@ def import_source(
             if not (out / RECORD).is_file():
                 write_json(out / RECORD, asked)
 
+        _warn_of_bits(shots)
         frames = []
         for k, shot in enumerate(shots):
             if on_frame:
@@ -93,19 +103,31 @@ def import_source(
                 up=up,
                 on_frame=on_frame,
             )
-        write_transforms(out, frames, up, source.unit or "unit")
+        write_transforms(out, frames, up, source.unit or "unit", origin=source.origin)
     return load_dataset(out)
 
 
-def _mask_file(masks: Path, shot: Shot) -> Path:
-    """Mask file of a shot. Raises InputError if there is none."""
+def _mask_file(masks: Path, shot: Shot, shots: Sequence[Shot]) -> Path:
+    """Mask file of a shot, named as its image with or without folders. Raises InputError if there
+    is none, or if it could be that of several images."""
     if not masks.is_dir():
         raise InputError(f"{masks}: no such folder; give the folder of the masks")
-    stem, full = shot.image.stem, shot.image.name
-    # The last two: as Metashape exports masks, and as COLMAP names them.
-    for name in (stem, shot.name, f"{stem}_mask", full):
-        if path := find_image(masks, name):
-            return path
+    if path := find_image(masks, shot.name):
+        return path
+    for end in (3, 2, 1):
+        image = Path(*shot.image.parts[-end:])
+        stem = image.with_suffix("").as_posix()
+        # The last two: as Metashape exports masks, and as COLMAP names them.
+        for name in (stem, f"{stem}_mask", image.as_posix()):
+            if path := find_image(masks, name):
+                others = [one for one in shots if one.image.parts[-end:] == image.parts]
+                if len(others) > 1:
+                    raise InputError(
+                        f"{path}: {len(others)} images have this name; put masks into folders as "
+                        "the images are, or name them as the frames, "
+                        f"{others[0].name} and {others[1].name}"
+                    )
+                return path
     raise InputError(f"{masks}: no mask for image {shot.image.name}; name masks as their images")
 
 
@@ -118,9 +140,11 @@ def _digest(shots: list[Shot]) -> str:
             shot.camera.width,
             shot.camera.height,
             shot.camera.world_to_camera.tolist(),
-            shot.distortion.tolist(),
+            shot.lens and [shot.lens.model, *shot.lens.parameters],
             shot.timestamp,
             shot.depth_unit,
+            shot.float_unit,
+            shot.turned,
             [
                 path and str(path.resolve())
                 for path in (shot.image, shot.depth, shot.mask, shot.rock)
@@ -144,7 +168,7 @@ def import_shot(
     silhouette: mask of a camera by `silhouette_of`. begin: makes the output folder, called between
     reading and writing, so that a source that cannot be read leaves no folder behind.
     """
-    camera, undo = undistorter(shot.camera, shot.distortion)
+    camera, undo = undistorter(shot.camera, shot.lens)
     camera, undo = shrunk(camera, downscale, undo)
     image, mask_path, rock_path = (
         out / folder / f"{shot.name}.png" for folder in ("images", "masks", "rock")
@@ -153,12 +177,14 @@ def import_shot(
     files = [path for path in (shot.image, shot.depth, shot.mask, shot.rock) if path]
     newest = max(path.stat().st_mtime_ns for path in files if path.is_file())
     if not image.is_file() or image.stat().st_mtime_ns < newest:
-        rgba = read_fitting(read_rgba, shot.image, shot.camera)
+        rgba = read_fitting(read_rgba, shot.image, shot.camera, shot.turned)
         mask, rock = silhouette(camera) if silhouette else None, None
         if silhouette is None:
             mask, rock = _mask_and_rock(shot, rgba, undo)
-        read = partial(_read_depth, unit=shot.depth_unit)
-        depth = None if shot.depth is None else read_fitting(read, shot.depth, shot.camera)
+        read = partial(read_depth, unit=shot.depth_unit, float_unit=shot.float_unit)
+        depth = None
+        if shot.depth is not None:
+            depth = read_fitting(read, shot.depth, shot.camera, shot.turned)
         begin()
         if depth_path is not None and depth is not None:
             write_exr(depth_path, {"Z": undo(depth, False)})
@@ -168,7 +194,7 @@ def import_shot(
         remove_file(out, rock_path)
         if rock is not None:
             write_rock_image(rock_path, rock)
-        if _is_plain_png(shot.image, camera) and not shot.distortion.any():
+        if _is_plain_png(shot.image, camera) and not (shot.lens or shot.turned):
             copy_file(shot.image, image)
         else:
             full, pixels = np.iinfo(rgba.dtype).max, undo(rgba[..., :3], True)
@@ -186,7 +212,8 @@ def _mask_and_rock(
     rgba [H,W,4]: pixels of the shot's image. Premultiplied light is resampled, since straight
     colours would mix with those of empty pixels and leave a rim.
     """
-    given = None if shot.rock is None else read_fitting(read_rgba, shot.rock, shot.camera)
+    about = shot.camera, shot.turned
+    given = None if shot.rock is None else read_fitting(read_rgba, shot.rock, *about)
     layer = rgba if given is None else given
     full = np.iinfo(layer.dtype).max
     alpha = layer[..., 3]
@@ -194,25 +221,56 @@ def _mask_and_rock(
         given = rgba
     rock = None if given is None else undo(premultiplied(given), True)
     if shot.mask is not None:
-        mask = read_fitting(read_mask, shot.mask, shot.camera)
+        mask = read_fitting(read_mask, shot.mask, *about)
         return undo(mask.astype(np.uint8) * 255, True) >= 128, rock
     return undo(alpha, True) > full // 2 if alpha.min() < full else None, rock
 
 
 def _is_plain_png(path: Path, camera: Camera) -> bool:
     """Whether a file is what `write_png` writes: an 8-bit RGB PNG of the camera's size."""
+    header = _png_header(path)
+    size = camera.width.to_bytes(4, "big") + camera.height.to_bytes(4, "big")
+    return header[16:] == size + b"\x08\x02"
+
+
+def _png_header(path: Path) -> bytes:
+    """Start of a PNG file up to its colour type; empty for other files."""
     with path.open("rb") as file:
         header = file.read(26)
-    size = camera.width.to_bytes(4, "big") + camera.height.to_bytes(4, "big")
-    return header[:8] == b"\x89PNG\r\n\x1a\n" and header[16:] == size + b"\x08\x02"
+    return header if header[:8] == b"\x89PNG\r\n\x1a\n" else b""
 
 
-def _read_depth(path: Path, unit: float) -> np.ndarray:
-    """Depth in metres, float32 [H,W], from EXR or from a 16-bit PNG in steps of `unit` metres."""
-    if path.suffix.lower() == ".exr":
-        channels = read_exr(path)
-        return channels.get("Z", next(iter(channels.values())))
-    return read_values(path).astype(np.float32) * unit
+def in_sight(path: Path, mesh: Mesh, shots: Sequence[Shot], origin: Sequence[float]) -> Mesh:
+    """The mesh, in the world of the shots, from which `origin` was subtracted. Raises InputError if
+    none of a few cameras sees it, as happens with another unit or other axes."""
+    from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
+
+    mesh = replace(mesh, vertices=mesh.vertices - origin)
+    depth = mesh_depth(mesh)
+    some = shots[:: max(1, len(shots) // CHECKED)]
+    if any((depth(shrunk_to(shot.camera, SMALL)[0]) > 0).any() for shot in some):
+        return mesh
+    size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    near = min(float(np.linalg.norm(shot.camera.position)) for shot in some)
+    raise InputError(
+        f"{path}: the mesh is in no picture: it is {size:.3g} across, and a camera is {near:.3g} "
+        "from the origin; give it in the unit and axes of the cameras"
+    )
+
+
+def _warn_of_bits(shots: Sequence[Shot]) -> None:
+    """Warn where pictures of 16 bits use only the lower ones, so that they are nearly black."""
+    some = [shot.image for shot in shots[:: max(1, len(shots) // CHECKED)]]
+    deep = [
+        path for path in some if _png_header(path)[PNG_BIT_DEPTH : PNG_BIT_DEPTH + 1] == b"\x10"
+    ]
+    bits = int(max((read_rgba(path)[..., :3].max() for path in deep), default=0)).bit_length()
+    if deep and bits <= 13:
+        text = (
+            f"{deep[0]}: its values use {bits} of 16 bits, so the pictures are nearly black; "
+            f"multiply them by {2 ** (16 - bits)}"
+        )
+        warnings.warn(Notice(text), stacklevel=2)
 
 
 def silhouette_of(mesh: Mesh) -> Callable[[Camera], np.ndarray]:

@@ -1,10 +1,12 @@
-"""Resampling of images: undistortion, reduction in size, and EXIF orientation."""
+"""Lenses as COLMAP's camera models, and resampling: undistortion, reduction, EXIF orientation."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,66 +18,157 @@ Undo = Callable[[np.ndarray, bool], np.ndarray]
 """undo(pixels, smooth): resample an image [H,W] or [H,W,C] to another camera, by interpolation if
 `smooth`, else by single pixels (depth)."""
 
+GENERAL = {
+    **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "FULL_OPENCV"),
+    **dict.fromkeys(("OPENCV", "FULL_OPENCV"), "FULL_OPENCV"),
+    **dict.fromkeys(("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), "OPENCV_FISHEYE"),
+}
+"""Camera models that are cases of a more general one, which takes their place."""
 
-def undistorter(camera: Camera, distortion: np.ndarray) -> tuple[Camera, Undo]:
-    """Pinhole camera inside the view of a distorted one, and the resampling to it.
+FARTHEST = np.tan(np.radians(60))
+"""Tangent of the largest angle to the axis in an undistorted image. Wider fisheyes are cut off."""
 
-    distortion: k1 k2 p1 p2 k3 (k4 k5 k6) of OpenCV's rational model. OpenCV's pixel centres are
-    whole numbers and ours are at +0.5, which is taken into account. Raises InputError if no valid
-    pixel is left.
+BLOCK = 1 << 20
+"""Pixels that are mapped at once."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera model of COLMAP with its parameters in COLMAP's order, pixels from the corner."""
+
+    model: str
+    parameters: tuple[float, ...]
+
+    @classmethod
+    def of(cls, where: str, model: str, K: np.ndarray, values: Mapping[str, float]) -> Lens | None:
+        """Lens of a model of COLMAP, K [3,3], and coefficients by COLMAP's names; None for a
+        pinhole.
+
+        Raises InputError, which begins with `where`, for another model, and for a coefficient that
+        the model lacks.
+        """
+        values = {name: value for name, value in values.items() if value}
+        if not np.isfinite([*values.values()]).all():
+            raise InputError(f"{where} has a distortion that is not finite; correct it")
+        if "PINHOLE" in model or (model in GENERAL and not values and "FISHEYE" not in model):
+            model, names = "PINHOLE", ["fx", "fy", "cx", "cy"]
+        else:
+            model = GENERAL.get(model, model)
+            names = parameter_names(model)
+        known = {"fx": K[0, 0], "fy": K[1, 1], "f": K[0, 0], "cx": K[0, 2], "cy": K[1, 2]}
+        if "f" in names and not np.isclose(K[0, 0], K[1, 1]):
+            raise InputError(f"{where} has two focal lengths, and {model} has one; correct them")
+        if lacking := [name for name in values if name not in names]:
+            raise InputError(
+                f"{where} has {lacking[0]}, which the model {model} lacks; undistort the images"
+            )
+        if not names or "w" in names:
+            raise InputError(
+                f"{where}: camera model {model} is not supported; undistort the images first"
+            )
+        if model == "PINHOLE":
+            return None
+        return cls(model, tuple(float({**known, **values}.get(name, 0)) for name in names))
+
+    def camera(self, width: int, height: int) -> Any:
+        """The camera of pycolmap."""
+        from pycolmap import Camera as ColmapCamera
+
+        return ColmapCamera(model=self.model, width=width, height=height, params=self.parameters)
+
+
+@functools.cache
+def parameter_names(model: str) -> list[str]:
+    """Names of the parameters of a camera model of COLMAP; none if there is no such model."""
+    from pycolmap import Camera as ColmapCamera
+    from pycolmap import CameraModelId
+
+    known = CameraModelId.__members__.get(model)
+    if known is None or int(known) < 0:
+        return []
+    text = ColmapCamera.create_from_model_id(1, known, 1.0, 1, 1).params_info
+    return [name.strip() for name in text.split(",")]
+
+
+def undistorter(camera: Camera, lens: Lens | None) -> tuple[Camera, Undo]:
+    """Pinhole camera inside the view of a lens, of the same size, and the resampling to it.
+
+    camera: its size and pose. Raises InputError if no valid pixel is left.
     """
+    if lens is None:
+        return camera, lambda pixels, smooth: pixels
     import cv2
 
-    if not distortion.any():
-        return camera, lambda pixels, smooth: pixels
-    shift = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    size = (camera.width, camera.height)
-    K, _ = cv2.getOptimalNewCameraMatrix(camera.K - shift, distortion, size, alpha=0.0)
-    if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+    size = camera.width, camera.height
+    K = _inner(lens, *size)
+    pixels = _distorted(lens, K, *(np.linspace(0.5, side - 0.5, 65) for side in size))
+    if not _is_sound(pixels, lens, K, size):
         raise InputError(
-            "import: the distortion leaves no valid pixel; check k1 k2 p1 p2 and the focal length"
-        )
-    if _folds(camera.K - shift, distortion, K, size):
-        raise InputError(
-            "import: the distortion folds the image over itself; check k1 k2 p1 p2 and the focal "
-            "length"
-        )
-
-    @functools.cache
-    def maps() -> tuple[np.ndarray, np.ndarray]:
-        return cv2.initUndistortRectifyMap(
-            camera.K - shift, distortion, None, K, size, cv2.CV_32FC1
+            "import: the distortion leaves no valid pixel or folds the image over itself; check "
+            "the focal length and k1 k2 p1 p2"
         )
 
     def undo(pixels: np.ndarray, smooth: bool) -> np.ndarray:
         method = cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST
-        pixels = np.ascontiguousarray(pixels)
-        return cv2.remap(pixels, *maps(), method, borderMode=cv2.BORDER_REPLICATE)
+        pixels, at = np.ascontiguousarray(pixels), _map(lens, K.tobytes(), *size)
+        return cv2.remap(pixels, at[..., 0], at[..., 1], method, borderMode=cv2.BORDER_REPLICATE)
 
-    return Camera(K + shift, camera.width, camera.height, camera.world_to_camera), undo
+    return Camera(K, *size, camera.world_to_camera), undo
 
 
-def _folds(
-    K: np.ndarray, distortion: np.ndarray, pinhole: np.ndarray, size: tuple[int, int]
-) -> bool:
-    """Whether the map from an undistorted image to the distorted one folds, leads out of it, or
-    magnifies beyond any lens.
+def _inner(lens: Lens, width: int, height: int) -> np.ndarray:
+    """K [3,3] of the largest pinhole image, on whose borders a pixel of the distorted borders lies,
+    and all of whose pixels are valid. It ends at FARTHEST."""
+    camera = lens.camera(width, height)
+    u, v = (np.linspace(0.5, side - 0.5, min(side, 257)) for side in (width, height))
+    limits = []
+    for axis, (side, along) in enumerate(((width, v), (height, u))):
+        for end, sign in ((0.5, -1), (side - 0.5, 1)):
+            border = np.full((len(along), 2), end)
+            border[:, 1 - axis] = along
+            rays = np.nan_to_num(camera.cam_from_img(border), nan=np.inf)
+            back = camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+            off = ~(np.abs(np.nan_to_num(back, nan=np.inf) - border).max(1) < 0.1)
+            reach = np.where(off | (sign * rays[:, axis] < 0), np.inf, sign * rays[:, axis])
+            limits.append(sign * min(reach.min(), FARTHEST))
+    left, right, top, bottom = limits
+    with np.errstate(all="ignore"):
+        fx, fy = (width - 1) / (right - left), (height - 1) / (bottom - top)
+        return np.array([[fx, 0, 0.5 - left * fx], [0, fy, 0.5 - top * fy], [0, 0, 1]])
 
-    pinhole, K: [3,3] of the two images, with OpenCV's pixel centres. size: width and height.
-    """
-    import cv2
 
-    u, v = (np.linspace(0, side - 1, 65) for side in size)
-    x, y = np.meshgrid((u - pinhole[0, 2]) / pinhole[0, 0], (v - pinhole[1, 2]) / pinhole[1, 1])
+def _distorted(lens: Lens, K: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Pixels [V,U,2] of a lens that see what the pixels (u, v) of a pinhole K see."""
+    x, y = np.meshgrid((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1])
     rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
-    pixels = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, distortion)[0]
-    at = pixels.reshape(*x.shape, 2)
+    return lens.camera(1, 1).img_from_cam(rays).reshape(*x.shape, 2)
+
+
+@functools.lru_cache(maxsize=1)
+def _map(lens: Lens, pinhole: bytes, width: int, height: int) -> np.ndarray:
+    """Positions float32 [H,W,2] to sample, for OpenCV: pixel centres are whole numbers. Images of
+    one lens share it."""
+    K, u = np.frombuffer(pinhole).reshape(3, 3), np.arange(width) + 0.5
+    found = np.empty((height, width, 2), np.float32)
+    rows = max(1, BLOCK // width)
+    for top in range(0, height, rows):
+        v = np.arange(top, min(top + rows, height)) + 0.5
+        found[top : top + rows] = _distorted(lens, K, u, v) - 0.5
+    return found
+
+
+def _is_sound(at: np.ndarray, lens: Lens, K: np.ndarray, size: tuple[int, int]) -> bool:
+    """Whether the map from an undistorted image to the distorted one, on a grid at [V,U,2], does
+    not fold, lead out of it, or magnify beyond any lens."""
+    if not np.isfinite(at).all() or not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        return False
     down, along = np.gradient(at, axis=(0, 1))
     turned = along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0]
     margin = 0.05 * np.array(size)
     inside = (at >= -margin).all() and (at <= size + margin).all()
-    alike = 0.1 < pinhole[0, 0] / K[0, 0] < 10 and 0.1 < pinhole[1, 1] / K[1, 1] < 10
-    return not (alike and inside and (turned > 0).all())
+    focal = lens.camera(*size).mean_focal_length()
+    alike = all(0.1 < value / focal < 10 for value in (K[0, 0], K[1, 1]))
+    return bool(alike and inside and (turned > 0).all())
 
 
 def shrunk(
@@ -114,21 +207,21 @@ def shrunk_to(camera: Camera, most: float) -> tuple[Camera, Undo]:
     return shrunk(camera, int(np.ceil(np.sqrt(camera.width * camera.height / most))))
 
 
-def read_fitting(read: Callable[[Path], np.ndarray], path: Path, camera: Camera) -> np.ndarray:
-    """Pixels of an image file, turned by its EXIF orientation if only that fits its camera's size.
-
-    COLMAP ignores EXIF orientation and other programs apply it; the size shows which. Raises
-    InputError, before anything is decoded, if neither size fits.
+def read_fitting(
+    read: Callable[[Path], np.ndarray], path: Path, camera: Camera, turned: bool = False
+) -> np.ndarray:
+    """Pixels of an image file, turned by its EXIF orientation if `turned`, or if only that fits its
+    camera's size. Raises InputError, before anything is decoded, if neither size fits.
     """
     wanted, found = (camera.width, camera.height), image_size(path)
-    orientation = exif_orientation(path) if found == wanted[::-1] != wanted else 1
-    if found != wanted and orientation < 5:
+    orientation = exif_orientation(path) if turned or found == wanted[::-1] != wanted else 1
+    if wanted != (found[::-1] if orientation >= 5 else found):
         raise InputError(
             f"{path}: is {found[0]}x{found[1]}, but its camera is {camera.width}x{camera.height}; "
             "resize it or correct w and h"
         )
     pixels = read(path)
-    if orientation < 5:
-        return pixels
-    flips = {5: (), 6: (1,), 7: (0, 1), 8: (0,)}[orientation]
-    return np.ascontiguousarray(np.flip(pixels.swapaxes(0, 1), flips))
+    flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}.get(orientation, ())
+    if orientation >= 5:
+        pixels = pixels.swapaxes(0, 1)
+    return np.ascontiguousarray(np.flip(pixels, flips))

@@ -1,20 +1,23 @@
 """Folders of robots and scanners with a pose for each image: TUM RGB-D, Open3D, RTAB-Map exports.
 
-Each reader returns keyframes as fields of `mgs.data.sources.Shot`, in metres.
+Each reader returns keyframes, in metres.
 """
 
 from __future__ import annotations
 
-import re
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mgs.camera import Camera
-from mgs.data.tracks import Spacing, Track, rigid
+from mgs.data.lens import Lens
+from mgs.data.shots import Shot, Source, natural
+from mgs.data.tracks import Spacing, Track, posed, rigid
 from mgs.errors import InputError
-from mgs.files import read_json, reading
+from mgs.files import read_json, read_text
 from mgs.images import image_size
 
 TUM_DEPTH_UNIT = 1 / 5000
@@ -29,8 +32,7 @@ OPEN3D_INTERVAL = 0.5
 
 def rows(path: Path, least: int) -> list[list[str]]:
     """Words of the lines without comments. Raises InputError for fewer than `least`."""
-    with reading(path):
-        lines = path.read_text(errors="replace").splitlines()
+    lines = read_text(path).splitlines()
     found = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if short := [words for words in found if len(words) < least]:
         raise InputError(
@@ -58,8 +60,8 @@ def poses(path: Path) -> list[list[float]]:
     return found
 
 
-def calibration(folder: Path, image: Path) -> tuple[np.ndarray, np.ndarray]:
-    """K [3,3] and distortion by camera_intrinsic.json (Open3D), else calibration.txt (fx fy cx cy
+def calibration(folder: Path) -> tuple[np.ndarray, Lens | None]:
+    """K [3,3] and lens by camera_intrinsic.json (Open3D), else calibration.txt (fx fy cx cy
     and k1 k2 p1 p2 k3). Both count pixel centres as whole numbers."""
     path = folder / "camera_intrinsic.json"
     if path.is_file():
@@ -69,7 +71,7 @@ def calibration(folder: Path, image: Path) -> tuple[np.ndarray, np.ndarray]:
         except (TypeError, KeyError, ValueError, OverflowError):
             raise InputError(f"{path}: has no intrinsic_matrix of 9 numbers; correct it") from None
         K[:2, 2] += 0.5
-        return K, np.zeros(5)
+        return K, None
     path = folder / "calibration.txt"
     if not path.is_file():
         raise InputError(
@@ -83,7 +85,7 @@ def calibration(folder: Path, image: Path) -> tuple[np.ndarray, np.ndarray]:
         )
     fx, fy, cx, cy, *distortion = values
     K = np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]])
-    return K, np.array([*distortion, *np.zeros(5 - len(distortion))])
+    return K, opencv_lens(str(path), K, distortion)
 
 
 def is_tum(folder: Path) -> bool:
@@ -91,7 +93,7 @@ def is_tum(folder: Path) -> bool:
     return (folder / "rgb.txt").is_file() and (folder / "groundtruth.txt").is_file()
 
 
-def read_tum(folder: Path, spacing: Spacing) -> list[dict[str, Any]]:
+def read_tum(folder: Path, spacing: Spacing) -> Source:
     """Keyframes of rgb.txt, depth.txt and groundtruth.txt, whose poses are interpolated."""
     listed: dict[str, list[tuple[float, Path]]] = {}
     for kind in ("rgb", "depth"):
@@ -100,22 +102,23 @@ def read_tum(folder: Path, spacing: Spacing) -> list[dict[str, Any]]:
         listed[kind] = [(numbers(path, words[:1])[0], folder / words[1]) for words in lines]
     path = folder / "groundtruth.txt"
     track = Track.of([(row[0], _pose(path, row[1:8])) for row in poses(path)])
-    images = [(t, image) for t, image in sorted(listed["rgb"]) if image.is_file()]
-    posed = [(t, pose, image) for t, image in images if (pose := track.at(t)) is not None]
-    if not posed:
+    images = {time: image for time, image in sorted(listed["rgb"]) if image.is_file()}
+    left_out = Counter({"whose file is missing": len(listed["rgb"]) - len(images)})
+    there = posed(images, track.at, left_out)
+    if not there:
         raise InputError(f"{folder}: no image has a pose at its time; check groundtruth.txt")
-    K, distortion = calibration(folder, posed[0][2])
+    K, lens = calibration(folder)
     times = np.array([time for time, _ in listed["depth"]])
-    shots: list[dict[str, Any]] = []
-    for k in spacing.choose([(time, pose) for time, pose, _ in posed]):
-        time, pose, image = posed[k]
+    shots: list[Shot] = []
+    for k in spacing.choose(there):
+        time, pose = there[k]
         near = int(np.argmin(np.abs(times - time))) if len(times) else -1
         depth = listed["depth"][near][1] if near >= 0 else None
         if depth is not None and abs(times[near] - time) > SYNCHRONOUS:
             depth = None
-        shots.append(_shot(f"kf_{len(shots):04d}", K, distortion, pose, time - posed[0][0], image))
-        shots[-1] |= {"depth": depth, "depth_unit": TUM_DEPTH_UNIT}
-    return shots
+        name, unit = f"kf_{len(shots):04d}", TUM_DEPTH_UNIT
+        shots.append(_shot(name, K, lens, pose, time - there[0][0], images[time], depth, unit))
+    return Source("TUM RGB-D", shots, left_out, unit="m")
 
 
 def is_open3d(folder: Path) -> bool:
@@ -123,8 +126,9 @@ def is_open3d(folder: Path) -> bool:
     return (folder / "trajectory.log").is_file() and (folder / "color").is_dir()
 
 
-def read_open3d(folder: Path, spacing: Spacing) -> list[dict[str, Any]]:
-    """Keyframes of color/, depth/ (mm) and trajectory.log (camera-to-world), in order of name."""
+def read_open3d(folder: Path, spacing: Spacing) -> Source:
+    """Keyframes of color/, depth/ (mm) and trajectory.log (camera-to-world), in the order of the
+    numbers in their names."""
     path = folder / "trajectory.log"
     words = [word for line in rows(path, 3) for word in line]
     values = numbers(path, words)
@@ -133,19 +137,23 @@ def read_open3d(folder: Path, spacing: Spacing) -> list[dict[str, Any]]:
             f"{path}: needs three numbers and a 4x4 matrix for each image; record it again"
         )
     matrices = np.array(values).reshape(-1, 19)[:, 3:].reshape(-1, 4, 4)
-    images = sorted(path for path in (folder / "color").iterdir() if path.is_file())
-    if len(images) != len(matrices):
-        raise InputError(
-            f"{path}: has {len(matrices)} poses for {len(images)} images in color; make them equal"
-        )
+    images, depths = (
+        sorted((path for path in (folder / name).glob("*") if path.is_file()), key=natural)
+        for name in ("color", "depth")
+    )
+    for name, listed in (("color", images), ("depth", depths)):
+        if len(listed) != len(matrices) and (listed or name == "color"):
+            raise InputError(
+                f"{path}: has {len(matrices)} poses for {len(listed)} images in {name}; "
+                "make them equal"
+            )
     times = OPEN3D_INTERVAL * np.arange(len(images))
-    K, distortion = calibration(folder, images[0])
-    shots: list[dict[str, Any]] = []
+    K, lens = calibration(folder)
+    shots: list[Shot] = []
     for k in spacing.choose(list(zip(times.tolist(), matrices, strict=True))):
-        shots.append(_shot(images[k].stem, K, distortion, matrices[k], times[k], images[k]))
-        depth = folder / "depth" / f"{images[k].stem}.png"
-        shots[-1] |= {"depth": depth if depth.is_file() else None, "depth_unit": 1e-3}
-    return shots
+        depth = depths[k] if depths else None
+        shots.append(_shot(images[k].stem, K, lens, matrices[k], times[k], images[k], depth))
+    return Source("Open3D", shots, unit="m")
 
 
 def is_rtabmap(folder: Path) -> bool:
@@ -153,49 +161,59 @@ def is_rtabmap(folder: Path) -> bool:
     return bool([*folder.glob("*_camera_poses.txt")]) and bool([*folder.glob("*_calib")])
 
 
-def read_rtabmap(folder: Path, spacing: Spacing) -> list[dict[str, Any]]:
+def read_rtabmap(folder: Path, spacing: Spacing) -> Source:
     """Keyframes of NAME_rgb, NAME_depth (mm), NAME_calib and NAME_camera_poses.txt, by id."""
     path = min(folder.glob("*_camera_poses.txt"))
     name = path.name.removesuffix("_camera_poses.txt")
     listed = poses(path)
     if any(len(row) < 9 for row in listed):
         raise InputError(f"{path}: has no ids; export with --poses_format 11")
-    posed = [(row[0], _pose(path, row[1:8]), int(row[8])) for row in sorted(listed)]
-    shots: list[dict[str, Any]] = []
-    for k in spacing.choose([(time, pose) for time, pose, _ in posed]):
-        time, pose, number = posed[k]
+    views = [row for row in sorted(listed) if row[8] >= 0]
+    left_out = Counter({"landmark": len(listed) - len(views)})
+    there = [(row[0], _pose(path, row[1:8])) for row in views]
+    shots: list[Shot] = []
+    for k in spacing.choose(there):
+        (time, pose), number = there[k], int(views[k][8])
         pictures = [folder / f"{name}_rgb" / f"{number}.{end}" for end in ("jpg", "png")]
         image = next((path for path in pictures if path.is_file()), pictures[0])
-        lens = folder / f"{name}_calib" / f"{number}.yaml"
-        K, distortion = _opencv_yaml(lens)
-        shots.append(_shot(f"{number:06d}", K, distortion, pose, time - posed[0][0], image))
+        K, lens = _opencv_yaml(folder / f"{name}_calib" / f"{number}.yaml")
         depth = folder / f"{name}_depth" / f"{number}.png"
-        shots[-1] |= {"depth": depth if depth.is_file() else None, "depth_unit": 1e-3}
-    return shots
+        shots.append(_shot(f"{number:06d}", K, lens, pose, time - there[0][0], image, depth))
+    return Source("RTAB-Map", shots, +left_out, unit="m")
 
 
-def _opencv_yaml(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """K and distortion of a camera in a file of OpenCV's FileStorage.
+def _opencv_yaml(path: Path) -> tuple[np.ndarray, Lens | None]:
+    """K and lens of a camera in a file of OpenCV's FileStorage.
 
     It is not read by OpenCV, which aborts the process on some damaged files.
     """
-    with reading(path):
-        text = path.read_text(errors="replace")
-    found = []
+    text, arrays = "\n" + read_text(path), []
     for key in ("camera_matrix", "distortion_coefficients"):
-        data = re.search(rf"^{key}:[^\[]*\bdata:\s*\[([^\]]*)\]", text, re.MULTILINE)
-        if data is None:
+        _, there, rest = text.partition(f"\n{key}:")
+        rest, opened, _ = rest.partition("data:")[2].partition("]")
+        if not (there and opened):
             raise InputError(f"{path}: has no {key}; export it again")
-        found.append(np.array(numbers(path, data[1].replace(",", " ").split())))
-    K, D = found
-    if K.size != 9 or D.size not in (0, 4, 5, 8):
+        words = rest.replace("[", " ").replace(",", " ").split()
+        arrays.append(np.array(numbers(path, words)))
+    K, D = arrays
+    if K.size != 9 or D.size not in (0, 4, 5, 6, 8):
         raise InputError(
             f"{path}: has {K.size} numbers in camera_matrix and {D.size} in "
-            "distortion_coefficients, not 9 and 4, 5 or 8; export it again"
+            "distortion_coefficients, not 9 and 4, 5, 6 or 8; export it again"
         )
     K = K.reshape(3, 3)
     K[:2, 2] += 0.5
-    return K, np.concatenate([D, np.zeros(max(0, 5 - len(D)))])
+    if D.size == 6:  # RTAB-Map's fisheyes: k1 k2 p1 p2 k3 k4
+        k1, k2, _, _, k3, k4 = D.tolist()
+        values = {"k1": k1, "k2": k2, "k3": k3, "k4": k4}
+        return K, Lens.of(str(path), "OPENCV_FISHEYE", K, values)
+    return K, opencv_lens(str(path), K, D.tolist())
+
+
+def opencv_lens(where: str, K: np.ndarray, distortion: Sequence[float]) -> Lens | None:
+    """Lens of the coefficients k1 k2 p1 p2 k3 k4 k5 k6 of OpenCV, or the first of them."""
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    return Lens.of(where, "FULL_OPENCV", K, dict(zip(names, distortion, strict=False)))
 
 
 def _pose(path: Path, row: list[float]) -> np.ndarray:
@@ -211,20 +229,17 @@ def _pose(path: Path, row: list[float]) -> np.ndarray:
 def _shot(
     name: str,
     K: np.ndarray,
-    distortion: np.ndarray,
+    lens: Lens | None,
     pose: np.ndarray,
     time: float,
     image: Path,
-) -> dict[str, Any]:
-    """Fields of a shot but its depth."""
+    depth: Path | None,
+    unit: float = 1e-3,
+) -> Shot:
+    """Keyframe of a pose, camera-to-world; depth: file that may not exist."""
     try:
         camera = Camera(K, *image_size(image), np.linalg.inv(pose))
     except np.linalg.LinAlgError:
         raise InputError(f"{image}: its pose is singular; correct it") from None
-    return {
-        "name": name,
-        "camera": camera,
-        "distortion": distortion,
-        "timestamp": float(time),
-        "image": image,
-    }
+    there = depth if depth is not None and depth.is_file() else None
+    return Shot(name, camera, lens, float(time), image, there, unit)

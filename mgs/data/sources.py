@@ -1,29 +1,21 @@
-"""Data to import: cameras and files of nerfstudio, NeRF-synthetic, COLMAP, and RECORDINGS."""
+"""Data to import: recognition of its format, and the files of nerfstudio and NeRF-synthetic."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.bags import is_bag, read_bag
-from mgs.data.clouds import SparseCloud, read_cloud
-from mgs.data.colmap import is_model, read_model
-from mgs.data.dataset import (
-    FRAME_INTERVAL,
-    PINHOLES,
-    finite_number,
-    posed_camera,
-    read_records,
-    timestamp_of,
-    unit_of,
-)
+from mgs.data.clouds import read_cloud
+from mgs.data.colmap import models_in, read_colmap
+from mgs.data.dataset import finite_number, posed_camera, read_records, timestamp_of, unit_of
+from mgs.data.lens import Lens
 from mgs.data.metashape import is_metashape, read_metashape
 from mgs.data.rgbd_folders import (
     is_open3d,
@@ -33,115 +25,46 @@ from mgs.data.rgbd_folders import (
     read_rtabmap,
     read_tum,
 )
+from mgs.data.shots import Shot, Source, checked, frame_name, turned_by_exif
 from mgs.data.tracks import Spacing
-from mgs.data.up import PLUS_Z, Up, degrees_between, unit_up, up_of_cameras
+from mgs.data.up import unit_up
 from mgs.errors import InputError
 from mgs.images import image_size
 
-DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
-"""Coefficients of the OPENCV camera model, in OpenCV's order."""
-
-LEVELLED = 10.0
-"""Angle from +Z, degrees, up to which cameras' common up vector counts as +Z."""
+COEFFICIENTS = (
+    *(f"k{i}" for i in range(1, 7)),
+    *("p1", "p2", "sx1", "sy1", "omega", "k", "k0", "alpha", "beta"),
+)
+"""Keys of transforms.json that are parameters of COLMAP's camera models, by the same name."""
 
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 """NeRF-synthetic names images without a suffix."""
 
+SPLITS = ("train_filenames", "val_filenames", "test_filenames")
+"""Keys of transforms.json that list the images of a split (nerfstudio)."""
 
-@dataclass(frozen=True)
-class Shot:
-    """One frame to import, with its camera before undistortion, and its files.
+NEARLY_RIGID = 2e-3
+"""Largest error of an entry of a rotation that was rounded when it was written. It is mended."""
 
-    distortion: coefficients in OpenCV's order. timestamp: seconds. depth_unit: metres per step of
-    a PNG depth image.
-    """
-
-    name: str
-    camera: Camera
-    distortion: np.ndarray
-    timestamp: float
-    image: Path
-    depth: Path | None = None
-    depth_unit: float = 1.0
-    mask: Path | None = None
-    rock: Path | None = None
-
-
-@dataclass(frozen=True)
-class Source:
-    """Data to import.
-
-    shots: frames whose image exists; missing: number of the others. sparse: triangulated points.
-    up, unit ("m" or "unit"): None if the source does not say. no_cloud: file of points that the
-    source names and that does not exist.
-    """
-
-    kind: str
-    shots: list[Shot]
-    missing: int
-    sparse: SparseCloud | None = None
-    up: Up | None = None
-    unit: str | None = None
-    no_cloud: Path | None = None
-
-    def in_metres(self, unit: float) -> Source:
-        """Scale cameras and points by `unit` metres. Raises InputError unless it is positive."""
-        if not 0 < unit < np.inf:
-            raise InputError(f"import: unit {unit} must be a positive number of metres; correct it")
-        shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
-        return replace(self, shots=shots, sparse=self.sparse and self.sparse.scaled(unit), unit="m")
-
-    def set_apart(self, every: int) -> tuple[Source, Source]:
-        """Split into (training, test): every Nth shot by name, from the first, is a test view.
-
-        Raises InputError if no training shot is left.
-        """
-        names = sorted(shot.name for shot in self.shots)[::every]
-        apart = [shot for shot in self.shots if shot.name in names]
-        kept = [shot for shot in self.shots if shot.name not in names]
-        if not kept:
-            raise InputError(
-                f"import: test_every {every} of {len(self.shots)} images leaves none to choose "
-                "from; correct it"
-            )
-        return replace(self, shots=kept), replace(self, shots=apart, sparse=None)
-
-    def up_or_estimate(self) -> tuple[Up, str]:
-        """Up vector and the reason for it: given by the source, by the format, or estimated by
-        `up_of_cameras`, whose InputError it raises."""
-        if self.up is not None:
-            return self.up, "as the source says"
-        if self.kind == "NeRF-synthetic":
-            return PLUS_Z, "the rule of NeRF-synthetic data"
-        found = up_of_cameras([shot.camera for shot in self.shots])
-        levelled = ("nerfstudio", "ROS bag", "TUM RGB-D", "RTAB-Map")
-        if self.kind in levelled and degrees_between(found, PLUS_Z) < LEVELLED:
-            return PLUS_Z, f"the cameras' common up vector is within {LEVELLED:.0f} degrees of it"
-        return found, "the cameras' common up vector"
-
-
-Fields = list[dict[str, Any]]
-"""Fields of each `Shot`."""
-
-Reader = Callable[[Path, Path | None, Spacing, Path], tuple[Fields, str | None]]
-"""(path, images, spacing of keyframes, folder to unpack into) -> shots, and unit of length. images:
+Reader = Callable[[Path, Path | None, Spacing, Path, str | None], Source]
+"""(path, images, spacing of keyframes, folder to unpack into, topic of poses) -> source. images:
 folder of the images, or of a bag their topic."""
 
 RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
     "ROS bag": (
         is_bag,
-        lambda path, images, spacing, unpack: (
-            read_bag(path, unpack, str(images) if images else None, spacing), "m"
+        lambda path, images, spacing, unpack, pose: read_bag(
+            path, unpack, str(images) if images else None, pose, spacing
         ),
     ),
-    "TUM RGB-D": (is_tum, lambda path, _, spacing, __: (read_tum(path, spacing), "m")),
-    "Open3D": (is_open3d, lambda path, _, spacing, __: (read_open3d(path, spacing), "m")),
-    "RTAB-Map": (is_rtabmap, lambda path, _, spacing, __: (read_rtabmap(path, spacing), "m")),
+    "TUM RGB-D": (is_tum, lambda path, _, spacing, *__: read_tum(path, spacing)),
+    "Open3D": (is_open3d, lambda path, _, spacing, *__: read_open3d(path, spacing)),
+    "RTAB-Map": (is_rtabmap, lambda path, _, spacing, *__: read_rtabmap(path, spacing)),
     "Metashape": (
         is_metashape,
         lambda path, images, *_: read_metashape(path, images or path.parent / "images"),
     ),
-}  # fmt: skip
+}
 """Recordings of robots: kind -> (whether a path is one, its reader)."""
 
 
@@ -152,37 +75,36 @@ def read_source(
     *,
     keyframes: str = "0.5s",
     unpack: Path | None = None,
+    pose: str | None = None,
 ) -> Source:
     """Recognise the format of a source, and read its cameras and file names.
 
     source: a transforms.json or its folder; a folder with NeRF-synthetic's transforms_SPLIT.json;
-    a folder with a COLMAP model in itself, sparse/ or sparse/0/; or one of RECORDINGS. images: the
-    image folder of COLMAP or Metashape, by default SOURCE/images; of a bag the topic. split: train,
-    val or test. keyframes: `Spacing` of a recording. unpack: folder for the images of a bag, by
-    default SOURCE.unpacked. Raises InputError if no format is recognised, no image exists, a frame
-    is listed twice, or a camera model is not supported.
+    a folder with a COLMAP model in itself, sparse/ or sparse/N/; or one of RECORDINGS. images: the
+    image folder, by default SOURCE/images, or that of the names in transforms.json; of a bag the
+    topic. split: train, val or test. keyframes: `Spacing` of a recording. unpack: folder for the
+    images of a bag, by default SOURCE.unpacked. pose: topic of a bag's poses. Raises InputError if
+    no format is recognised, no image exists, a frame is listed twice, or a camera model is not
+    supported.
     """
     source = Path(source)
     source.exists()  # an OSError of the source itself is not one of a file that it names
     try:
-        result = _recognised(source, images, split, keyframes, unpack)
+        result = checked(source, _recognised(source, images, split, keyframes, unpack, pose))
     except OSError as error:
         raise InputError(
             f"{source}: a file of it cannot be read ({error.strerror or error}); correct its name"
         ) from None
-    if not result.shots:
-        raise InputError(
-            f"{source}: none of the {result.missing} images it lists exists; "
-            "restore them or give `images`"
-        )
-    for name, count in Counter(shot.name for shot in result.shots).items():
-        if count > 1:
-            raise InputError(f"{source}: lists {name} more than once; remove the duplicate frames")
-    return result
+    return turned_by_exif(result).near_origin()
 
 
 def _recognised(
-    source: Path, images: Path | None, split: str, keyframes: str, unpack: Path | None
+    source: Path,
+    images: Path | None,
+    split: str,
+    keyframes: str,
+    unpack: Path | None,
+    pose: str | None,
 ) -> Source:
     """`read_source` without checks of the shots. Raises OSError for names that are too long."""
     if not source.exists():
@@ -192,18 +114,15 @@ def _recognised(
         )
     path = source if source.is_file() else source / "transforms.json"
     split_path = source / f"transforms_{split}.json"
-    folders = (source / "sparse/0", source / "sparse", source)
     recording = next((kind for kind, (fits, _) in RECORDINGS.items() if fits(source)), None)
     if recording is not None:
         folder = unpack or source.with_name(f"{source.name}.unpacked")
         reader = RECORDINGS[recording][1]
-        fields, unit = reader(source, images, Spacing.parse(keyframes), folder)
-        shots = [Shot(**each) for each in fields if each["image"].is_file()]
-        return Source(recording, shots, len(fields) - len(shots), unit=unit)
+        return reader(source, images, Spacing.parse(keyframes), folder, pose)
     if path.is_file() or split_path.is_file():
-        return _read_transforms(path if path.is_file() else split_path)
-    if model := next((folder for folder in folders if is_model(folder)), None):
-        return _read_colmap(model, images if images is not None else source / "images")
+        return _read_transforms(path if path.is_file() else split_path, images)
+    if models := models_in(source):
+        return read_colmap(source, models, images if images is not None else source / "images")
     raise InputError(
         f"{source}: holds no transforms.json, transforms_{split}.json or COLMAP model "
         "(cameras, images and points3D, .bin or .txt, in sparse/0, sparse or the folder "
@@ -217,82 +136,135 @@ def find_image(folder: Path, name: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def _frame_name(path: str) -> str:
-    """Flat name of an image path: images/left/0001.png -> left_0001."""
-    parts = Path(path).with_suffix("").parts
-    return "_".join(part for part in parts if part not in (".", "..", "/", "images"))
+def _named(folder: Path, images: Path | None, name: str) -> Path | None:
+    """File that transforms.json names: in its folder, or by its end in the folder of the images.
+    Names written on Windows have backslashes."""
+    path = folder / name
+    if not path.exists() and "\\" in name:
+        path = folder / PureWindowsPath(name).as_posix()
+    if images is None:
+        return find_image(path.parent, path.name)
+    parts = PureWindowsPath(name).parts
+    ends = ("/".join(parts[k:]) for k in range(len(parts)))
+    return next((found for end in ends if (found := find_image(images, end))), None)
 
 
-def _read_transforms(path: Path) -> Source:
+def _read_transforms(path: Path, images: Path | None) -> Source:
     """Read a transforms.json of nerfstudio or NeRF-synthetic (camera_angle_x, no suffixes)."""
     data, records = read_records(path)
-    model = data.get("camera_model", "OPENCV")
-    if model not in PINHOLES:
-        raise InputError(
-            f"{path}: camera model {model} is not supported; "
-            "undistort the images to OPENCV or PINHOLE first"
-        )
     key = "depth_unit_scale_factor"
     scale = finite_number(str(path), key, data.get(key, 1e-3))
-    shots, missing = [], 0
+    of_floats = scale if key in data else 1.0
+    tests, without = _splits(path, data, records)
+    left_out, shots, rounded = Counter[str](), [], 0
     for index, record in enumerate(records):
-        image = find_image(path.parent, record["file_path"])
+        image = _named(path.parent, images, record["file_path"])
+        if record["file_path"] in without:
+            left_out["in no split"] += 1
+            continue
         if image is None:
-            missing += 1
+            left_out["whose file is missing"] += 1
             continue
         keys = ("depth_file_path", "mask_path", "rock_file_path")
-        depth, mask, rock = (path.parent / record[key] if record.get(key) else None for key in keys)
+        depth, mask, rock = (
+            (_named(path.parent, None, record[key]) or path.parent / record[key])
+            if record.get(key)
+            else None
+            for key in keys
+        )
         where = f"{path}: frame {index}"
-        camera, distortion = record_camera(where, {**data, **record}, image)
-        time = timestamp_of(where, index, record)
-        unit = 1.0 if depth is None or depth.suffix.lower() == ".exr" else scale
-        name = _frame_name(record["file_path"])
-        shots.append(Shot(name, camera, distortion, time, image, depth, unit, mask, rock))
-    kind = "NeRF-synthetic" if "camera_angle_x" in data and "fl_x" not in data else "nerfstudio"
+        camera, lens, mended = record_camera(where, {**data, **record}, image)
+        rounded += mended
+        time, name = timestamp_of(where, index, record), frame_name(record["file_path"])
+        files = image, depth, scale, mask, rock
+        shots.append(Shot(name, camera, lens, time, *files, float_unit=of_floats))
+    note = f"{rounded} rotations were rounded when they were written; they are made orthonormal"
     cloud = path.parent / str(data["ply_file_path"]) if data.get("ply_file_path") else None
     no_cloud = cloud if cloud is not None and not cloud.is_file() else None
-    sparse = read_cloud(cloud) if cloud is not None and no_cloud is None else None
-    up = unit_up(data["up"]) if data.get("up") else None
-    length = unit_of(path, data) or ("m" if any(shot.depth for shot in shots) else None)
-    return Source(kind, shots, missing, sparse, up, length, no_cloud)
+    return Source(
+        "NeRF-synthetic" if "camera_angle_x" in data and "fl_x" not in data else "nerfstudio",
+        shots,
+        left_out,
+        (note,) if rounded else (),
+        sparse=read_cloud(cloud) if cloud is not None and no_cloud is None else None,
+        up=unit_up(data["up"]) if data.get("up") else None,
+        unit=unit_of(path, data) or ("m" if any(shot.depth for shot in shots) else None),
+        no_cloud=no_cloud,
+        tests=frozenset(frame_name(name) for name in tests),
+    )
 
 
-def record_camera(where: str, record: dict[str, Any], image: Path) -> tuple[Camera, np.ndarray]:
-    """Camera and distortion of a frame; missing intrinsics follow from the image."""
+def _splits(
+    path: Path, data: dict[str, Any], records: list[dict[str, Any]]
+) -> tuple[set[str], set[str]]:
+    """file_path of the test images, and of those in no split: nerfstudio's SPLITS, whose training
+    images are by default the others. Raises InputError unless they are lists of text."""
+    listed = []
+    for key in SPLITS:
+        names = data.get(key) or []
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise InputError(f"{path}: {key} is no list of file names; correct it")
+        listed.append(set(names))
+    train, val, test = listed
+    tests = (test | val) - train
+    every = {record["file_path"] for record in records}
+    return tests, every - train - tests if train else set()
+
+
+def record_camera(
+    where: str, record: dict[str, Any], image: Path
+) -> tuple[Camera, Lens | None, bool]:
+    """Camera and lens of a frame, and whether its rotation was NEARLY_RIGID. Missing intrinsics
+    follow from the image."""
+    record = {key: value for key, value in record.items() if value is not None}
+    model = record.get("camera_model", "OPENCV")
     try:
         if "w" in record and "h" in record:
             width, height = float(record["w"]), float(record["h"])
         else:
             width, height = image_size(image)
-        if "fl_x" in record:
-            fl_x = float(record["fl_x"])
-        else:
-            fl_x = width / 2 / math.tan(float(record["camera_angle_x"]) / 2)
-        defaults = {"fl_y": fl_x, "cx": width / 2, "cy": height / 2}
-        fl_y, cx, cy = (float(record.get(key, value)) for key, value in defaults.items())
+        fl_x = _focal(record, "x", width)
+        fl_y = _focal(record, "y", height) if {"fl_y", "camera_angle_y"} & set(record) else fl_x
+        cx, cy = float(record.get("cx", width / 2)), float(record.get("cy", height / 2))
         K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]])
-        distortion = np.array([float(record.get(key, 0)) for key in DISTORTION_KEYS])
+        values = {key: float(record[key]) for key in COEFFICIENTS if key in record}
         pose = np.array(record["transform_matrix"], np.float64)
     except (KeyError, TypeError, ValueError, ArithmeticError):
         raise InputError(
             f"{where} has no usable intrinsics or pose; give fl_x (or camera_angle_x) and a matrix"
         ) from None
-    if record.get("k4"):
+    if record.get("is_fisheye") and "FISHEYE" not in str(model):
+        model = "OPENCV_FISHEYE"
+    if values.get("k4") and model in ("OPENCV", "PINHOLE"):
         raise InputError(
-            f"{where} has k4, which the OPENCV model lacks; undistort the images first"
+            f"{where} has k4, which the OPENCV model lacks; undistort the images first, or give "
+            "camera_model FULL_OPENCV or OPENCV_FISHEYE"
         )
+    if model in ("SIMPLE_RADIAL", "SIMPLE_RADIAL_FISHEYE") and "k" in values:
+        values["k1"] = values.pop("k")
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0, 0, 0, 1]])
-    if not np.isfinite(distortion).all():
-        raise InputError(f"{where} has a distortion that is not finite; correct it")
-    return posed_camera(where, K, width, height, pose), distortion
+    pose, mended = _rigid(pose)
+    lens = Lens.of(where, str(model), K, values)
+    return posed_camera(where, K, width, height, pose), lens, mended
 
 
-def _read_colmap(model: Path, images: Path) -> Source:
-    listed, cloud = read_model(model)
-    shots = [
-        Shot(_frame_name(name), camera, distortion, FRAME_INTERVAL * index, images / name)
-        for index, (name, camera, distortion) in enumerate(listed)
-        if (images / name).is_file()
-    ]
-    return Source("COLMAP", shots, len(listed) - len(shots), cloud)
+def _focal(record: dict[str, Any], axis: str, side: float) -> float:
+    """Focal length along an axis: fl_x, or by camera_angle_x and the side of the image."""
+    if f"fl_{axis}" in record:
+        return float(record[f"fl_{axis}"])
+    return side / 2 / math.tan(float(record[f"camera_angle_{axis}"]) / 2)
+
+
+def _rigid(pose: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Pose with the rotation nearest to its own, if that is NEARLY_RIGID, and whether it changed by
+    more than the rounding of float32."""
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        return pose, False
+    left, _, right = np.linalg.svd(pose[:3, :3])
+    error = np.abs(left @ right - pose[:3, :3]).max()
+    if not 1e-5 < error < NEARLY_RIGID:
+        return pose, False
+    mended = pose.copy()
+    mended[:3, :3] = left @ right
+    return mended, True

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,6 +12,27 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from mgs.errors import InputError
+
+LONG = 3.0
+"""Times between two samples of a track over their median, beyond which poses are not interpolated.
+"""
+
+STILL = 0.01
+"""Change of a pose, metres and radians, below which it is interpolated over any time."""
+
+WITHOUT_POSE = "without a pose at its time"
+"""Reason to leave an image out."""
+
+
+def posed(
+    times: Collection[float],
+    pose_at: Callable[[float], np.ndarray | None],
+    left_out: Counter[str],
+) -> list[tuple[float, np.ndarray]]:
+    """(time, pose) of the times that have a pose; the others are counted in `left_out`."""
+    found = [(time, pose) for time in times if (pose := pose_at(time)) is not None]
+    left_out[WITHOUT_POSE] += len(times) - len(found)
+    return found
 
 
 def rigid(translation: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
@@ -41,15 +63,29 @@ class Track:
         return cls(np.array(times), np.stack([known[time] for time in times]))
 
     @cached_property
+    def gaps(self) -> np.ndarray:
+        """Whether the poses between two samples are unknown [T-1]: the time between them is LONG
+        times the median, and the pose changed."""
+        steps = np.diff(self.times)
+        moved = np.linalg.norm(np.diff(self.transforms[:, :3, 3], axis=0), axis=1)
+        turns = Rotation.from_matrix(self.transforms[:, :3, :3])
+        turned = (turns[:-1].inv() * turns[1:]).magnitude()
+        still = (moved < STILL) & (turned < STILL)
+        return np.asarray((steps > LONG * np.median(steps)) & ~still)
+
+    @cached_property
     def _turns(self) -> Slerp:
         return Slerp(self.times, Rotation.from_matrix(self.transforms[:, :3, :3]))
 
     def at(self, time: float) -> np.ndarray | None:
-        """Interpolated transform [4,4]; None before the first and after the last sample. A single
-        sample holds at all times."""
+        """Interpolated transform [4,4]; None before the first and after the last sample, and in
+        `gaps`. A single sample holds at all times."""
         if len(self.times) == 1:
             return self.transforms[0]
         if not self.times[0] <= time <= self.times[-1]:
+            return None
+        before = min(int(np.searchsorted(self.times, time, "right")) - 1, len(self.times) - 2)
+        if self.gaps[before] and time not in self.times[before : before + 2]:
             return None
         pose = np.eye(4)
         pose[:3, :3] = self._turns(time).as_matrix()

@@ -21,7 +21,9 @@ from mgs.colour import srgb_from_linear
 from mgs.data.dataset import FILES, Dataset, intrinsics, load_dataset, read_records
 from mgs.data.frames import Frame, as_captured, capture_record
 from mgs.data.importers import import_shot, silhouette_of
-from mgs.data.sources import Shot, record_camera
+from mgs.data.lens import Lens
+from mgs.data.shots import Shot
+from mgs.data.sources import record_camera
 from mgs.data.up import levelled
 from mgs.errors import InputError, Notice
 from mgs.files import below, read_json, remove_file, write_json
@@ -85,7 +87,7 @@ def begin(folder: Path, poses: Dataset, prior: Prior) -> None:
     for given, frame in zip(poses.frames, frames, strict=True):
         if not given.on_demand:
             image, depth, mask = given.image_path, given.depth_path, given.mask_path
-            shot = Shot(frame.name, frame.camera, np.zeros(5), frame.timestamp, image, depth)
+            shot = Shot(frame.name, frame.camera, None, frame.timestamp, image, depth)
             _commit(folder, frame, replace(shot, mask=mask), silhouette)
 
 
@@ -167,9 +169,9 @@ def _received(
 ) -> Frame:
     """Read, check and commit an answer. Raises InputError where it is refused."""
     image, found = picture(out), answers(out)
-    camera, distortion = frame.camera, np.zeros(5)
+    camera, lens = frame.camera, None
     if flown := found.get(".flown.json"):
-        camera, distortion = _flown(flown, frame, image)
+        camera, lens = _flown(flown, frame, image)
     away = float(np.linalg.norm(camera.position - frame.camera.position))
     limit = live.distance
     if limit is None:
@@ -179,16 +181,16 @@ def _received(
     depth = found.get(".depth.exr") or found.get(".depth.png")
     unit = DEPTH_UNIT if depth and depth.suffix == ".png" else 1.0
     mask = found.get(".mask.png")
-    shot = Shot(frame.name, camera, distortion, frame.timestamp, image, depth, unit, mask)
+    shot = Shot(frame.name, camera, lens, frame.timestamp, image, depth, unit, mask)
     return _commit(root, frame, shot, silhouette)
 
 
-def _flown(path: Path, frame: Frame, image: Path) -> tuple[Camera, np.ndarray]:
-    """Camera and distortion by a flown pose; the lens is that asked for where it says nothing."""
+def _flown(path: Path, frame: Frame, image: Path) -> tuple[Camera, Lens | None]:
+    """Camera and lens by a flown pose; the lens is that asked for where it says nothing."""
     record: Any = read_json(path)
     if not isinstance(record, dict) or "transform_matrix" not in record:
         raise InputError(f"{path}: has no transform_matrix")
-    camera, distortion = record_camera(str(path), intrinsics(frame.camera) | record, image)
+    camera, lens, _ = record_camera(str(path), intrinsics(frame.camera) | record, image)
     asked = frame.camera
     same = (camera.width, camera.height) == (asked.width, asked.height) and all(
         np.allclose(one, other, rtol=0, atol=SAME)
@@ -197,7 +199,7 @@ def _flown(path: Path, frame: Frame, image: Path) -> tuple[Camera, np.ndarray]:
             (camera.K, asked.K),
         )
     )
-    return asked if same else camera, distortion
+    return asked if same else camera, lens
 
 
 def _commit(

@@ -1,0 +1,185 @@
+"""Frames to import, as the readers of all formats return them."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from mgs.camera import Camera
+from mgs.data.clouds import SparseCloud
+from mgs.data.lens import Lens
+from mgs.data.up import PLUS_Z, Up, degrees_between, up_of_cameras
+from mgs.errors import InputError
+from mgs.images import exif_orientation, image_size
+
+LEVELLED = 10.0
+"""Angle from +Z, degrees, up to which cameras' common up vector counts as +Z."""
+
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+
+FAR = 1000.0
+"""Distance of the cameras from the origin over their extent, beyond which float32 loses digits of
+the scene and the origin is moved."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One frame to import, with its camera before undistortion, and its files.
+
+    lens: None for a pinhole. timestamp: seconds. depth_unit: metres per step of a depth image of
+    whole numbers; float_unit: of one of floating-point numbers. turned: its files are turned by
+    their EXIF orientation.
+    """
+
+    name: str
+    camera: Camera
+    lens: Lens | None
+    timestamp: float
+    image: Path
+    depth: Path | None = None
+    depth_unit: float = 1.0
+    mask: Path | None = None
+    rock: Path | None = None
+    float_unit: float = 1.0
+    turned: bool = False
+
+
+@dataclass(frozen=True)
+class Source:
+    """Data to import.
+
+    left_out: number of listed images that are not imported, by reason. notes: lines for the user.
+    sparse: triangulated points. up, unit ("m" or "unit"): None if the source does not say.
+    no_cloud: file of points that the source names and that does not exist. tests: names of the
+    shots that the source sets apart. origin: what was subtracted from all positions.
+    """
+
+    kind: str
+    shots: list[Shot]
+    left_out: Counter[str] = field(default_factory=Counter)
+    notes: tuple[str, ...] = ()
+    sparse: SparseCloud | None = None
+    up: Up | None = None
+    unit: str | None = None
+    no_cloud: Path | None = None
+    tests: frozenset[str] = frozenset()
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def in_metres(self, unit: float) -> Source:
+        """Scale cameras and points by `unit` metres. Raises InputError unless it is positive."""
+        if not 0 < unit < np.inf:
+            raise InputError(
+                f"import: --unit {unit} must be a positive number of metres; correct it"
+            )
+        shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
+        return replace(self, shots=shots, sparse=self.sparse and self.sparse.scaled(unit), unit="m")
+
+    def near_origin(self) -> Source:
+        """Move the origin to the cameras, in whole units, if they are FAR from it."""
+        eyes = np.stack([shot.camera.position for shot in self.shots])
+        centre = np.round(eyes.mean(0))
+        extent = max(float(np.linalg.norm(eyes - eyes.mean(0), axis=1).max()), 1.0)
+        if np.abs(centre).max() < FAR * extent:
+            return self
+        shots = [replace(shot, camera=shot.camera.moved(-centre)) for shot in self.shots]
+        x, y, z = centre.tolist()
+        sparse = self.sparse and replace(self.sparse, points=self.sparse.points - centre)
+        return replace(self, shots=shots, sparse=sparse, origin=(x, y, z))
+
+    def set_apart(self, every: int | None) -> tuple[Source, Source | None]:
+        """Split into (training, test): the shots that the source sets apart, or every Nth by name,
+        from the first. Raises InputError if no training shot is left."""
+        names = set(self.tests)
+        if every is not None:
+            names = set(sorted(shot.name for shot in self.shots)[::every])
+        apart = [shot for shot in self.shots if shot.name in names]
+        others = [shot for shot in self.shots if shot.name not in names]
+        if not others:
+            raise InputError(
+                f"import: {len(apart)} test views of {len(self.shots)} images leave none to choose "
+                "from; correct --test-every, or test_filenames"
+            )
+        if not apart:
+            return self, None
+        return replace(self, shots=others), replace(self, shots=apart, sparse=None)
+
+    def up_or_estimate(self) -> tuple[Up, str]:
+        """Up vector and the reason for it: given by the source, by the format, or estimated by
+        `up_of_cameras`, whose InputError it raises."""
+        if self.up is not None:
+            return self.up, "as the source says"
+        if self.kind == "NeRF-synthetic":
+            return PLUS_Z, "the rule of NeRF-synthetic data"
+        estimate = up_of_cameras([shot.camera for shot in self.shots])
+        levelled = ("nerfstudio", "ROS bag", "TUM RGB-D", "RTAB-Map")
+        if self.kind in levelled and degrees_between(estimate, PLUS_Z) < LEVELLED:
+            return PLUS_Z, f"the cameras' common up vector is within {LEVELLED:.0f} degrees of it"
+        return estimate, "the cameras' common up vector"
+
+
+def frame_name(path: str) -> str:
+    """Flat name of an image path, which is no path: images/left/0001.png -> left_0001."""
+    parts = list(Path(path.replace("\\", "/")).parts)
+    if parts and Path(parts[-1]).suffix.lower() in PICTURE_SUFFIXES:
+        parts[-1] = Path(parts[-1]).stem
+    return "_".join(part for part in parts if part not in (".", "..", "/", "images"))
+
+
+def checked(path: Path, source: Source) -> Source:
+    """Source without the shots whose image does not exist.
+
+    Raises InputError if none is left, if a name is listed twice, or cannot be that of a file.
+    """
+    there = [shot for shot in source.shots if shot.image.is_file()]
+    left_out = source.left_out + Counter({"whose file is missing": len(source.shots) - len(there)})
+    if not there:
+        raise InputError(
+            f"{path}: none of the {source.left_out.total() + len(source.shots)} images it lists "
+            "exists; "
+            "restore them or give --images"
+        )
+    for name, count in Counter(shot.name for shot in there).items():
+        if count > 1:
+            raise InputError(f"{path}: lists {name} more than once; remove the duplicate frames")
+        if not name or name != Path(name).name or not name.isprintable():
+            raise InputError(f"{path}: {name!r} cannot be the name of a file; rename the image")
+    return replace(source, shots=there, left_out=+left_out)
+
+
+def turned_by_exif(source: Source) -> Source:
+    """Source whose pictures are turned by their EXIF orientation if its cameras are for such ones.
+
+    Some programs ignore the orientation and others apply it. Pictures of unequal sides that lie on
+    their side show which by the size of their cameras. Where none does, the pictures are taken as
+    they are stored, and a note says so.
+    """
+    tags = [exif_orientation(shot.image) for shot in source.shots]
+    shown = set()
+    for shot, tag in zip(source.shots, tags, strict=True):
+        if tag >= 5 and (size := image_size(shot.image))[0] != size[1]:
+            shown.add((shot.camera.width, shot.camera.height) == size[::-1])
+    if shown == {True}:
+        return replace(source, shots=[replace(shot, turned=True) for shot in source.shots])
+    if not shown and (count := sum(tag > 1 for tag in tags)):
+        note = (
+            f"EXIF turns {count} pictures, and their sizes do not show whether the poses are of "
+            "the turned ones; they are taken as stored"
+        )
+        return replace(source, notes=(*source.notes, note))
+    return source
+
+
+def natural(path: Path) -> list[tuple[int, int, str]]:
+    """Key to sort paths by, with the numbers in their names as numbers: 2 before 10."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
+
+
+def poses_agree(a: Sequence[np.ndarray], tolerance: float = 1e-6) -> bool:
+    """Whether all poses are equal."""
+    return all(np.allclose(a[0], pose, atol=tolerance) for pose in a)
