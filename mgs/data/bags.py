@@ -158,7 +158,7 @@ class Tree:
                 body = self.parents[body]
             self._add(path, body, stamped, chosen)
         elif topic is not None and not any(topic in by_kind for by_kind in sources.values()):
-            raise InputError(f"{path}: --pose {topic} has no poses; it has {_pose_topics(reader)}")
+            raise InputError(f"{path}: pose {topic} has no poses; it has {_pose_topics(reader)}")
 
     def _add(self, path: Path, child: str, by_kind: dict[str, Samples], chosen: str) -> None:
         """Add the step of a frame: by the topic that is chosen, else tf, else the only one."""
@@ -166,14 +166,14 @@ class Tree:
         others = sorted({*by_kind} - {kind})
         if others and kind not in (chosen, "tf"):
             raise InputError(
-                f"{path}: poses of {child} come from {kind} and {others[0]}; give one as --pose"
+                f"{path}: poses of {child} come from {kind} and {others[0]}; give one as pose"
             )
         self.unused += [f"{name} (tf has the poses of {child})" for name in others]
         parent = max(by_kind[kind], key=lambda name: len(by_kind[kind][name]))
         if len(by_kind[kind]) > 1:
             raise InputError(
                 f"{path}: {kind} has two parents of {child}: {', '.join(sorted(by_kind[kind]))}; "
-                "give the topic of the right poses as --pose"
+                "give the topic of the right poses as pose"
             )
         self.parents[child], self.tracks[child] = parent, Track.of(by_kind[kind][parent])
 
@@ -190,7 +190,7 @@ class Tree:
 
 
 def _pose_topics(reader: Any) -> str:
-    """Topics of poses that could be given as --pose."""
+    """Topics of poses that could be given as pose."""
     kinds = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry")
     found = [one.topic for one in reader.connections if one.msgtype.rpartition("/")[2] in kinds]
     return ", ".join(sorted(set(found))) or "none"
@@ -213,7 +213,7 @@ def read_bag(
         left_out = Counter[str]()
         there = posed(times, lambda time: tree.pose(frame, time), left_out)
         others = _pose_topics(reader)
-        give = f"; if {others} has poses of the camera, give --pose" if others != "none" else ""
+        give = f"; if {others} has poses of the camera, name it: pose TOPIC" if others != "none" else ""
         if frame not in tree.parents:
             raise InputError(
                 f"{path}: no tf or odometry leads to {frame or 'the frame'} of {topic}; "

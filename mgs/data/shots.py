@@ -73,9 +73,7 @@ class Source:
     def in_metres(self, unit: float) -> Source:
         """Scale cameras and points by `unit` metres. Raises InputError unless it is positive."""
         if not 0 < unit < np.inf:
-            raise InputError(
-                f"import: --unit {unit} must be a positive number of metres; correct it"
-            )
+            raise InputError(f"import: unit {unit} must be a positive number of metres; correct it")
         shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
         return replace(self, shots=shots, sparse=self.sparse and self.sparse.scaled(unit), unit="m")
 
@@ -102,7 +100,7 @@ class Source:
         if not others:
             raise InputError(
                 f"import: {len(apart)} test views of {len(self.shots)} images leave none to choose "
-                "from; correct --test-every, or test_filenames"
+                "from; correct test_every, or test_filenames"
             )
         if not apart:
             return self, None
@@ -141,7 +139,7 @@ def checked(path: Path, source: Source) -> Source:
         raise InputError(
             f"{path}: none of the {source.left_out.total() + len(source.shots)} images it lists "
             "exists; "
-            "restore them or give --images"
+            "restore them or give images"
         )
     for name, count in Counter(shot.name for shot in there).items():
         if count > 1:
