@@ -213,7 +213,7 @@ def read_bag(
         left_out = Counter[str]()
         there = posed(times, lambda time: tree.pose(frame, time), left_out)
         others = _pose_topics(reader)
-        give = f"; if {others} has poses of the camera, name it: pose TOPIC" if others != "none" else ""
+        give = f"; if {others} has the camera's poses, give it as pose" if others != "none" else ""
         if frame not in tree.parents:
             raise InputError(
                 f"{path}: no tf or odometry leads to {frame or 'the frame'} of {topic}; "
