@@ -209,6 +209,7 @@ def test_runs_of_one_policy_are_told_apart_by_their_folders(runs, tmp_path):
     other = shutil.copytree(runs[1], tmp_path / "again")
     labels = ["d-optimal", "random (random)", "random (again)"]
     assert list(compare_runs([*runs, other])) == labels
+    assert list(compare_runs([runs[0].parent])) == ["d-optimal", "random"]
     with pytest.raises(InputError, match="same policy and folder name"):
         compare_runs([runs[1], runs[1]])
 

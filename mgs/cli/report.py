@@ -16,7 +16,7 @@ from mgs.files import check_new_file, folder_locked
 
 
 def report(
-    runs: Annotated[list[Path], argument("Run folders, all of one dataset.")],
+    runs: Annotated[list[Path], argument("Run folders, or folders of them; all of one dataset.")],
     out: Annotated[
         Path | None,
         option(

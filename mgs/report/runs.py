@@ -10,18 +10,18 @@ from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import read_text
 from mgs.report.figures import Curves
-from mgs.run.folder import STEPS, Run, open_run, text_of
+from mgs.run.folder import STEPS, Run, holds_run, open_run, text_of
 
 
 def compare_runs(runs: Sequence[str | PathLike[str]]) -> dict[str, Run]:
     """Open runs that are to be compared, by label: the policy, with the folder's name if several
     runs have it. They share their dataset.
 
-    runs: folders or opened runs. Raises InputError as `open_run`, `Run.steps`, `Run.metrics` and
-    `Run.dataset`; if steps.jsonl is not that of the run; if two runs have the same policy and
-    folder name; and if the runs are on different datasets.
+    runs: opened runs, their folders, or folders of these. Raises InputError as `open_run`,
+    `Run.steps`, `Run.metrics` and `Run.dataset`; if steps.jsonl is not that of the run; if two runs
+    have the same policy and folder name; and if the runs are on different datasets.
     """
-    opened = [run if isinstance(run, Run) else open_run(Path(run)) for run in runs]
+    opened = [one for run in runs for one in _opened(run)]
     policies = [run.label for run in opened]
     labelled = {
         run.label
@@ -46,6 +46,16 @@ def compare_runs(runs: Sequence[str | PathLike[str]]) -> dict[str, Run]:
         _check_lines(run)
         run.metrics  # noqa: B018 a damaged file ends the command here
     return labelled
+
+
+def _opened(run: str | PathLike[str]) -> list[Run]:
+    """A run, or all runs in a folder that is none, by name."""
+    if isinstance(run, Run):
+        return [run]
+    path = Path(run)
+    inside = [] if (path / "config.json").exists() else sorted(path.glob("*/config.json"))
+    folders = [file.parent for file in inside if holds_run(file.parent)]
+    return [open_run(folder) for folder in folders or [path]]
 
 
 def _check_lines(run: Run) -> None:
