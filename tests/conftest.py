@@ -68,12 +68,12 @@ def coarse_priors():
 @pytest.fixture
 def short_fits(monkeypatch):
     """Fits of runs have at most two passes: for tests that do not look at their quality."""
-    from mgs.run import operations
+    from mgs import scene
 
-    fit = operations.fit
+    fit = scene.fit
 
     def short(gaussians, cameras, targets, train, *rest):
         few = train.model_copy(update={"passes": min(train.passes, 2)})
         return fit(gaussians, cameras, targets, few, *rest)
 
-    monkeypatch.setattr(operations, "fit", short)
+    monkeypatch.setattr(scene, "fit", short)

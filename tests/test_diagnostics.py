@@ -17,7 +17,7 @@ from mgs.report import diagnostics
 from mgs.run import folder as run_folder
 from mgs.run.folder import Run
 from mgs.run.settings import NbvSettings
-from mgs.run.state import State
+from mgs.run.state import Checkpoint
 from mgs.splat import groups
 
 CHANNELS = {
@@ -34,7 +34,7 @@ def test_scalars_follow_their_formulas(tmp_path):
     surface[4] = 1e-5
     gaussians = Gaussians(*(np.zeros(shape) for shape in ((5, 3), (5, 3), (5, 4), 5, (5, 1, 3))))
     run = Run(tmp_path, NbvSettings(dataset=tmp_path, prior=tmp_path))
-    run.state = State(gaussians, H, surface, [], [], {})
+    run.state = Checkpoint(gaussians, H, surface, [], [], {})
     scalars = diagnostics.run_scalars(run)
     np.testing.assert_allclose(scalars["fisher.scale"], H[:, 3] + H[:, 4] + H[:, 5])
     np.testing.assert_allclose(scalars["fisher.opacity"], H[:, 10])

@@ -1,6 +1,8 @@
 """Directional D- and I-optimality against their definitions, their updated gains against gains
 computed anew, and plans of views."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tiny
@@ -11,9 +13,11 @@ from mgs.colour import SH_C0
 from mgs.policy import criteria, directional, pool_gains
 from mgs.policy.directional import Views, gains
 from mgs.policy.pool_gains import PoolGains, planned_path, planned_views
+from mgs.run import flight
 from mgs.run import folder as run_folder
-from mgs.run import loop
-from mgs.run.problem import Problem
+from mgs.run.loop import choose
+from mgs.run.policies import POLICIES
+from mgs.scene import learn
 from mgs.splat import reference
 
 LAM = (0.02 / 1.0) ** 2
@@ -290,7 +294,7 @@ def test_views_are_chosen_without_looking_at_any_fit(loaded, tmp_path, policy):
         return fit
 
     whole = tiny.run(tmp_path / "run", loaded, policy=policy)
-    same = tiny.run(tmp_path / "black", loaded, tiny.operations(fit=black), policy=policy)
+    same = tiny.run(tmp_path / "black", loaded, parts={"fit": black}, policy=policy)
     assert same.taken == whole.taken
     for key in ("score", "coverage"):
         assert [step[key] for step in same.steps] == [step[key] for step in whole.steps]
@@ -324,47 +328,63 @@ def test_what_poses_see_is_measured_once(loaded, tmp_path, policy):
         looked.append(camera)
         return tiny.fisher(gaussians, camera)
 
-    settings = tiny.start(tmp_path / "run", loaded, policy=policy)
-    problem = Problem(loaded, settings, tiny.operations(exact=exact))
-    state = loop.learn(problem, problem.seeds)
+    scene = tiny.scene(loaded, tiny.start(tmp_path / "run", loaded), exact=exact)
+    state = learn(scene, scene.seeds(3))
     looked.clear()
-    first = loop.choose(problem, state)
+    first = choose(scene, state, POLICIES[policy])
     assert looked
     looked.clear()
-    assert loop.choose(problem, state) == first
+    assert choose(scene, state, POLICIES[policy]) == first
     assert not looked
 
 
-def flown(loaded, out, **values):
-    """A run of four views: its problem, seeds and chosen views."""
-    state = tiny.run(out, loaded, budget=4, **values)
-    problem = Problem(loaded, run_folder.open_run(out).settings, tiny.operations())
-    return problem, state.taken[:3], state.taken[3:]
+def flown(loaded, out, policy, **limits):
+    """A run of four views: its scene, a function views -> state, its mission and chosen views."""
+    taken = tiny.run(out, loaded, budget=4, policy=policy, **limits).taken
+    settings = run_folder.open_run(out).settings
+    scene = tiny.scene(loaded, settings)
+    start = learn(scene, taken[:3])
+    return scene, lambda views: replace(start, taken=(*taken[:3], *views)), settings, taken[3:]
 
 
 @pytest.mark.parametrize("policy", ["directional-d", "directional-i"])
 def test_a_run_takes_the_views_of_its_plan(loaded, tmp_path, policy):
-    """Whatever order; after another view a new plan is made, and with a travel cost none."""
-    problem, seeds, chosen = flown(loaded, tmp_path / "run", policy=policy)
-    left = problem.reachable(seeds)
-    assert sorted(chosen) == problem.planned(seeds, left)
-    first = [*seeds, chosen[0]]
-    assert problem.planned(first, problem.reachable(first)) == sorted(chosen[1:])
-    other = [*seeds, next(i for i in left if i not in chosen)]
-    new = problem.planned(other, problem.reachable(other))
-    assert len(new) == 3
-    for changes in ({"travel": 1.0}, {"policy": "cover"}):
-        assert problem.with_settings(**changes).planned(seeds, left) == left
+    """Whatever order; after another view a new plan is made."""
+    scene, after, mission, chosen = flown(loaded, tmp_path / "run", policy)
+
+    def planned(views):
+        state = after(views)
+        candidates, left = flight.free(scene, state, mission), flight.views_left(state, mission)
+        plan = POLICIES[policy].plan(scene, state, candidates, left, None)
+        return sorted(i for i in plan if i in candidates)
+
+    assert planned([]) == sorted(chosen)
+    assert planned(chosen[:1]) == sorted(chosen[1:])
+    other = next(i for i in flight.free(scene, after([]), mission) if i not in chosen)
+    assert len(planned([other])) == 3
 
 
 @pytest.mark.parametrize("policy", ["directional-d", "directional-i"])
 def test_a_run_with_limited_reach_follows_its_path(loaded, tmp_path, policy):
     """After another view a new path is planned."""
-    problem, seeds, chosen = flown(loaded, tmp_path / "run", policy=policy, nearest=2)
+    scene, after, mission, chosen = flown(loaded, tmp_path / "run", policy, nearest=2)
     for step in range(4):
-        taken = [*seeds, *chosen[:step]]
-        assert chosen[step] in problem.reachable(taken)
-        assert problem.planned(taken, problem.reachable(taken)) == [chosen[step]]
-    other = [*seeds, next(i for i in problem.reachable(seeds) if i != chosen[0])]
-    (new,) = problem.planned(other, problem.reachable(other))
-    assert new in problem.reachable(other)
+        state = after(chosen[:step])
+        assert chosen[step] in flight.reachable(scene, state, mission)
+        assert choose(scene, state, POLICIES[policy], mission)[0] == chosen[step]
+    other = next(i for i in flight.reachable(scene, after([]), mission) if i != chosen[0])
+    new, _ = choose(scene, after([other]), POLICIES[policy], mission)
+    assert new in flight.reachable(scene, after([other]), mission)
+
+
+def test_a_travel_cost_is_weighed_against_the_gain_of_every_pose(loaded, tmp_path):
+    """No plan is made, since the cost depends on the last view."""
+    scene, after, mission, _ = flown(loaded, tmp_path / "run", "directional-d")
+    state, policy = after([]), POLICIES["directional-d"]
+    near = mission.model_copy(update={"travel": 1e-3})
+    views = flight.free(scene, state, mission)
+    here, positions = scene.positions(state.frames)[state.taken[-1]], scene.positions(state.frames)
+    worth = policy(scene, state, views) / (
+        1 + np.linalg.norm(positions[views] - here, axis=1) / 1e-3
+    )
+    assert choose(scene, state, policy, near)[0] == views[int(worth.argmax())]

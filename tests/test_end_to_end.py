@@ -14,10 +14,10 @@ from mgs.cli.app import COMMANDS, main
 from mgs.data.dataset import load_dataset
 from mgs.evaluation import psnr_measure
 from mgs.images import read_exr
-from mgs.policy.registry import policy_names
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.report import predicted_error
+from mgs.run.policies import POLICIES
 from mgs.splat import ListCache
 from mgs.splat_ply import read_ply
 from mgs.synth.rendering import write_contact_sheet
@@ -27,10 +27,10 @@ pytestmark = pytest.mark.usefixtures("coarse_priors")
 VIEWS = ["--seeds", "3", "--budget", "4", "--set", "train.passes=6", "--seed", "1"]
 STRUCK = """
 import os, signal
-from mgs.run import operations
+from mgs import scene
 from mgs.cli.app import main
 
-fit, fits = operations.fit, []
+fit, fits = scene.fit, []
 
 def interrupted(gaussians, cameras, targets, settings, on_pass, *rest):
     fits.append(len(cameras))
@@ -42,7 +42,7 @@ def interrupted(gaussians, cameras, targets, settings, on_pass, *rest):
 
     return fit(gaussians, cameras, targets, settings, interrupt, *rest)
 
-operations.fit = interrupted
+scene.fit = interrupted
 # A shell lets its background processes ignore this signal.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 main()
@@ -145,7 +145,7 @@ def test_demo_shows_the_table_and_the_pictures_and_can_be_repeated(tmp_path, cap
     dataset = synthetic.write_dataset(out / "dataset", synthetic.orbit_cameras(13, 32, 24))
     write_contact_sheet(out / "dataset/contact_sheet.png", dataset.frames)
     synthetic.write_dataset(out / "dataset/test", synthetic.orbit_cameras(2, 32, 24))
-    assert set(demo.POLICIES) < set(policy_names())
+    assert set(demo.POLICIES) < set(POLICIES)
     policies = ("d-optimal", "random")
     monkeypatch.setattr("mgs.cli.demo.POLICIES", policies)
     monkeypatch.setattr("mgs.cli.demo.GAUSSIANS", "150")

@@ -21,8 +21,9 @@ from mgs.prior.exposure import DARK, GAIN_STD, RATIO_STD, SATURATED, solve_gains
 from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate_run
 from mgs.report.tables import markdown_table
-from mgs.run.folder import State, read_checkpoint
+from mgs.run.folder import read_checkpoint
 from mgs.run.nbv import resume_nbv, run_nbv
+from mgs.run.state import Checkpoint
 
 
 def normalised(gains: np.ndarray) -> np.ndarray:
@@ -132,7 +133,7 @@ def varied(rock: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-Runs = dict[str, tuple[State, Path]]
+Runs = dict[str, tuple[Checkpoint, Path]]
 
 RUN = {"policy": "uniform", "seeds": 4, "budget": 5, "train": {"passes": 20}}
 
@@ -191,7 +192,7 @@ def test_the_alarm_of_exposure_is_silent_where_gains_explain_it(runs):
 
 
 def test_an_interrupted_run_goes_on_bit_for_bit(varied, runs, tmp_path):
-    def kill(state: State) -> None:
+    def kill(state: Checkpoint) -> None:
         if len(state.steps) == 2:
             raise KeyboardInterrupt
 

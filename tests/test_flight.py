@@ -13,7 +13,6 @@ from mgs.policy import tour
 from mgs.policy.directional import Views, gains
 from mgs.policy.pool_gains import PoolGains
 from mgs.run import folder as run_folder
-from mgs.run.problem import Problem
 from mgs.run.settings import FlightLimits
 
 POSITIONS = arrays(np.float64, (9, 3), elements=st.floats(-50, 50, width=32))
@@ -152,9 +151,8 @@ def test_a_flight_never_exceeds_its_limits_and_resumes_the_same(loaded, tmp_path
         if len(state.taken) >= 4:
             raise KeyboardInterrupt
 
-    settings, parts = tiny.start(tmp_path / "part", loaded, **given), tiny.operations()
     with pytest.raises(KeyboardInterrupt):
-        tiny.recording.run(tmp_path / "part", settings, loaded, parts, tiny.silent, stop)
+        run(tmp_path / "part", loaded, on_step=stop, **given)
     assert tiny.resume(tmp_path / "part", loaded).taken == state.taken
 
 
@@ -172,6 +170,7 @@ def test_poses_that_are_not_allowed_are_never_taken(dataset, prior, tmp_path, ca
     assert len(steps(tmp_path / "run")) == 3
     settings = run_folder.open_run(tmp_path / "run").settings
     settings = settings.model_copy(update={"flight": FlightLimits(no_fly=2.0)})
-    problem = Problem(run_folder.open_run(tmp_path / "run").dataset, settings, tiny.operations())
-    opposite = problem.flight.legs[0, 6]
+    scene = tiny.scene(run_folder.open_run(tmp_path / "run").dataset, settings)
+    positions = scene.positions(scene.frames)
+    opposite = tour.legs(positions, scene.centre[:2], settings.flight.no_fly)[0, 6]
     assert 6 < opposite == pytest.approx(2 * np.sqrt(5) + 2 * (np.pi - 2 * np.arccos(2 / 3)), 0.01)

@@ -13,7 +13,6 @@ from program import change_settings
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.run import folder as run_folder
-from mgs.run import recording
 
 
 def other_image(root: Path, name: str) -> None:
@@ -55,7 +54,7 @@ def half_done(dataset, tmp_path):
     """A dataset and a run of three steps of six."""
     loaded, out = load_dataset(dataset), tmp_path / "run"
     settings = tiny.start(out, loaded).model_copy(update={"budget": 2})
-    recording.run(out, settings, loaded, tiny.operations(), tiny.silent)
+    tiny.go(out, settings, loaded)
     return dataset, out
 
 
@@ -88,4 +87,4 @@ def test_a_run_does_not_go_on_from_other_initial_gaussians(half_done):
         return replace(g, means=g.means + np.float32(0.01))
 
     with pytest.raises(InputError, match=r"is not the prior that .*run was started on"):
-        tiny.resume(out, load_dataset(root), tiny.operations(initial=initial))
+        tiny.resume(out, load_dataset(root), initial=initial)

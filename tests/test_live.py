@@ -68,7 +68,7 @@ class Flight:
         capture = live.live_capture(dataset, self.prior, live.Live(deliver, **options))
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            tiny.resume(self.out, dataset, tiny.operations(capture=capture))
+            tiny.resume(self.out, dataset, capture=capture)
         return [str(one.message) for one in said if one.category is Notice]
 
     @property

@@ -8,6 +8,7 @@ import tiny
 from program import change_settings
 from refusals import refused
 
+from mgs import scene as scene_module
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
@@ -22,7 +23,6 @@ from mgs.report.convergence import remaining_decrease
 from mgs.report.diagnostics import diagnose_run
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
-from mgs.run import operations
 from mgs.run.nbv import resume_nbv, run_nbv, start_run
 from mgs.run.settings import NbvSettings
 from mgs.splat import MEANS, as_drjit, fisher, groups, render
@@ -208,7 +208,7 @@ def test_criteria_see_the_means_and_coverage_does_not(files, whole):
 
 def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, monkeypatch):
     means, out, state = whole
-    real, calls = operations.fit, []
+    real, calls = scene_module.fit, []
 
     def struck(*arguments):
         calls.append(1)
@@ -216,7 +216,7 @@ def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, mon
             raise KeyboardInterrupt
         return real(*arguments)
 
-    monkeypatch.setattr(operations, "fit", struck)
+    monkeypatch.setattr(scene_module, "fit", struck)
     with pytest.raises(KeyboardInterrupt):
         run_nbv(files[0], tmp_path / "run", **options(files, means))
     resumed = resume_nbv(tmp_path / "run").state

@@ -13,6 +13,7 @@ import pytest
 import synthetic
 
 import mgs
+from mgs import evaluation, scene
 from mgs.data import importers
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame
@@ -23,7 +24,6 @@ from mgs.fit import objective
 from mgs.memory import PADDING, adopted, kept_within, padded
 from mgs.prior.build import build_prior, prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.run import operations, problem
 from mgs.run.nbv import run_nbv
 
 
@@ -75,17 +75,17 @@ def rock(tmp_path_factory):
 
 
 def test_a_run_holds_few_images_at_once_and_finds_the_same(rock, tmp_path, monkeypatch):
-    live, target, target_of = Live(), Frame.target, problem.target_of
+    live, target, target_of = Live(), Frame.target, scene.target_of
 
     def watched(frame):
         rgba, weight = target(frame)
         return live.watch(rgba), weight
 
     monkeypatch.setattr(Frame, "target", watched)
-    monkeypatch.setattr(problem, "target_of", lambda *frame: live.watch(target_of(*frame)))
+    monkeypatch.setattr(scene, "target_of", lambda *frame: live.watch(target_of(*frame)))
     found, most = [], []
     for name, budget in (("kept", 1 << 30), ("read again", 0)):
-        for module in (problem, objective, operations):
+        for module in (scene, objective, evaluation):
             monkeypatch.setattr(module, "IMAGE_BYTES", budget)
         gc.collect()
         live.now = live.most = 0

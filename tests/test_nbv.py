@@ -23,11 +23,9 @@ from tiny import resume, run
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.fit.stopping import StopReason
-from mgs.policy import criteria
-from mgs.policy import poses as pose_policies
-from mgs.policy.registry import needs_model, policy_names
+from mgs.policy import criteria, poses
 from mgs.run import folder as run_folder
-from mgs.run import problem, recording
+from mgs.run import policies
 from mgs.splat_ply import read_ply
 
 OF_A_FIT = {"uncertainty", "iterations", "loss", "stop_reason"}
@@ -63,12 +61,12 @@ def test_views_are_the_best_at_the_model_and_given_the_batch_so_far(loaded, tmp_
 
 
 def test_fits_start_in_the_colours_of_all_images_taken(loaded, tmp_path):
-    """The model moves with the prior's colours; means stay those of the seeds."""
+    """The model moves with the prior's colours."""
     handed, fitted = [], []
 
     def initial(frames):
         g, count = tiny.initial(frames), np.float32(len(frames))
-        return replace(g, sh=g.sh + count, means=g.means + count)
+        return replace(g, sh=g.sh + count)
 
     def fit(gaussians, start, *others):
         handed.append((gaussians, start))
@@ -76,11 +74,10 @@ def test_fits_start_in_the_colours_of_all_images_taken(loaded, tmp_path):
         fitted.append(found.gaussians)
         return found
 
-    run(tmp_path / "run", loaded, tiny.operations(initial=initial, fit=fit), budget=2)
+    run(tmp_path / "run", loaded, parts={"initial": initial, "fit": fit}, budget=2)
     assert len(handed) == 3
     for step, (model, start) in enumerate(handed):
         np.testing.assert_array_equal(start.sh, initial([None] * (3 + step)).sh)
-        np.testing.assert_array_equal(start.means, initial([None] * 3).means)
         expected = start.sh if step == 0 else fitted[step - 1].sh + np.float32(1)
         np.testing.assert_allclose(model.sh, expected, atol=1e-5)
         np.testing.assert_array_equal(model.means, start.means)
@@ -88,14 +85,14 @@ def test_fits_start_in_the_colours_of_all_images_taken(loaded, tmp_path):
 
 def test_a_tie_goes_to_the_farthest_camera(loaded, tmp_path):
     """Views spread where every view sees everything and coverage has no preference."""
-    same = tiny.operations(fisher=lambda *_: np.ones((tiny.POINTS, 11), np.float32))
-    state = run(tmp_path / "run", loaded, same, policy="coverage", seeds=1, budget=3)
+    same = {"fisher": lambda *_: np.ones((tiny.POINTS, 11), np.float32)}
+    state = run(tmp_path / "run", loaded, parts=same, policy="coverage", seeds=1, budget=3)
     assert [line["score"] for line in state.steps[1:]] == [0, 0, 0]
     assert sorted(state.taken) == [0, 3, 6, 9]
 
 
 @pytest.mark.parametrize(
-    ("policy", "batch"), [("d-optimal", 1), *((name, 2) for name in policy_names())]
+    ("policy", "batch"), [("d-optimal", 1), *((name, 2) for name in policies.POLICIES)]
 )
 def test_a_run_reads_the_images_of_its_choices_and_writes_what_it_did(
     dataset, tmp_path, policy, batch
@@ -110,8 +107,8 @@ def test_a_run_reads_the_images_of_its_choices_and_writes_what_it_did(
             shutil.copy(hidden / path.relative_to(dataset), path)
         return frame
 
-    parts = tiny.operations(capture=capture)
-    state = run(tmp_path / "run", known, parts, policy=policy, batch=batch)
+    parts = {"capture": capture}
+    state = run(tmp_path / "run", known, parts=parts, policy=policy, batch=batch)
     names = [known.frames[i].name for i in state.taken]
     assert list(dict.fromkeys(made)) == names
     lines = steps(tmp_path / "run")
@@ -137,7 +134,7 @@ def test_one_candidate_in_memory_at_a_time(loaded, tmp_path):
         alive.append(weakref.ref(F))
         return F
 
-    run(tmp_path / "run", loaded, tiny.operations(fisher=fisher))
+    run(tmp_path / "run", loaded, parts={"fisher": fisher})
     assert len(alive) > 50
 
 
@@ -196,7 +193,7 @@ def test_a_fit_that_diverges_ends_the_run_which_can_go_on(
 
     out = tmp_path / "run"
     with pytest.raises(InputError, match=named) as stop:
-        run(out, loaded, tiny.operations(fit=fit), batch=batch)
+        run(out, loaded, parts={"fit": fit}, batch=batch)
     said = str(stop.value)
     assert "diverged: its loss was 0.0123 at the start, and 0.5, nan in the last passes" in said
     assert f"`train.rates` in {out / 'config.json'}" in said
@@ -208,18 +205,19 @@ def test_a_fit_that_diverges_ends_the_run_which_can_go_on(
 
 
 def test_a_choice_takes_the_seconds_of_its_policy(loaded, tmp_path, monkeypatch):
-    def slow(candidates, taken, centre, rng):
+    def slow(candidates, taken, centre):
         time.sleep(0.05)
-        return rng.random(len(candidates))
+        return np.ones(len(candidates))
 
-    monkeypatch.setitem(pose_policies.POSE_POLICIES, "slow", slow)
+    monkeypatch.setitem(policies.POLICIES, "slow", policies.Poses("slow", slow))
     state = run(tmp_path / "run", loaded, policy="slow", batch=2, budget=2)
     assert all(step["seconds"]["score"] >= 0.05 for step in state.steps[1:])
 
 
 @pytest.mark.parametrize("score", [math.nan, math.inf])
 def test_a_policy_that_returns_no_number_is_named(loaded, tmp_path, monkeypatch, score):
-    monkeypatch.setitem(criteria.CRITERIA, "mine", criteria.Criterion(lambda F, H, lam: score))
+    mine = policies.Information("mine", lambda F, H, lam: score)
+    monkeypatch.setitem(policies.POLICIES, "mine", mine)
     with pytest.raises(InputError, match="policy mine: returned a score that is NaN or infinite"):
         run(tmp_path / "run", loaded, policy="mine")
     assert len(steps(tmp_path / "run")) == 1
@@ -247,9 +245,8 @@ def test_a_step_is_a_view_and_the_last_of_a_batch_has_its_fit(loaded, tmp_path):
     def on_step(state):
         seen.append(len(state.taken))
 
-    out, parts = tmp_path / "run", tiny.operations(fit=fit)
-    settings = tiny.start(out, loaded, batch=2, evaluate_every=3)
-    state = recording.run(out, settings, loaded, parts, tiny.silent, on_step)
+    out, values = tmp_path / "run", {"batch": 2, "evaluate_every": 3}
+    state = run(out, loaded, on_step=on_step, parts={"fit": fit}, **values)
     assert fits == seen == [3, 5, 7, 8], "the budget of 5 views is no multiple of 2"
     lines = steps(out)
     assert [set(line) >= OF_A_FIT for line in lines] == [True, False, True, False, True, True]
@@ -263,17 +260,16 @@ def test_a_step_is_a_view_and_the_last_of_a_batch_has_its_fit(loaded, tmp_path):
 
 
 @pytest.mark.parametrize("room", [1 << 30, 0], ids=["kept", "no room"])
-def test_a_batch_measures_each_candidate_once_if_there_is_room(loaded, tmp_path, monkeypatch, room):
+def test_a_batch_measures_each_candidate_once_if_there_is_room(loaded, tmp_path, room):
     measured = []
 
     def fisher(gaussians, camera):
         measured.append((gaussians.sh.tobytes(), camera.key))
         return tiny.fisher(gaussians, camera)
 
-    monkeypatch.setattr(problem, "VIEW_BYTES", room)
-    parts = tiny.operations(fisher=fisher, exact=tiny.fisher)
+    parts = {"fisher": fisher, "exact": tiny.fisher, "keep": room}
     views = {"budget": 6, "batch": 3, "policy": "d-optimal"}
-    state = run(tmp_path / "run", loaded, parts, **views)
+    state = run(tmp_path / "run", loaded, parts=parts, **views)
     assert state.taken == run(tmp_path / "as before", loaded, **views).taken
     candidates = 9 + 6  # of two batches
     taken = 3 + 6 + 9  # views whose information is summed after three fits
@@ -283,15 +279,15 @@ def test_a_batch_measures_each_candidate_once_if_there_is_room(loaded, tmp_path,
 
 
 @pytest.mark.parametrize(
-    ("policy", "nearest"), [("d-optimal", 3), *((name, None) for name in policy_names())]
+    ("policy", "nearest"), [("d-optimal", 3), *((name, None) for name in policies.POLICIES)]
 )
 def test_a_batch_counts_as_taken_for_every_policy(loaded, tmp_path, policy, nearest):
     """A batch has the views that are chosen one by one, where fits do not change the policy."""
-    parts = tiny.operations()
-    if needs_model(policy):
-        parts = tiny.operations(fit=lambda g, *rest: tiny.Fit(g, 0.1, 1))
+    parts = {}
+    if policies.POLICIES[policy].needs_fit:
+        parts = {"fit": lambda g, *rest: tiny.Fit(g, 0.1, 1)}
     one, three = (
-        run(tmp_path / str(batch), loaded, parts, policy=policy, nearest=nearest, batch=batch)
+        run(tmp_path / str(batch), loaded, parts=parts, policy=policy, nearest=nearest, batch=batch)
         for batch in (1, 3)
     )
     assert one.taken == three.taken
@@ -325,12 +321,12 @@ METRES = st.floats(-100, 100)
     st.floats(0.1, 10),
 )
 def test_cost_of_an_image_and_of_the_way_to_it(positions, here, travel, factor):
-    cost = pose_policies.travel_cost(positions, here, travel)
+    cost = poses.travel_cost(positions, here, travel)
     distance = np.linalg.norm(positions - here, axis=1)
     np.testing.assert_allclose(travel * (cost - 1), distance, atol=1e-6)
     assert (cost >= 1).all()
-    assert pose_policies.travel_cost(here[None], here, travel) == 1
-    scaled = pose_policies.travel_cost(factor * positions, factor * here, factor * travel)
+    assert poses.travel_cost(here[None], here, travel) == 1
+    scaled = poses.travel_cost(factor * positions, factor * here, factor * travel)
     np.testing.assert_allclose(cost, scaled, rtol=1e-6)
 
 
@@ -362,8 +358,8 @@ def test_the_choice_is_the_best_gain_for_its_cost(loaded, tmp_path, travel, batc
 
 def test_what_cannot_be_divided_by_a_cost_is_refused(loaded, tmp_path, monkeypatch):
     negative = lambda candidates, *rest: -np.ones(len(candidates))  # noqa: E731
-    monkeypatch.setitem(pose_policies.POSE_POLICIES, "mine", negative)
-    with pytest.raises(InputError, match="policy mine: returned negative scores, which travel"):
+    monkeypatch.setitem(policies.POLICIES, "mine", policies.Poses("mine", negative))
+    with pytest.raises(InputError, match="policy mine: returned negative scores, which a travel"):
         run(tmp_path / "run", loaded, policy="mine", travel=1.0)
     assert len(run(tmp_path / "free", loaded, policy="mine").taken) == 8
 
@@ -377,7 +373,7 @@ def test_moves_can_be_limited_to_the_nearest_poses(loaded, tmp_path):
     for step in range(3, 9):
         left = [i for i in range(12) if i not in state.taken[:step]]
         here = positions[state.taken[step - 1]]
-        near = [left[k] for k in pose_policies.nearest_poses(positions[left], here, 2)]
+        near = [left[k] for k in poses.nearest_poses(positions[left], here, 2)]
         assert len(near) == 2
         assert state.taken[step] in near
     free = run(tmp_path / "free", loaded, **far)
@@ -392,4 +388,4 @@ def test_moves_can_be_limited_to_the_nearest_poses(loaded, tmp_path):
 def test_the_nearest_poses(count, nearest):
     """Ties go to the first pose."""
     positions = np.array([[0.0, 0, 0], [3, 0, 0], [1, 0, 0], [-1, 0, 0], [9, 0, 0]])
-    assert pose_policies.nearest_poses(positions, np.zeros(3), count) == nearest
+    assert poses.nearest_poses(positions, np.zeros(3), count) == nearest

@@ -26,7 +26,7 @@ from mgs.run import folder as run_folder
 from mgs.run import nbv
 from mgs.run.inputs import prior_digest
 from mgs.run.settings import NbvSettings
-from mgs.run.state import State
+from mgs.run.state import Checkpoint
 from mgs.splat import ListCache, fisher
 from mgs.splat_ply import read_ply
 
@@ -72,9 +72,9 @@ def test_a_frame_without_rock_is_refused_before_it_is_fitted_to(dataset, tmp_pat
         fits.append(len(cameras))
         return tiny.fit(gaussians, start, cameras, *rest)
 
-    parts = tiny.operations(fit=fit)
+    parts = {"fit": fit}
     with pytest.raises(InputError, match=f"kf_000{frame}.*is empty"):
-        tiny.run(tmp_path / "run", load_dataset(dataset), parts, policy="farthest")
+        tiny.run(tmp_path / "run", load_dataset(dataset), parts=parts, policy="farthest")
     assert max(fits, default=0) == images
 
 
@@ -100,7 +100,7 @@ def test_what_is_printed_of_a_run(tmp_path):
     line = {"step": 0, "name": None, "seed_names": ["a", "b"], "score": None, "coverage": 1.0}
     line |= {"seconds": {"fit": 2.5}, "images": 2, "iterations": 14, "loss": 0.1}
     line |= {"stop_reason": "pass-limit", "psnr": 20.0, "test_psnr": 30.12, "test_psnr_mask": 25.5}
-    state = State(tiny.initial([]), np.zeros(0), np.zeros(0), [0], [line])
+    state = Checkpoint(tiny.initial([]), np.zeros(0), np.zeros(0), [0], [line])
     console = Console(record=True, width=80, force_terminal=True)
     print_run(tmp_path, state, {"all": views, "test": views}, console)
     shown = console.export_text()

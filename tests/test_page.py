@@ -23,7 +23,6 @@ from mgs.report import page_pictures
 from mgs.report.evaluation import evaluate_run
 from mgs.report.page import write_page
 from mgs.report.page_plots import corners_at
-from mgs.run import recording
 from mgs.run.folder import open_run
 
 
@@ -34,12 +33,11 @@ def runs(tmp_path_factory):
     root = tmp_path_factory.mktemp("a <b> & c")  # to be escaped, in an address and in text
     tiny.write_dataset(root / "data/test", frames=3)
     dataset = load_dataset(tiny.write_dataset(root / "data"))
-    parts = tiny.operations(measure=lambda gaussians, taken: {"psnr": float(len(taken))})
     for policy, budget in (("d-optimal", 3), ("random", 1)):
         out = root / policy
         settings = tiny.start(out, dataset, policy=policy, budget=3, evaluate_every=1)
         settings = settings.model_copy(update={"budget": budget})
-        recording.run(out, settings, dataset, parts, tiny.silent)
+        tiny.go(out, settings, dataset)
     metrics = evaluate_run(root / "d-optimal", pictures=False)
     # A stand-in: there is no prior to measure it by.
     fit = {"phi": 1.0, "predicted_decrease": 0.004, "converged": True}
@@ -213,7 +211,7 @@ def hostile(tmp_path_factory):
     (dataset / "transforms.json").write_text(text.replace("\\", "\\\\"))
     loaded = load_dataset(dataset)
     run = root / EVIL
-    tiny.run(run, loaded, tiny.operations(), budget=2, evaluate_every=1)
+    tiny.run(run, loaded, budget=2, evaluate_every=1)
     evaluate_run(run)
     config = read_json(run / "config.json")
     config["settings"]["policy"] = f"/a/{EVIL}.py:{EVIL}"

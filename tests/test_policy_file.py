@@ -9,10 +9,9 @@ from refusals import refused
 import mgs
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
-from mgs.policy.registry import check_policy, policy_named
-from mgs.run import recording
 from mgs.run.folder import open_run
 from mgs.run.nbv import start_run
+from mgs.run.policy_file import check_policy, policy_of
 
 FUNCTIONS = """
 from __future__ import annotations
@@ -145,7 +144,7 @@ def test_a_run_goes_on_with_the_same_file_only(dataset, file, tmp_path, monkeypa
     run(half, loaded, policy=f"{file}:poses", budget=1)
     assert open_run(half).label == "mine.py:poses"
     settings = open_run(half).settings.model_copy(update={"budget": 2})
-    further = lambda: recording.run(half, settings, loaded, tiny.operations(), tiny.silent)  # noqa: E731
+    further = lambda: tiny.go(half, settings, loaded)  # noqa: E731
     file.write_text(FUNCTIONS + "\n")
     with pytest.raises(InputError, match=r"mine\.py:poses: its file has changed since .*half was"):
         further()
@@ -165,8 +164,8 @@ def test_a_file_is_executed_once_until_it_changes(tmp_path):
     source = f"with open({str(log)!r}, 'a') as log: log.write('x')\ndef poses(taken): ...\n"
     for count, text in enumerate([source, source + "# changed\n"], start=1):
         path.write_text(text)
-        policy_named(f"{path}:poses")
-        policy_named(f"{path}:poses")
+        policy_of(f"{path}:poses")
+        policy_of(f"{path}:poses")
         assert log.read_text() == count * "x"
 
 

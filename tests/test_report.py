@@ -20,12 +20,12 @@ from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import read_json, write_json
-from mgs.policy.registry import policy_names
 from mgs.report import figures, tables, writing
 from mgs.report.figures import POLICY_STYLE
 from mgs.report.page_plots import SYMBOLS
 from mgs.report.runs import compare_runs
 from mgs.run.folder import open_run
+from mgs.run.policies import POLICIES
 
 FIGURES = ("orbit", "gain", "coverage", "comparison", "psnr")
 
@@ -44,7 +44,7 @@ def runs(tmp_path_factory):
 
     return [
         tiny.write_measured_run(
-            root / policy, dataset, grey, tiny.operations(measure=measure),
+            root / policy, dataset, grey, {"measure": measure},
             policy=policy, evaluate_every=1,
         )
         for policy, grey in (("d-optimal", 0.3), ("random", 0.2))
@@ -317,7 +317,7 @@ def test_every_line_of_a_figure_looks_different():
 
 
 def test_every_policy_has_a_colour_and_a_marker_of_its_own():
-    assert set(POLICY_STYLE) >= set(policy_names())
+    assert set(POLICY_STYLE) >= set(POLICIES)
     colours, markers = zip(*POLICY_STYLE.values(), strict=True)
     assert len(set(colours)) == len(set(markers)) == len({SYMBOLS[one] for one in markers})
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from program import change_settings, command, steps, table_numbers
@@ -83,7 +82,7 @@ def test_a_run_that_ended_goes_on_only_when_its_rule_is_changed(loaded, whole, t
     assert state.steps[-1]["ended"] == {"reason": reason, "views": 2, **numbers}
     assert three["name"] not in state.inputs["files"], "the image of a view that was refused"
     before = {path.name: path.read_bytes() for path in out.iterdir()}
-    again = resume(out, loaded, tiny.operations(fit=never, fisher=never))
+    again = resume(out, loaded, fit=never, fisher=never)
     assert again.taken == state.taken
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     change_settings(out, **{rule: changed})

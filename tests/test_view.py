@@ -26,7 +26,6 @@ from mgs.camera import Camera, look_at
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset
 from mgs.report.evaluation import evaluate_run
-from mgs.run import recording
 from mgs.run.folder import open_run
 from mgs.splat import render
 from mgs.splat_ply import write_ply
@@ -39,7 +38,7 @@ def steps(run, budget):
     """Let a run on stand-ins go on to this many chosen views."""
     opened = open_run(run)
     settings = opened.settings.model_copy(update={"budget": budget})
-    recording.run(run, settings, opened.dataset, tiny.operations(), tiny.silent)
+    tiny.go(run, settings, opened.dataset)
 
 
 @pytest.fixture(scope="module")

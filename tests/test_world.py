@@ -40,7 +40,11 @@ def make_run(root: Path, tilted: bool) -> Path:
     def turned(g: Gaussians) -> Gaussians:
         return replace(g, means=(g.means @ turn.T).astype(np.float32))
 
-    parts = tiny.operations(initial=lambda frames: turned(tiny.initial(frames)), up=dataset.up)
+    def initial(frames):
+        return turned(tiny.initial(frames))
+
+    there = tiny.prior(dataset.up)
+    parts = {"initial": initial, "prior": there}
     return tiny.write_measured_run(root / "run", dataset, 0.0, parts, policy="uniform")
 
 

@@ -1,30 +1,38 @@
-"""A rock of a few pixels: a dataset on disk, and the operations of the loop in NumPy.
+"""A rock of a few pixels: a dataset on disk, and a scene that is fitted in NumPy.
 
 `python tiny.py DATASET OUT MOMENT COUNT` starts a run and kills itself (SIGKILL) at the COUNT-th
-MOMENT (`dying_operations`).
+MOMENT (`dying_parts`).
 """
 
 import os
 import signal
 import sys
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.data.frames import Frame
+from mgs.data.meshes import Mesh
+from mgs.data.up import upright
 from mgs.files import write_json
 from mgs.fit.settings import TrainSettings
 from mgs.fit.stopping import StopReason
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr, write_png
+from mgs.memory import VIEW_BYTES
+from mgs.prior.build import Prior, load_prior, save_prior
+from mgs.progress import report
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
-from mgs.run import problem, recording
+from mgs.run import recording
 from mgs.run.settings import NbvSettings
-from mgs.run.state import State
+from mgs.run.state import Checkpoint
+from mgs.scene import Scene
 
 FRAMES, POINTS, WIDTH, HEIGHT = 12, 40, 16, 12
 GROUPS = {
@@ -133,16 +141,60 @@ def fit(
     return Fit(fitted, float(np.abs(rgb - g.rgb).mean()), 7)
 
 
-def operations(**replaced) -> problem.Operations:
-    """The operations of this module, with some replaced."""
-    parts = {
-        "initial": initial,
-        "fit": fit,
-        "fisher": fisher,
-        "estimate": estimate,
-        "measure": lambda gaussians, taken: {"psnr": float(len(taken))},
-    }
-    return problem.Operations(centre=np.zeros(3), groups=GROUPS, **(parts | replaced))
+@dataclass(frozen=True, eq=False)
+class TinyScene(Scene):
+    """A scene with functions of this module in place of the splat core's.
+
+    parts: other functions in place of `initial`, `fit`, `fisher`, `estimate`; `exact`, of views of
+    the Gaussians before training; `exposure`, `render`.
+    """
+
+    parts: dict[str, Callable[..., Any]] = field(default_factory=dict)
+    centre = np.zeros(3)
+    ground = -np.inf
+
+    def initial(self, frames):
+        made = self.parts.get("initial", initial)(frames)
+        self.once("starts", list).append(made)
+        return made
+
+    def fitted(self, model, frames, gains=None, train=None):
+        cameras = [frame.camera for frame in frames]
+        targets, start = self.targets(frames, gains), self.start(tuple(frames))
+        on_pass = lambda done, total: report("fitting", done, total)  # noqa: E731
+        fit_to = self.parts.get("fit", fit)
+        return fit_to(model, start, cameras, targets, train or self.settings.train, on_pass)
+
+    def fisher(self, model, camera, estimator="exact"):
+        if any(model is start for start in self.memo["starts"]) and "exact" in self.parts:
+            return self.parts["exact"](model, camera)
+        if estimator == "exact":
+            return self.parts.get("fisher", fisher)(model, camera)
+        return self.parts.get("estimate", estimate)(model, camera, estimator)
+
+    def render(self, model, camera):
+        return self.parts["render"](model, camera)
+
+    @property
+    def measured_exposure(self):
+        return self.parts["exposure"]
+
+
+def prior(up=(0, 0, 1)) -> Prior:
+    """The sphere's points, turned with the world where `up` is not +Z."""
+    n = _normals() @ upright(up)
+    mesh = Mesh(n[:3], np.array([[0, 1, 2]]), np.zeros(1, bool))
+    numbers = {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS, "backed": 0, "up": list(up)}
+    return Prior(mesh, n, n, 0.5, 0.2, numbers)
+
+
+def scene(dataset: Dataset, settings: NbvSettings, **parts) -> TinyScene:
+    """The scene of a dataset. parts: as in `TinyScene`; `capture`, `prior` and `keep` as in
+    `Scene`."""
+    of_scene = {key: parts.pop(key) for key in ("capture", "keep") if key in parts}
+    of_scene = {"keep": VIEW_BYTES if settings.batch > 1 or settings.flies else 0} | of_scene
+    made_from = parts.pop("prior", None) or prior()
+    return TinyScene(dataset, made_from, settings, **of_scene, parts=parts)
 
 
 def start(out: Path, dataset: Dataset, **values) -> NbvSettings:
@@ -154,49 +206,46 @@ def start(out: Path, dataset: Dataset, **values) -> NbvSettings:
     return settings
 
 
-def run(out: Path, dataset: Dataset, parts: problem.Operations | None = None, **values) -> State:
+def run(out: Path, dataset: Dataset, *, on_step=None, parts=(), **values) -> Checkpoint:
     """Start a run and run it to its end; its last state. values: settings."""
-    return recording.run(out, start(out, dataset, **values), dataset, parts or operations(), silent)
+    return go(out, start(out, dataset, **values), dataset, on_step=on_step, **dict(parts))
 
 
-def resume(out: Path, dataset: Dataset, parts: problem.Operations | None = None) -> State:
-    """Run a started run to its end; its last state."""
-    settings = run_folder.open_run(out).settings
-    return recording.run(out, settings, dataset, parts or operations(), silent)
+def resume(out: Path, dataset: Dataset, *, on_step=None, **parts) -> Checkpoint:
+    """Run a started run to its end; its last state. parts: as in `go`."""
+    return go(out, run_folder.open_run(out).settings, dataset, on_step=on_step, **parts)
+
+
+def go(out: Path, settings: NbvSettings, dataset: Dataset, *, on_step=None, **parts) -> Checkpoint:
+    """Run or resume in a folder by these settings. parts: as in `scene`, and `measure`."""
+    measure = parts.pop("measure", lambda gaussians, taken: {"psnr": float(len(taken))})
+    observed = {"measure": measure, "checked": "render" in parts}
+    made = scene(dataset, settings, **parts)
+    return recording.run(out, settings, made, on_step=on_step or (lambda _: None), **observed)
 
 
 def write_prior(out: Path) -> Path:
     """A prior folder of the sphere's points, as `mgs prior` would write it."""
-    from mgs.data.meshes import Mesh
-    from mgs.prior.build import Prior, save_prior
-
-    n = _normals()
-    mesh = Mesh(n[:3], np.array([[0, 1, 2]]), np.zeros(1, bool))
-    numbers = {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS, "backed": 0, "up": [0, 0, 1]}
-    return save_prior(out, Prior(mesh, n, n, 0.5, 0.2, numbers))
+    return save_prior(out, prior())
 
 
 def write_run(out: Path, root: Path, prior: Path) -> Path:
-    """A run folder of the seeds alone, by the operations of this module."""
-    from mgs.prior.build import load_prior
+    """A run folder of the seeds alone, by the functions of this module."""
     from mgs.prior.initial import initial_gaussians, pixel_on
-    from mgs.run.inputs import prior_digest
 
-    dataset, known = load_dataset(root), load_prior(prior)
-    settings = start(out, dataset, prior=prior, budget=2)
-    pixel = pixel_on(known, [frame.camera for frame in dataset.frames])
-    parts = operations(
-        prior=prior_digest(known), initial=lambda frames: initial_gaussians(known, frames, pixel)[0]
-    )
-    recording.run(out, settings.model_copy(update={"budget": 0}), dataset, parts, silent)
+    dataset, loaded = load_dataset(root), load_prior(prior)
+    settings = start(out, dataset, prior=prior, budget=2).model_copy(update={"budget": 0})
+    pixel = pixel_on(loaded, [frame.camera for frame in dataset.frames])
+    initial = lambda frames: initial_gaussians(loaded, frames, pixel)[0]  # noqa: E731
+    go(out, settings, dataset, prior=loaded, initial=initial)
     return out
 
 
-def write_measured_run(out: Path, dataset: Dataset, grey: float, parts, **values) -> Path:
+def write_measured_run(out: Path, dataset: Dataset, grey: float, parts=(), **values) -> Path:
     """A finished run with pictures and metrics.json, as if every render were of one grey."""
     from mgs.evaluation import evaluate_model
 
-    run(out, dataset, parts, **values)
+    run(out, dataset, parts=parts, **values)
     made, tests = run_folder.open_run(out), dataset.test_views()
 
     def wall(_, camera):
@@ -215,12 +264,8 @@ def write_measured_run(out: Path, dataset: Dataset, grey: float, parts, **values
     return out
 
 
-def silent(stage: str, done: int, total: int) -> None:
-    """No progress bar."""
-
-
-def dying_operations(moment: str, count: int) -> problem.Operations:
-    """Operations; the count-th call of one of them, or of a write, kills this process."""
+def dying_parts(moment: str, count: int) -> dict[str, Callable[..., Any]]:
+    """Parts of a scene; the count-th call of one of them, or of a write, kills this process."""
     calls = {"n": 0}
 
     def dying(function):
@@ -233,7 +278,7 @@ def dying_operations(moment: str, count: int) -> problem.Operations:
         return call
 
     if moment == "fisher":
-        return operations(fisher=dying(fisher))
+        return {"fisher": dying(fisher)}
     if moment == "before the lines are written":
         run_folder.write_steps = dying(run_folder.write_steps)
     if moment == "while the checkpoint is written":
@@ -248,9 +293,9 @@ def dying_operations(moment: str, count: int) -> problem.Operations:
             savez(file, **arrays)
 
         np.savez = half_then_die
-    return operations()
+    return {}
 
 
 if __name__ == "__main__":
     loaded, folder = load_dataset(sys.argv[1]), Path(sys.argv[2])
-    run(folder, loaded, dying_operations(sys.argv[3], int(sys.argv[4])), seed=3)
+    run(folder, loaded, parts=dying_parts(sys.argv[3], int(sys.argv[4])), seed=3)

@@ -24,7 +24,7 @@ from mgs.files import check_new_folder, check_writable, read_json
 
 if TYPE_CHECKING:
     from mgs.run.folder import Run
-    from mgs.run.state import State
+    from mgs.run.state import Checkpoint
 
 POLICIES = ("directional-i", "paper", "d-optimal", "cover", "random")
 
@@ -139,7 +139,7 @@ def complete(run: Path, others: list[Path], threads: int) -> None:
     from mgs.run.folder import write_checkpoint
     from mgs.run.nbv import resume_nbv
 
-    def share(state: State) -> None:
+    def share(state: Checkpoint) -> None:
         for other in others:
             if len(state.steps) == 1 and not (other / "checkpoint.npz").is_file():
                 write_checkpoint(other, state)

@@ -22,20 +22,20 @@ from mgs.cli.options import (
     setting,
     with_keys,
 )
-from mgs.policy.from_file import in_file
-from mgs.policy.registry import policy_names
+from mgs.run.policies import POLICIES
+from mgs.run.policy_file import in_file
 from mgs.run.settings import PRESETS, NbvSettings, Positive, settings_in, validated
 
 if TYPE_CHECKING:
     from mgs.cli.terminal import Terminal
     from mgs.run.folder import Run
     from mgs.run.live import Live
-    from mgs.run.state import State
+    from mgs.run.state import Checkpoint
 
 TYPED = "COMMANDLINE"
 """Name of the source of options that were given, not left at their default."""
 
-POLICIES = f" Names (docs/nbv.md): {', '.join(policy_names())}."
+NAMES = f" Names (docs/nbv.md): {', '.join(POLICIES)}."
 
 
 class Capture(BaseModel):
@@ -70,7 +70,7 @@ def nbv(
         option("Folder of `mgs prior`. Default: DATASET/prior, or one built in the run."),
     ] = None,
     gaussians: Gaussians = None,
-    policy: Annotated[str | None, setting(NbvSettings, "policy", POLICIES)] = None,
+    policy: Annotated[str | None, setting(NbvSettings, "policy", NAMES)] = None,
     budget: Annotated[int | None, setting(NbvSettings, "budget")] = None,
     seeds: Annotated[int | None, setting(NbvSettings, "seeds")] = None,
     batch: Annotated[int | None, setting(NbvSettings, "batch")] = None,
@@ -160,7 +160,7 @@ def nbv(
     resume_and_print(run, console, run.settings.policy, live=live, on_state=logged)
 
 
-def _logged(run: Run, wanted: bool) -> Callable[[State], None]:
+def _logged(run: Run, wanted: bool) -> Callable[[Checkpoint], None]:
     """Callback that logs steps to RUN/tensorboard, or does nothing."""
     from mgs.files import below
     from mgs.run import tensorboard
@@ -214,7 +214,8 @@ def start_and_print(
     """`mgs.run.nbv.start_run`, or another start, with its progress; print which prior was found in
     the dataset."""
     from mgs.cli.progress import progress_bar
-    from mgs.run.nbv import problem_of, start_run
+    from mgs.run.flight import allowed
+    from mgs.run.nbv import scene_of, start_run
 
     with progress_bar("starting", console) as progress:
         run = (start or start_run)(dataset, out, progress=progress, **settings)
@@ -222,9 +223,9 @@ def start_and_print(
     if settings.get("prior") is None and dataset and found.parent == dataset.resolve():
         console.print(f"prior: {found}", soft_wrap=True)
     if run.settings.flight.no_fly or run.settings.flight.clearance is not None:
-        allowed = problem_of(run, policy=run.settings.policy).allowed
-        where = f"of {len(allowed)} poses are ruled out by flight.no_fly and flight.clearance"
-        console.print(f"{len(allowed) - allowed.sum()} {where}")
+        may = allowed(scene_of(run), run.settings)
+        where = f"of {len(may)} poses are ruled out by flight.no_fly and flight.clearance"
+        console.print(f"{len(may) - may.sum()} {where}")
     return run
 
 
@@ -234,7 +235,7 @@ def resume_and_print(
     policy: str | None = None,
     pictures: bool = False,
     live: Live | None = None,
-    on_state: Callable[[State], None] = lambda state: None,
+    on_state: Callable[[Checkpoint], None] = lambda state: None,
 ) -> None:
     """Run or resume the loop of a run, evaluate (with pictures where asked), print the table of
     steps; where the output is no terminal, a line after each step instead.
@@ -254,7 +255,7 @@ def resume_and_print(
     total, known = run.settings.seeds + run.settings.budget, list[dict[str, Any]]()
     with progress_bar("reading", console) as progress:
 
-        def on_step(state: State) -> None:
+        def on_step(state: Checkpoint) -> None:
             on_state(state)
             progress.whole(f"{run.folder.name}: images", len(state.taken), total)
             new = state.steps[len(known) :]

@@ -12,7 +12,7 @@ from rich.table import Column, Table
 from mgs.cli.terminal import Terminal
 
 if TYPE_CHECKING:
-    from mgs.run.state import State
+    from mgs.run.state import Checkpoint
 
 GROUPS = {"test": "test", "all": "all", "held_out": "held out"}
 """Sets of views -> their names in the headings of `print_quality`."""
@@ -99,7 +99,7 @@ def _heading(key: str, new: bool) -> str:
     return ("masked\n" if mask else "") + f"{name.upper()}\n{group}"
 
 
-def print_run(out: Path, state: State, metrics: dict[str, Any], console: Terminal) -> None:
+def print_run(out: Path, state: Checkpoint, metrics: dict[str, Any], console: Terminal) -> None:
     """Print the steps of a run as a table, on a terminal only, then the quality of its model."""
     from mgs.run.ending import RunEnd, fit_line, why_ended
 

@@ -24,6 +24,14 @@ class StopReason(StrEnum):
     DIVERGED = "diverged"
 
 
+class DivergedError(Exception):
+    """A fit diverged. step: of the loop, 0 for the seeds. losses: of the start, then each pass."""
+
+    def __init__(self, step: int, losses: Sequence[float]) -> None:
+        super().__init__(f"the fit of step {step} diverged")
+        self.step, self.losses = step, losses
+
+
 def stop_reason(losses: Sequence[float], tolerance: float, limit: int) -> StopReason | None:
     """Why a fit stops after its last pass, or None if it continues.
 

@@ -8,8 +8,6 @@ l = N P the number of parameters.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,10 +41,6 @@ and orientation: with a larger tau, Gaussians grow into needles (docs/fit.md).""
 MEAN_STD = 0.5
 """tau of learned means, as a multiple of the spacing of the prior's samples. A chosen constant.
 `mgs nbv` multiplies it by the spacing, so `prior_std` is in metres."""
-
-BLOCKS_AT_ONCE = 2048
-"""Blocks whose determinants are computed together: 2 MB, which fit into a core's cache."""
-
 
 GAIN_UNIT = "½ nat per parameter"
 """Unit of `d_optimal` with the lambda of `regularisation`: 2/l times mutual information in nats."""
@@ -115,20 +109,9 @@ def d_optimal(F: Array, H: Array, lam: Array) -> float:
 def t_optimal(F: Array, H: Array, lam: Array) -> float:
     """1/l sum [1/(H+lam) - 1/(H+F+lam)], the decrease of the average variance.
 
-    The paper calls this A-optimal; POp-GS (and here) T-optimal, keeping A for its own p = -1.
+    The paper calls this A-optimal; POp-GS (and here) T-optimal.
     """
     return float((F / ((H + lam) * (H + F + lam))).mean(dtype=np.float64))
-
-
-def a_optimal(F: Array, H: Array, lam: Array) -> float:
-    """POp-GS's A-optimal (p = -1): the increase of the trace of the inverse covariance, 1/l sum F.
-    Does not depend on H."""
-    return float(F.mean(dtype=np.float64))
-
-
-def e_optimal(F: Array, H: Array, lam: Array) -> float:
-    """Increase of the smallest eigenvalue of H + lam; 0 while any parameter stays unobserved."""
-    return float((H + F + lam).min() - (H + lam).min())
 
 
 def fisherrf(F: Array, H: Array, lam: Array) -> float:
@@ -136,57 +119,6 @@ def fisherrf(F: Array, H: Array, lam: Array) -> float:
     return float((F / (H + lam)).mean(dtype=np.float64))
 
 
-def i_optimal(F: Array, H: Array, lam: Array, weight: Array) -> float:
-    """1/l sum weight [1/(H+lam) - 1/(H+F+lam)], the decrease of the predicted variance of a set of
-    views, per parameter (diagonal, linearised).
-
-    weight: mean information of these views [N,P]. With a weight of 1 it is `t_optimal`.
-    """
-    return float((weight * F / ((H + lam) * (H + F + lam))).mean(dtype=np.float64))
-
-
-def block_log_determinant(H: Array, lam: Array) -> float:
-    """1/l sum over the Gaussians of log det(I + Lambda^-1/2 H Lambda^-1/2), Lambda = diag(lam).
-
-    H: blocks of J^T J [N,P,P], which hold the correlations between the parameters of one Gaussian.
-    The difference of two such values is Eq. 7 for blocks. If rounding has made an eigenvalue -1 or
-    less, negative eigenvalues of its group of BLOCKS_AT_ONCE blocks count as 0.
-    """
-    whitening, total = 1 / np.sqrt(np.multiply.outer(lam, lam)), 0.0
-    for first in range(0, len(H), BLOCKS_AT_ONCE):
-        whitened = H[first : first + BLOCKS_AT_ONCE] * whitening
-        try:
-            factor = np.linalg.cholesky(whitened + np.eye(len(lam)))
-            total += 2 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum()
-        except np.linalg.LinAlgError:
-            total += np.log1p(np.maximum(np.linalg.eigvalsh(whitened), 0)).sum()
-    return float(total / (len(H) * len(lam)))
-
-
 def coverage_greedy(F: Array, H: Array, lam: Array) -> float:
     """Number of Gaussians newly `observed`."""
     return float((observed(H + F, lam) & ~observed(H, lam)).sum())
-
-
-@dataclass(frozen=True)
-class Criterion:
-    """A score, and the Gaussians at which its F and H are measured.
-
-    at: "fitted", the model so far; or "prior", the Gaussians on the surface before training, with
-    exact Fisher information whatever the estimator of the run.
-    """
-
-    score: Score
-    at: Literal["fitted", "prior"] = "fitted"
-
-
-CRITERIA: dict[str, Criterion] = {
-    "d-optimal": Criterion(d_optimal),
-    "coverage": Criterion(coverage_greedy, at="prior"),
-    "t-optimal": Criterion(t_optimal),
-    "a-optimal": Criterion(a_optimal),
-    "e-optimal": Criterion(e_optimal),
-    "fisherrf": Criterion(fisherrf),
-}
-"""Policies that use information alone, by name. A program may add its own
-(docs/howto/policy.md)."""

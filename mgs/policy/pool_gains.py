@@ -30,9 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mgs.memory import IMAGE_BYTES, padded
-from mgs.policy.context import Gains
 from mgs.policy.criteria import Array
-from mgs.policy.directional import Views, gains, in_parts, information, of_points, precision
+from mgs.policy.directional import Gains, Views, gains, in_parts, information, of_points, precision
 from mgs.splat.recording import one_at_a_time
 
 BYTES_OF_ENTRY, BYTES_OF_PAIR = 16, 40

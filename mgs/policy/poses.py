@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
 from mgs.policy.criteria import Array
-
-PosePolicy = Callable[[Array, Array, Array, np.random.Generator], Array]
-"""(candidates [C,3], taken [T,3], centre [3], rng) -> score of each candidate [C]; metres."""
 
 
 def azimuths(positions: Array, centre: Array) -> NDArray[np.float64]:
@@ -24,14 +19,7 @@ def azimuth_difference(a: Array, b: Array) -> NDArray[np.float64]:
     return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi)
 
 
-def random_order(candidates: Array, taken: Array, centre: Array, rng: np.random.Generator) -> Array:
-    """A random number for each candidate."""
-    return rng.random(len(candidates))
-
-
-def uniform_azimuth(
-    candidates: Array, taken: Array, centre: Array, rng: np.random.Generator
-) -> Array:
+def uniform_azimuth(candidates: Array, taken: Array, centre: Array) -> Array:
     """Azimuth gap to the next view taken on the left times that on the right, square radians.
 
     Splitting a gap a + b lowers the sum of squared gaps by 2ab, so this is greedy for the most even
@@ -41,19 +29,10 @@ def uniform_azimuth(
     return _rounded(gaps.min(axis=1) * (2 * np.pi - gaps.max(axis=1)))
 
 
-def farthest_pose(
-    candidates: Array, taken: Array, centre: Array, rng: np.random.Generator
-) -> Array:
+def farthest_pose(candidates: Array, taken: Array, centre: Array) -> Array:
     """Distance to the nearest camera already taken, metres (farthest-point sampling)."""
     distance = np.linalg.norm(candidates[:, None, :] - taken[None, :, :], axis=2)
     return _rounded(distance.min(axis=1))
-
-
-def smallest_angle(
-    candidates: Array, taken: Array, centre: Array, rng: np.random.Generator
-) -> Array:
-    """Angle at `centre` to the nearest camera already taken, radians."""
-    return _rounded(angles(candidates, taken, centre).min(axis=1))
 
 
 def angles(ours: Array, theirs: Array, centre: Array) -> NDArray[np.float64]:
@@ -68,15 +47,6 @@ def angles(ours: Array, theirs: Array, centre: Array) -> NDArray[np.float64]:
 def _rounded(scores: Array) -> Array:
     """Round, so that distances which differ only by rounding errors are ties."""
     return np.round(scores, 9)
-
-
-POSE_POLICIES: dict[str, PosePolicy] = {
-    "random": random_order,
-    "uniform": uniform_azimuth,
-    "farthest": farthest_pose,
-    "angle": smallest_angle,
-}
-"""Policies that use poses alone, by name. A program may add its own (docs/howto/policy.md)."""
 
 
 def nearest_poses(positions: Array, here: Array, count: int) -> list[int]:

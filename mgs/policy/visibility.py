@@ -11,16 +11,15 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.memory import IMAGE_BYTES, kept_within
-from mgs.policy.context import Gains
 from mgs.policy.criteria import Array
-from mgs.policy.directional import Views, dome_cameras, of_points, squared_weights
+from mgs.policy.directional import Gains, Views, dome_cameras, of_points, squared_weights
 from mgs.policy.poses import nearest_poses
 
 if TYPE_CHECKING:
     from mgs.policy.pool_gains import PoolGains
 
 Model = tuple[int, float, bool]
-"""SH degree, tau and over_dome of gains (`mgs.policy.context.Gains`)."""
+"""SH degree, tau and over_dome of gains (`mgs.policy.directional.Gains`)."""
 
 FEW = 500
 """About the number of Gaussians by which a flight is planned. A chosen constant."""

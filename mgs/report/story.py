@@ -14,14 +14,13 @@ from mgs.data.frames import Frame
 from mgs.metrics import psnr
 from mgs.plotting import NO_GRID, crop, new_figure
 from mgs.policy import criteria
+from mgs.progress import Progress, listening
 from mgs.report.diagnostics import VISIBLE, view_maps
 from mgs.report.figures import NEWEST, draw_cameras
 from mgs.report.video import UNKNOWN, Film
 from mgs.run.folder import Run
-from mgs.run.loop import learn
-from mgs.run.operations import operations_of
-from mgs.run.problem import Problem, Progress
-from mgs.run.state import Fitted
+from mgs.run.nbv import scene_of
+from mgs.scene import Scene, State, learn
 
 SIZE = (8.4, 3.1)
 """Width and height of a frame, inches."""
@@ -29,12 +28,12 @@ SIZE = (8.4, 3.1)
 DPI = 110
 
 
-def models(run: Run, problem: Problem) -> Iterator[Fitted]:
+def models(run: Run, scene: Scene) -> Iterator[State]:
     """Fit the run's views again, one more each time; yield every model."""
     taken, seeds = run.state.taken, run.settings.seeds
-    before: Fitted | None = None
+    before: State | None = None
     for count in range(1, len(taken) + 1):
-        before = learn(problem, taken[:count], before if count > seeds else None)
+        before = learn(scene, taken[:count], before if count > seeds else None)
         yield before
 
 
@@ -46,19 +45,16 @@ def story_frames(run: Run, progress: Progress) -> Film:
     among the test views, or else the views never taken, or else all. Raises InputError as `models`,
     and if an image cannot be read.
     """
-    # Nothing is chosen, so a policy of the user's own is neither needed nor loaded.
-    settings = run.settings.model_copy(update={"policy": "uniform"})
-    operations = operations_of(run.dataset, run.prior, settings)
-    problem = Problem(run.dataset, settings, operations, progress)
-    shown: Frame | None = None
-    for model in models(run, problem):
-        unknown = {"uncertainty": criteria.uncertainty(model.H, problem.lam)}
-        shown = shown or _shown_view(run, model, unknown)
-        maps = view_maps(model.gaussians, shown.camera, unknown)
-        yield _drawn(run, model, maps, shown)
+    scene, shown = scene_of(run), None
+    with listening(progress):
+        for model in models(run, scene):
+            unknown = {"uncertainty": criteria.uncertainty(model.H, scene.lam)}
+            shown = shown or _shown_view(run, model, unknown)
+            maps = view_maps(model.gaussians, shown.camera, unknown)
+            yield _drawn(run, model, maps, shown)
 
 
-def _shown_view(run: Run, model: Fitted, unknown: dict[str, np.ndarray]) -> Frame:
+def _shown_view(run: Run, model: State, unknown: dict[str, np.ndarray]) -> Frame:
     """The view of `story_frames`, by the model after the first image."""
     tests, frames = run.dataset.test_views(), run.dataset.frames
     new = [frame for i, frame in enumerate(frames) if i not in run.state.taken]
@@ -74,7 +70,7 @@ def _left(maps: dict[str, np.ndarray]) -> float:
     return float(maps["uncertainty"][maps["A"] >= VISIBLE].mean())
 
 
-def _drawn(run: Run, model: Fitted, maps: dict[str, np.ndarray], shown: Frame) -> np.ndarray:
+def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], shown: Frame) -> np.ndarray:
     """One frame, sRGB uint8 [H,W,3]."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -4,23 +4,20 @@ prediction for the views not taken."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from mgs.camera import Camera
+from mgs.data.frames import Frame
 from mgs.gaussians import Gaussians
-from mgs.policy.poses import POSE_POLICIES
-from mgs.policy.registry import PLANNED
 from mgs.run import detectors
-from mgs.run.problem import Problem
-from mgs.run.state import Learned
-
-GEOMETRIC = (*POSE_POLICIES, "cover")
-"""Policies that ignore how much a view tells, so one of small gain does not mean that all are."""
+from mgs.run.flight import views_left
+from mgs.run.policies import DIRECTIONAL_D, Policy
+from mgs.run.settings import NbvSettings
+from mgs.scene import Scene, State
 
 WINDOW = 3
 """Number of last fits whose new views give the mean excess of `predicted_psnr`. Chosen among 2 to 8
@@ -31,55 +28,54 @@ LEAST_ERROR = 1e-8
 
 
 class Checks:
-    """Compares renders with the images taken. render(gaussians, camera) -> RGB, alpha."""
+    """Compares renders with the images taken."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        render: Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray]],
-    ) -> None:
-        self.problem, self.render = problem, render
-        self.before_fit = cache(self._before_fit)
+    def __init__(self, scene: Scene, settings: NbvSettings, policy: Policy) -> None:
+        self.scene, self.settings, self.policy = scene, settings, policy
 
     def entries(
-        self, learned: Learned, new: list[int], known: Sequence[dict[str, Any]]
+        self,
+        state: State,
+        before: Gaussians | None,
+        new: Sequence[int],
+        steps: Sequence[dict[str, Any]],
     ) -> dict[str, Any]:
-        """Entries of the last line in `known`, the lines of all steps: `residual`, `indicators`,
-        `warnings` and `prediction`. new: views that the model before was not fitted to."""
+        """Entries of the last line in `steps`, the lines of all steps: `residual`, `indicators`,
+        `warnings` and `prediction`. new: views that the model `before` was not fitted to."""
         new_views: list[detectors.ViewIndicators] = []
         entries: dict[str, Any] = {}
-        if learned.before is not None:
-            new_views = self.views(learned.before, learned, new)
+        if before is not None:
+            new_views = self.views(before, state, new)
             entries["residual"] = float(np.sqrt(np.mean([view.error**2 for view in new_views])))
-        views = self.views(learned.fit.gaussians, learned, learned.taken)
-        entries |= self.indicators(learned, views, known)
-        settings = self.problem.settings
-        if settings.stop_psnr is not None or settings.policy in PLANNED:
-            past = [step["prediction"] for step in known if "prediction" in step]
-            entry = self.prediction(learned.taken, new, views, new_views)
+        views = self.views(state.gaussians, state, state.taken)
+        entries |= self.indicators(state, views, steps)
+        if self.settings.stop_psnr is not None or hasattr(self.policy, "plan"):
+            past = [step["prediction"] for step in steps if "prediction" in step]
+            entry = self.prediction(state, new, views, new_views)
             if (psnr := predicted_psnr([*past, entry])) is not None:
                 entry["psnr"] = psnr
             entries["prediction"] = entry
         return entries
 
     def views(
-        self, model: Gaussians, learned: Learned, some: list[int]
+        self, model: Gaussians, state: State, some: Sequence[int]
     ) -> list[detectors.ViewIndicators]:
         """Compare the images of the last views taken, `some`, with a model."""
-        problem, views = self.problem, []
-        shown = problem.targets(learned.taken, learned.gains)[-len(some) :]
-        for i, target in zip(some, shown, strict=True):
-            packed, before = self.before_fit(i)
+        views, frames = [], [state.frames[i] for i in state.taken]
+        targets = self.scene.targets(frames, state.exposure)[-len(some) :]
+        for frame, target in zip(frames[-len(some) :], targets, strict=True):
+            key = "before fit", state.taken[: state.seeds], frame
+            packed, before = self.scene.once(key, partial(self._before_fit, state, frame))
             size = target.shape[0] * target.shape[1]
             mask = np.unpackbits(packed, count=size).astype(bool).reshape(target.shape[:2])
-            rendered = self.render(model, problem.cameras[i])[0]
+            rendered = self.scene.render(model, frame.camera)[0]
             views.append(detectors.view_indicators(target, mask, rendered, before))
         return views
 
     def prediction(
         self,
-        taken: list[int],
-        new: list[int],
+        state: State,
+        new: Sequence[int],
         views: list[detectors.ViewIndicators],
         new_views: list[detectors.ViewIndicators],
     ) -> dict[str, float]:
@@ -88,37 +84,39 @@ class Checks:
         views: all views taken, under the model. new_views: the new ones, under the model before.
         """
 
-        def mean_gain(before: list[int], poses: list[int]) -> float:
-            gains = self.problem.visibility.gains(before, poses, *PLANNED["directional-d"])
+        def mean_gain(before: Sequence[int], poses: Sequence[int]) -> float:
+            gains = self.scene.surface(state).gains(before, poses, *DIRECTIONAL_D.model)
             return float(gains.mean())
 
         entry = {"fitted": float(np.mean([view.srgb_error for view in views]))}
         if new_views:
             entry["new"] = float(np.mean([view.srgb_error for view in new_views]))
-            entry["gain"] = mean_gain(taken[: -len(new)], new)
-        if left := [i for i in range(len(self.problem.frames)) if i not in taken]:
-            entry["left"] = mean_gain(taken, left)
+            entry["gain"] = mean_gain(state.taken[: -len(new)], new)
+        if others := [i for i in range(len(state.frames)) if i not in state.taken]:
+            entry["left"] = mean_gain(state.taken, others)
         return entry
 
     def indicators(
         self,
-        learned: Learned,
+        state: State,
         views: list[detectors.ViewIndicators],
         steps: Sequence[dict[str, Any]],
     ) -> dict[str, Any]:
         """`indicators` of the last step, and `warnings` where one now exceeds its limit."""
-        problem, fit = self.problem, learned.fit
-        known = [] if problem.settings.policy in GEOMETRIC else steps
-        scores = [s["information_gain"] for s in known if s["information_gain"] is not None]
-        start, coverage = problem.start, steps[-1]["coverage"]
+        assert state.fit is not None
+        start, coverage = self.scene.untrained(state), steps[-1]["coverage"]
+        scores = list[float]()
+        if not getattr(self.policy, "geometric", False):
+            gains = [step["information_gain"] for step in steps]
+            scores = [gain for gain in gains if gain is not None]
         drift = 0.0  # changed Gaussians are not those of the start
-        std = problem.settings.prior_std.get("mean")
-        if std and problem.settings.train.density == "fixed":
-            drift = detectors.means_drift(fit.gaussians.means, start.means, std)
-        positions = problem.positions[learned.taken]
-        last = problem.views_left(learned.taken) <= 0
+        std = self.settings.prior_std.get("mean")
+        if std and self.settings.train.density == "fixed":
+            drift = detectors.means_drift(state.gaussians.means, start.means, std)
+        positions = self.scene.positions([state.frames[i] for i in state.taken])
+        last = views_left(state, self.settings) <= 0
         indicators = detectors.step_indicators(
-            views, positions, fit.losses, coverage, scores, drift, last
+            views, positions, state.fit.losses, coverage, scores, drift, last
         )
         if start.opacities.max() < 0.5:  # random points: no surface to compare with
             for name in ("prior", "pose", "coverage"):
@@ -126,15 +124,14 @@ class Checks:
         before_this = next(
             (step["indicators"] for step in reversed(steps[:-1]) if "indicators" in step), None
         )
-        said = detectors.alarms(indicators, before_this)
-        return {"indicators": indicators, "warnings": said} if said else {"indicators": indicators}
+        alarms = detectors.alarms(indicators, before_this)
+        return {"indicators": indicators} | ({"warnings": alarms} if alarms else {})
 
-    def _before_fit(self, frame: int) -> tuple[np.ndarray, detectors.Before]:
+    def _before_fit(self, state: State, frame: Frame) -> tuple[np.ndarray, detectors.Before]:
         """Mask of a frame taken, one bit a pixel, and its indicators before any training."""
-        problem = self.problem
-        mask, camera = problem.frames[frame].mask(), problem.cameras[frame]
-        margin = detectors.outline_margin(problem.start, camera)
-        alpha = self.render(problem.start, camera)[1]
+        start = self.scene.untrained(state)
+        mask, margin = frame.mask(), detectors.outline_margin(start, frame.camera)
+        alpha = self.scene.render(start, frame.camera)[1]
         return np.packbits(mask), detectors.before_fit(mask, alpha, margin)
 
 

@@ -15,14 +15,6 @@ if TYPE_CHECKING:
     from mgs.run.settings import NbvSettings
 
 
-class FitDivergedError(Exception):
-    """A fit diverged. step: of the loop, 0 for the seeds. losses: of the start, then each pass."""
-
-    def __init__(self, step: int, losses: Sequence[float]) -> None:
-        super().__init__(f"the fit of step {step} diverged")
-        self.step, self.losses = step, losses
-
-
 def diverged(out: Path, step: int, kept: int, losses: Sequence[float]) -> str:
     """Message for a fit that diverged: its first and last losses, and how to go on.
 

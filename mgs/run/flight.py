@@ -12,23 +12,88 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mgs.policy import tour
+from mgs.errors import InputError
+from mgs.policy import poses, tour
 from mgs.policy.criteria import Array
-from mgs.run.settings import FlightLimits
+from mgs.run.settings import FlightLimits, Mission
+from mgs.scene import Scene, State
 
 
-def allowed_poses(
-    positions: Array, centre: Array, ground: float, limits: FlightLimits
-) -> NDArray[np.bool_]:
-    """Whether the camera may be at each position [V,3]: outside `no_fly`, above `clearance`.
+def allowed(scene: Scene, mission: Mission) -> NDArray[np.bool_]:
+    """Whether the camera may be at each pose [V]: outside `no_fly`, above `clearance`."""
+    positions = scene.positions(scene.frames)
+    out = np.linalg.norm(positions[:, :2] - scene.centre[:2], axis=1)
+    inside = out >= (mission.flight.no_fly or 0.0)
+    if mission.flight.clearance is not None:
+        inside &= positions[:, 2] >= scene.ground + mission.flight.clearance
+    return np.asarray(inside)
 
-    centre: middle of the object [3]. ground: height of its lowest point. Metres, +Z up.
-    """
-    out = np.linalg.norm(positions[:, :2] - centre[:2], axis=1)
-    allowed = out >= (limits.no_fly or 0.0)
-    if limits.clearance is not None:
-        allowed &= positions[:, 2] >= ground + limits.clearance
-    return np.asarray(allowed)
+
+def free(scene: Scene, state: State, mission: Mission) -> list[int]:
+    """Views that are allowed, and neither taken nor given up."""
+    key = "allowed", mission.flight.no_fly, mission.flight.clearance
+    may = scene.once(key, lambda: allowed(scene, mission))
+    views = range(len(state.frames))
+    return [i for i in views if may[i] and i not in state.taken and not state.frames[i].given_up]
+
+
+def reachable(scene: Scene, state: State, mission: Mission) -> list[int]:
+    """Views of `free` within the limits of the flight; with the setting `nearest`, those nearest to
+    the last view."""
+    views = free(scene, state, mission)
+    if mission.flies:
+        views = flight_of(scene, state, mission).in_reach(state.taken, views)
+    if mission.nearest is None:
+        return views
+    positions = scene.positions(state.frames)
+    near = poses.nearest_poses(positions[views], positions[state.taken[-1]], mission.nearest)
+    return [views[k] for k in near]
+
+
+def views_left(state: State, mission: Mission) -> int:
+    """Number of views that the budget has left."""
+    return mission.budget - state.step
+
+
+def flight_of(scene: Scene, state: State, mission: Mission) -> Flight:
+    """Legs between all poses, and the limits of the flight."""
+    home, skipped = state.taken[max(state.skipped - 1, 0)], state.skipped
+    no_fly = mission.flight.no_fly or 0.0
+
+    def legs() -> NDArray[np.float64]:
+        return tour.legs(scene.positions(state.frames), scene.centre[:2], no_fly)
+
+    matrix = scene.once(("legs", state.moved, no_fly), legs)
+    key = "flight", state.moved, mission.flight, home, skipped
+    return scene.once(key, lambda: Flight(mission.flight, matrix, home, skipped))
+
+
+def check_seeds(scene: Scene, mission: Mission) -> None:
+    """Raise InputError where the flight over the seeds and home exceeds the limits."""
+    seeds = seed_views(scene, mission)
+    matrix = tour.legs(
+        scene.positions(scene.frames), scene.centre[:2], mission.flight.no_fly or 0.0
+    )
+    flight = Flight(mission.flight, matrix, seeds[0])
+    metres = flight.metres(seeds)
+    if flight.share(metres, len(seeds)) > 1:
+        seconds = metres / mission.flight.speed + mission.flight.hover * len(seeds)
+        raise InputError(
+            f"nbv: the flight over {len(seeds)} seeds and home takes {metres:.1f} m and "
+            f"{seconds:.0f} s; raise `flight.length` or `flight.time`, or lower `seeds`"
+        )
+
+
+def seed_views(scene: Scene, mission: Mission) -> list[int]:
+    """Views to begin with, spread over the directions of the poses allowed. Raises InputError if
+    fewer are allowed than seeds are needed."""
+    may = np.flatnonzero(allowed(scene, mission))
+    if len(may) < mission.seeds:
+        raise InputError(
+            f"{scene.dataset.root}: flight.no_fly and flight.clearance allow {len(may)} of its "
+            f"{len(scene.frames)} poses, fewer than {mission.seeds} seeds; lower one of them"
+        )
+    return scene.seeds(mission.seeds, may.tolist())
 
 
 @dataclass(frozen=True)

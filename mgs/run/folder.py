@@ -44,13 +44,13 @@ from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, parsing, read_json, reading, write_json, write_text
 from mgs.gaussians import ARRAYS, Gaussians
 from mgs.notebook import cloud, html, thumbnails
-from mgs.policy.from_file import label
 from mgs.prior.build import Prior, load_prior
 from mgs.provenance import versions
 from mgs.run.ending import RunEnd
+from mgs.run.policy_file import label
 from mgs.run.records import Config, Metrics, Record, checked, read_checked
 from mgs.run.settings import NbvSettings, check_settings, validated
-from mgs.run.state import State
+from mgs.run.state import Checkpoint
 from mgs.splat_ply import read_ply, write_ply
 
 CHECKPOINT, STEPS, POLICY_SOURCE = "checkpoint.npz", "steps.jsonl", "policy.py"
@@ -81,7 +81,7 @@ class Run:
         dataset: Dataset | None = None,
         prior: Prior | None = None,
         policy: str | Callable[..., Any] | None = None,
-        state: State | None = None,
+        state: Checkpoint | None = None,
     ) -> None:
         self.folder, self.settings, self.policy = folder, settings, policy
         for name, value in (("dataset", dataset), ("prior", prior), ("state", state)):
@@ -164,7 +164,7 @@ class Run:
         return steps
 
     @cached_property
-    def state(self) -> State:
+    def state(self) -> Checkpoint:
         """The state after the last finished step."""
         state = self._existing(read_checkpoint(self.folder))
         if "ended" in state.steps[-1]:
@@ -177,7 +177,7 @@ class Run:
             raise InputError(f"{self.folder}: has no finished step yet; continue it with {resume}")
         return found
 
-    def _repair(self, state: State) -> None:
+    def _repair(self, state: Checkpoint) -> None:
         """Write gaussians.ply again where it is not the model of the checkpoint, and warn."""
         path = self.folder / "gaussians.ply"
         try:
@@ -278,7 +278,7 @@ def holds_run(out: Path) -> bool:
     return True
 
 
-def write_checkpoint(out: Path, state: State) -> None:
+def write_checkpoint(out: Path, state: Checkpoint) -> None:
     """Commit a step: the state in one file, renamed into place; then the readable lines."""
     text = json.dumps(
         {
@@ -295,7 +295,7 @@ def write_checkpoint(out: Path, state: State) -> None:
     write_steps(out, state)
 
 
-def write_steps(out: Path, state: State) -> None:
+def write_steps(out: Path, state: Checkpoint) -> None:
     """Write steps.jsonl from the state, atomically."""
     write_text(out / STEPS, text_of(state.steps))
 
@@ -341,7 +341,7 @@ def read_record(out: Path) -> dict[str, Any] | None:
     return record
 
 
-def read_checkpoint(out: Path) -> State | None:
+def read_checkpoint(out: Path) -> Checkpoint | None:
     """Read the state after the last finished step; None before the first. Raises InputError as
     `read_record`."""
     record = read_record(out)
@@ -357,7 +357,7 @@ def read_checkpoint(out: Path) -> State | None:
         gaussians.check(f"{out / CHECKPOINT}: not a readable checkpoint")
         if H.ndim != 2 or surface.ndim != 2 or len(H) != len(gaussians):
             raise ValueError(f"H has shape {H.shape} of {len(gaussians)} Gaussians")
-    return State(gaussians, H, surface, **record)
+    return Checkpoint(gaussians, H, surface, **record)
 
 
 def _member(file: zipfile.ZipFile, name: str, kind: str) -> np.ndarray:

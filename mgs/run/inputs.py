@@ -20,7 +20,7 @@ from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame
 from mgs.data.up import PLUS_Z
 from mgs.errors import InputError
-from mgs.policy import from_file
+from mgs.run import policy_file
 
 if TYPE_CHECKING:
     from mgs.prior.build import Prior
@@ -105,9 +105,9 @@ def check_unchanged(
 
 def policy_record(policy: str) -> dict[str, str]:
     """The hash of a policy's file, as an entry of a record; empty for a policy of ours."""
-    if not from_file.in_file(policy):
+    if not policy_file.in_file(policy):
         return {}
-    return {"policy": file_digest(from_file.file_of(policy))}
+    return {"policy": file_digest(policy_file.file_of(policy))}
 
 
 def changed_prior(out: Path, prior: Path) -> str:

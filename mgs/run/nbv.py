@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,16 +18,16 @@ from mgs.errors import InputError, row_named
 from mgs.files import THERE, Ours, atomic_folder, reading
 from mgs.fit.settings import as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE
-from mgs.policy.from_file import in_file, is_function, label, name_of, source_of
-from mgs.policy.registry import policy_of
+from mgs.memory import VIEW_BYTES
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.photographs import source_of as source_of_prior
 from mgs.prior.settings import PriorSettings
+from mgs.progress import Progress, no_progress
 from mgs.run import recording
+from mgs.run.flight import check_seeds
 from mgs.run.folder import DATASET, FILES, POLICY_SOURCE, Run, holds_run, open_run, start
-from mgs.run.live import Live, begin
-from mgs.run.operations import operations_of
-from mgs.run.problem import Problem, Progress, no_progress
+from mgs.run.live import Live, begin, live_capture
+from mgs.run.policy_file import in_file, is_function, label, name_of, policy_of, source_of
 from mgs.run.settings import (
     ALPHA_WEIGHT,
     PRESETS,
@@ -35,8 +36,9 @@ from mgs.run.settings import (
     validated,
     with_defaults,
 )
-from mgs.run.state import State
+from mgs.run.state import Checkpoint
 from mgs.run.transports import Transport
+from mgs.scene import Scene
 from mgs.splat.constants import NEAR
 from mgs.synth.scene_file import load_scene_file
 
@@ -66,7 +68,7 @@ def run_nbv(
     dataset: str | Path | Dataset | None,
     out: str | Path,
     *,
-    on_step: Callable[[State], None] = lambda state: None,
+    on_step: Callable[[Checkpoint], None] = lambda state: None,
     progress: Progress = no_progress,
     **settings: Any,
 ) -> Run:
@@ -136,7 +138,7 @@ def start_run(
     where = Path(prior) if isinstance(prior, str | Path) else out / "prior"
     policy = settings.get("policy", NbvSettings.model_fields["policy"].default)
     named = name_of(policy) if isinstance(policy, str) or callable(policy) else policy
-    outlined = not loaded or all(frame.mask_path or frame.rock_path for frame in loaded.frames)
+    outlined = not loaded or loaded.outlined
     weight = ALPHA_WEIGHT if outlined else 0.0
     wanted = with_defaults(settings | {"policy": named}, row, weight)
     known = validated(
@@ -144,7 +146,7 @@ def start_run(
     )
     count = len(loaded) if loaded else _candidates(capture)
     complete = _resolved(known, count, "budget" in settings)
-    scores = policy_of(policy)  # a user's policy fails here, before there is a folder
+    policy_of(policy)  # a user's policy fails here, before there is a folder
     check_settings(complete, count)
     found = load_prior(prior) if isinstance(prior, str | Path) else prior
     read = [path for path in (root if capture is None else None, prior) if isinstance(path, Path)]
@@ -164,9 +166,7 @@ def start_run(
             )
         complete = complete.with_spacing(built.spacing, loose)
         if complete.flies or complete.flight.no_fly or complete.flight.clearance is not None:
-            Problem(
-                frames, complete, operations_of(frames, built, complete), policy=scores
-            ).check_seeds()
+            check_seeds(Scene(frames, built, complete), complete)
         if live is not None:
             begin(unfinished / DATASET, frames, built)
         start(unfinished, complete, frames)
@@ -275,7 +275,7 @@ def _poses(folder: Path, scene: str, seed: int, progress: Progress) -> Dataset:
 
 def resume_nbv(
     run: str | Path | Run,
-    on_step: Callable[[State], None] = lambda state: None,
+    on_step: Callable[[Checkpoint], None] = lambda state: None,
     progress: Progress = no_progress,
     policy: str | Callable[..., Any] | None = None,
     live: Live | Transport | None = None,
@@ -297,10 +297,15 @@ def resume_nbv(
     policy = policy or run.policy
     check_named(run, policy)
     live = live if live is None or isinstance(live, Live) else Live(live)
-    operations = operations_of(run.dataset, run.prior, run.settings, live)
     scores = None if policy is None else policy_of(policy)
     state = recording.run(
-        run.folder, run.settings, run.dataset, operations, progress, on_step, scores, bool(live)
+        run.folder,
+        run.settings,
+        scene_of(run, live),
+        scores,
+        on_step=on_step,
+        progress=progress,
+        retry=bool(live),
     )
     dataset = None if run.dataset.on_demand else run.dataset  # captured poses are in its files
     return Run(run.folder, run.settings, dataset, run.prior, policy, state)
@@ -327,18 +332,16 @@ def check_named(run: Run, policy: str | Callable[..., Any] | None) -> None:
         raise InputError(f"{run.folder}: its policy is a program, {own}; to run it: {resume}")
 
 
-def problem_of(
-    run: str | Path | Run,
-    progress: Progress = no_progress,
-    policy: str | Callable[..., Any] | None = None,
-) -> Problem:
-    """Selection problem of a run, for the functions of `mgs.run.loop`.
+def scene_of(run: Run, live: Live | None = None) -> Scene:
+    """Scene of a run, with its settings. live: how images are captured that are not rendered."""
+    settings, dataset = run.settings, run.dataset
+    keep = VIEW_BYTES if settings.batch > 1 or settings.flies else 0
+    scene = Scene(dataset, run.prior, settings, keep=keep)
+    if not dataset.on_demand:
+        return scene
+    if not (dataset.root / "config.json").is_file():
+        return replace(scene, capture=live_capture(dataset, run.prior, live))
+    runtime.start()
+    from mgs.synth.capture import capture_of  # needs a variant, and only rendered datasets need it
 
-    Arguments and errors as `resume_nbv`.
-    """
-    run = run if isinstance(run, Run) else open_run(run)
-    policy = policy or run.policy
-    check_named(run, policy)
-    operations = operations_of(run.dataset, run.prior, run.settings)
-    scores = None if policy is None else policy_of(policy)
-    return Problem(run.dataset, run.settings, operations, progress, scores)
+    return replace(scene, capture=capture_of(dataset))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,18 +11,25 @@ from typing import Any
 import numpy as np
 
 from mgs.data.dataset import Dataset
+from mgs.data.frames import capture_record
 from mgs.errors import InputError
-from mgs.files import working_in
+from mgs.evaluation import psnr_measure
+from mgs.files import remove_file, working_in
+from mgs.fit.stopping import DivergedError
+from mgs.gaussians import Gaussians
 from mgs.policy import criteria
-from mgs.policy.context import Policy
+from mgs.progress import Progress, listening, no_progress, report
 from mgs.run import inputs
 from mgs.run.checks import Checks
-from mgs.run.ending import FitDivergedError, RunEnd, diverged, run_end
+from mgs.run.ending import RunEnd, diverged, run_end
+from mgs.run.flight import flight_of, reachable
 from mgs.run.folder import check_settings, read_checkpoint, write_checkpoint, write_steps
 from mgs.run.loop import select_views, uncertainty
-from mgs.run.problem import Operations, Problem, Progress
+from mgs.run.policies import Policy
+from mgs.run.policy_file import policy_of
 from mgs.run.settings import NbvSettings
-from mgs.run.state import Choice, Learned, State
+from mgs.run.state import Checkpoint
+from mgs.scene import Choice, Scene, State, captured
 from mgs.splat_ply import write_ply
 
 STAGES = {
@@ -35,117 +42,125 @@ STAGES = {
 }
 """Stage of the progress -> key of `seconds` in steps.jsonl."""
 
+Measure = Callable[[Gaussians, Sequence[int]], dict[str, float]]
+"""(model, views taken) -> entries of steps.jsonl (`mgs.evaluation.psnr_measure`)."""
+
 
 def run(
     out: Path,
     settings: NbvSettings,
-    dataset: Dataset,
-    operations: Operations,
-    progress: Progress,
-    on_step: Callable[[State], None] = lambda state: None,
+    scene: Scene,
     policy: Policy | None = None,
+    *,
+    on_step: Callable[[Checkpoint], None] = lambda state: None,
+    progress: Progress = no_progress,
     retry: bool = False,
-) -> State:
+    measure: Measure | None = None,
+    checked: bool = True,
+) -> Checkpoint:
     """Run or resume the loop in `out`, which has its config.json, to its end; give the last state.
 
-    on_step(state): called after every step, or batch of steps, that is on disk. policy: in
-    place of that of the settings. retry: ask again for poses that were given up, if the run has no
-    model yet or no pose left. Killed at any moment and called again, it takes the same views as an
-    uninterrupted run.
+    - on_step(checkpoint): called after every step, or batch of steps, that is on disk.
+    - policy: in place of that of the settings.
+    - retry: ask again for poses that were given up, if the run has no model yet or no pose left.
+    - measure: evaluation of steps, by default PSNR. checked: whether renders are compared with the
+      images (`mgs.run.checks`).
 
-    Raises InputError as `check_settings`; where another process works on the folder; where the
-    prior, a pose or a file of a frame taken has changed; where a frame it takes cannot be read or
-    has an empty mask; and where a fit diverged. The steps before are kept.
+    Killed at any moment and called again, it takes the same views as an uninterrupted run. Raises
+    InputError as `check_settings`; where another process works on the folder; where the prior, a
+    pose or a file of a frame taken has changed; where a frame it takes cannot be read or has an
+    empty mask; and where a fit diverged. The steps before are kept.
     """
-    check_settings(settings, len(dataset))
-    with working_in(out):
-        state = read_checkpoint(out)
-        if state is not None:
-            inputs.check_unchanged(out, state.inputs, operations.prior, settings, dataset)
-        stopwatch = Stopwatch(progress)
-        problem = Problem(dataset, settings, operations, stopwatch, policy)
-        recorder = Recorder(problem, stopwatch)
-        ended = state.steps[-1].get("ended", {}) if state else {}
-        if retry and (state is None or ended.get("reason") == RunEnd.FLIGHT):
-            problem.retry()
-        if state is not None:
-            problem.resume(state.taken)
-            check_model(out, problem, state)
-            known, state = state, mark_end(problem, state)
-            if known.steps != state.steps:
-                write_checkpoint(out, state)
-            on_step(state)
-        if state is None or "ended" not in state.steps[-1]:
-            state = _go_on(out, problem, recorder, state, on_step)
-        write_steps(out, state)
-        write_ply(out / "gaussians.ply", state.gaussians)
-        return state
+    check_settings(settings, len(scene.dataset))
+    with working_in(out), listening(stopwatch := Stopwatch(progress)):
+        checkpoint = read_checkpoint(out)
+        if checkpoint is not None:
+            digest = inputs.prior_digest(scene.prior)
+            inputs.check_unchanged(out, checkpoint.inputs, digest, settings, scene.dataset)
+        ended = checkpoint.steps[-1].get("ended", {}) if checkpoint else {}
+        if retry and (checkpoint is None or ended.get("reason") == RunEnd.FLIGHT):
+            scene = replace(scene, dataset=asked_again(scene.dataset))
+        policy = policy or policy_of(settings.policy)
+        recorder = Recorder(scene, settings, policy, stopwatch, measure, checked)
+        state = None
+        if checkpoint is not None:
+            state = resumed(scene, settings, checkpoint)
+            check_model(out, scene, settings, state)
+            before, checkpoint = checkpoint, recorder.marked(state, checkpoint)
+            if before.steps != checkpoint.steps:
+                write_checkpoint(out, checkpoint)
+            on_step(checkpoint)
+        if checkpoint is None or "ended" not in checkpoint.steps[-1]:
+            checkpoint = _go_on(out, recorder, state, checkpoint, on_step)
+        write_steps(out, checkpoint)
+        write_ply(out / "gaussians.ply", checkpoint.gaussians)
+        return checkpoint
+
+
+def asked_again(dataset: Dataset) -> Dataset:
+    """The dataset with those frames as candidates again that were given up."""
+    frames = []
+    for frame in dataset.frames:
+        if frame.given_up:
+            remove_file(dataset.root, capture_record(frame))
+        frames.append(replace(frame, given_up=False))
+    return replace(dataset, frames=tuple(frames))
+
+
+def resumed(scene: Scene, settings: NbvSettings, checkpoint: Checkpoint) -> State:
+    """State of the loop from a checkpoint."""
+    frames = captured(scene, scene.frames, checkpoint.taken)
+    taken, model = tuple(checkpoint.taken), checkpoint.gaussians
+    return State(frames, taken, settings.seeds, model, checkpoint.H, checkpoint.surface)
 
 
 def _go_on(
     out: Path,
-    problem: Problem,
     recorder: Recorder,
     state: State | None,
-    on_step: Callable[[State], None],
-) -> State:
+    checkpoint: Checkpoint | None,
+    on_step: Callable[[Checkpoint], None],
+) -> Checkpoint:
     """Run the loop from a state to its end, and commit every step."""
+    settings = recorder.settings
     try:
-        for learned in select_views(problem, state):
-            if isinstance(learned, Choice):
+        for item in select_views(recorder.scene, recorder.policy, settings, state):
+            if isinstance(item, Choice):
                 assert state is not None
-                state = mark_end(problem, state, learned)
-                write_checkpoint(out, state)
-            else:
-                state = recorder.recorded(learned, state)
-                write_checkpoint(out, state)
-                on_step(state)
-                if "ended" in state.steps[-1]:
-                    break
-    except FitDivergedError as error:
-        kept = len(state.steps) if state else 0
-        raise InputError(diverged(out, error.step, kept, error.losses)) from None
+                assert checkpoint is not None
+                checkpoint = recorder.marked(state, checkpoint, item)
+                write_checkpoint(out, checkpoint)
+                continue
+            state, checkpoint = item, recorder.recorded(item, checkpoint)
+            write_checkpoint(out, checkpoint)
+            on_step(checkpoint)
+            if "ended" in checkpoint.steps[-1]:
+                break
+    except DivergedError as error:
+        steps = len(checkpoint.steps) if checkpoint else 0
+        raise InputError(diverged(out, error.step, steps, error.losses)) from None
     assert state is not None
-    known, state = state, mark_end(problem, state)
-    if state.steps != known.steps:  # the last candidates were given up
-        write_checkpoint(out, state)
-    return state
+    assert checkpoint is not None
+    before, checkpoint = checkpoint, recorder.marked(state, checkpoint)
+    if checkpoint.steps != before.steps:  # the last candidates were given up
+        write_checkpoint(out, checkpoint)
+    return checkpoint
 
 
-def check_model(out: Path, problem: Problem, state: State) -> None:
+def check_model(out: Path, scene: Scene, settings: NbvSettings, state: State) -> None:
     """Raises InputError where a state does not belong to a run of these settings and this prior.
 
     Its means must be those of the prior where they are frozen, and its parameters as many as the
     run learns.
     """
-    if state.H.shape[1] != len(problem.lam):
+    if state.H.shape[1] != len(scene.lam):
         where = f"{out / 'config.json'}: settings.train.means"
         raise InputError(
             f"{where} has changed since {out} was started; restore it, or start a new run"
         )
-    frozen = problem.settings.train.means == "frozen"
-    if frozen and not np.array_equal(state.gaussians.means, problem.start.means):
-        raise InputError(inputs.changed_prior(out, problem.settings.prior))
-
-
-def mark_end(problem: Problem, state: State, refused: Choice | None = None) -> State:
-    """The state with `ended` in its last step where the run ends there by its settings as they are.
-
-    refused: the next view, where it was refused; by default the one that the last step records.
-    """
-    last = {key: value for key, value in state.steps[-1].items() if key != "ended"}
-    next_view: dict[str, Any] | None = state.steps[-1].get("ended")
-    if refused is not None:
-        name = problem.frames[refused.frame].name
-        next_view = {"name": name, "information_gain": refused.information_gain}
-    views = len(state.taken) - problem.settings.seeds
-    stuck = not problem.reachable(state.taken)
-    metres = problem.flight.metres(state.taken) if stuck else None
-    predicted = last.get("prediction", {}).get("psnr")
-    left = uncertainty(problem, state)
-    given_up = sum(frame.given_up for frame in problem.frames)
-    ended = run_end(problem.settings, views, left, next_view, metres, predicted, given_up)
-    return replace(state, steps=[*state.steps[:-1], last | ({"ended": ended} if ended else {})])
+    frozen = settings.train.means == "frozen"
+    if frozen and not np.array_equal(state.gaussians.means, scene.untrained(state).means):
+        raise InputError(inputs.changed_prior(out, settings.prior))
 
 
 class Stopwatch:
@@ -178,80 +193,111 @@ class Stopwatch:
     def take(self) -> dict[str, float]:
         """Seconds by stage since the last call or lap."""
         self.switch("")
-        found, self.seconds = self.seconds, {}
-        return found
+        seconds, self.seconds = self.seconds, {}
+        return seconds
 
 
 class Recorder:
-    """Turns what the loop learned into lines of steps.jsonl, with warnings and evaluation."""
+    """Turns states of the loop into lines of steps.jsonl, with warnings and evaluation."""
 
-    def __init__(self, problem: Problem, stopwatch: Stopwatch) -> None:
-        self.problem, self.stopwatch = problem, stopwatch
-        cameras = {frame.name: inputs.camera_digest(frame.camera) for frame in problem.frames}
+    def __init__(
+        self,
+        scene: Scene,
+        settings: NbvSettings,
+        policy: Policy,
+        stopwatch: Stopwatch,
+        measure: Measure | None = None,
+        checked: bool = True,
+    ) -> None:
+        self.scene, self.settings, self.policy = scene, settings, policy
+        self.stopwatch = stopwatch
+        self.measure = measure or psnr_measure(scene.dataset, scene.cache, settings.exposure)
+        self.checks = Checks(scene, settings, policy) if checked else None
         self.made_from = {
-            "prior": problem.operations.prior,
-            "cameras": cameras,
-            **inputs.policy_record(problem.settings.policy),
+            "prior": inputs.prior_digest(scene.prior),
+            "cameras": {f.name: inputs.camera_digest(f.camera) for f in scene.frames},
+            **inputs.policy_record(settings.policy),
         }
-        render = problem.operations.render
-        self.checks = Checks(problem, render) if render else None
 
-    def recorded(self, learned: Learned, state: State | None) -> State:
-        """The state after a fit: a line for the seeds, or for each view chosen since `state`."""
-        problem, settings = self.problem, self.problem.settings
-        lines, known = self.lines(learned), state.steps if state else []
-        new = learned.taken[len(state.taken) if state else 0 :]
-        fit, line = learned.fit, lines[-1]
+    def recorded(self, state: State, before: Checkpoint | None) -> Checkpoint:
+        """The checkpoint after a fit: a line for the seeds, or for each view chosen since."""
+        assert state.fit is not None
+        lines, steps = self.lines(state), before.steps if before else []
+        new = state.taken[len(before.taken) if before else 0 :]
+        fit, line = state.fit, lines[-1]
         line |= {
-            "uncertainty": uncertainty(problem, learned),
+            "uncertainty": uncertainty(self.scene, state),
             "iterations": int(fit.iterations),
             "loss": float(fit.loss),
             "stop_reason": str(fit.stop_reason),
         }
-        if learned.gains is not None:
-            names = [problem.frames[i].name for i in learned.taken]
-            line["exposure"] = dict(zip(names, learned.gains.tolist(), strict=True))
+        if state.exposure is not None:
+            names = [state.frames[i].name for i in state.taken]
+            line["exposure"] = dict(zip(names, state.exposure.tolist(), strict=True))
         if self.checks:
-            self.stopwatch("checking", 0, 1)
-            line |= self.checks.entries(learned, new, [*known, *lines])
-        every, first, step = settings.evaluate_every, len(known), line["step"]
+            report("checking", 0, 1)
+            model = before.gaussians if before else None
+            line |= self.checks.entries(state, model, new, [*steps, *lines])
+        every, first, step = self.settings.evaluate_every, len(steps), line["step"]
         if every and any(k % every == 0 for k in range(first, step + 1)):
-            self.stopwatch("evaluating", 0, 1)
-            line |= problem.operations.measure(fit.gaussians, learned.taken)
+            report("evaluating", 0, 1)
+            line |= self.measure(fit.gaussians, list(state.taken))
         line["seconds"] |= self.stopwatch.take()
         kinds = ["image", "mask", "rock", "depth", "capture"]
-        files = dict(state.inputs["files"]) if state else {}
-        for frame in (problem.frames[i] for i in new):
+        files = dict(before.inputs["files"]) if before else {}
+        for frame in (state.frames[i] for i in new):
             files[frame.name] = inputs.frame_digests(frame, kinds)
         made_from = {**self.made_from, "files": files}
-        taken, steps = learned.taken, [*known, *lines]
-        return mark_end(
-            problem, State(fit.gaussians, learned.H, learned.surface, taken, steps, made_from)
-        )
+        model, taken = fit.gaussians, list(state.taken)
+        checkpoint = Checkpoint(model, state.H, state.surface, taken, [*steps, *lines], made_from)
+        return self.marked(state, checkpoint)
 
-    def lines(self, learned: Learned) -> list[dict[str, Any]]:
+    def lines(self, state: State) -> list[dict[str, Any]]:
         """Lines of the new steps, with all that is known before their images are read."""
-        problem, seeds = self.problem, self.problem.settings.seeds
-        if not learned.choices:
-            names = [problem.frames[i].name for i in learned.taken]
-            coverage = criteria.coverage(learned.surface, problem.prior_lam)
+        seeds = state.seeds
+        if not state.choices:
+            names = [state.frames[i].name for i in state.taken]
+            coverage = criteria.coverage(state.surface, self.scene.surface_lam)
             line: dict[str, Any] = {"step": 0, "frame": None, "name": None}
-            line |= {"seeds": learned.taken, "seed_names": names}
+            line |= {"seeds": list(state.taken), "seed_names": names}
             line |= {"score": None, "information_gain": None}
             return [line | {"images": seeds, "coverage": coverage, "seconds": {}}]
-        first = len(learned.taken) - seeds - len(learned.choices) + 1
-        laps = self.stopwatch.laps[-len(learned.choices) :]  # without choices that were given up
+        first = state.step - len(state.choices) + 1
+        laps = self.stopwatch.laps[-len(state.choices) :]  # without choices that were given up
         self.stopwatch.laps = []
         return [
             {
                 "step": first + k,
-                "frame": choice.frame,
-                "name": problem.frames[choice.frame].name,
+                "frame": choice.view,
+                "name": state.frames[choice.view].name,
                 "score": choice.score,
                 "information_gain": choice.information_gain,
                 "images": seeds + first + k,
                 "coverage": choice.coverage,
                 "seconds": seconds,
             }
-            for k, (choice, seconds) in enumerate(zip(learned.choices, laps, strict=True))
+            for k, (choice, seconds) in enumerate(zip(state.choices, laps, strict=True))
         ]
+
+    def marked(
+        self, state: State, checkpoint: Checkpoint, refused: Choice | None = None
+    ) -> Checkpoint:
+        """The checkpoint with `ended` in its last step where the run ends there by its settings.
+
+        refused: the next step if it was already chosen, else the one recorded when the run ended.
+        """
+        scene, settings, steps = self.scene, self.settings, checkpoint.steps
+        last = {key: value for key, value in steps[-1].items() if key != "ended"}
+        next_view: dict[str, Any] | None = steps[-1].get("ended")
+        if refused is not None:
+            name = state.frames[refused.view].name
+            next_view = {"name": name, "information_gain": refused.information_gain}
+        metres = None
+        if not reachable(scene, state, settings):
+            metres = flight_of(scene, state, settings).metres(state.taken)
+        predicted = last.get("prediction", {}).get("psnr")
+        given_up = sum(frame.given_up for frame in state.frames)
+        uncertain = uncertainty(scene, state)
+        end = run_end(settings, state.step, uncertain, next_view, metres, predicted, given_up)
+        last |= {"ended": end} if end else {}
+        return replace(checkpoint, steps=[*steps[:-1], last])

@@ -27,7 +27,7 @@ from mgs.fit.settings import (
     TrainSettings,
 )
 from mgs.policy.criteria import MEAN_STD, PRIOR_STD
-from mgs.policy.registry import check_policy
+from mgs.run.policy_file import check_policy
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,19 +25,18 @@ from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.memory import VIEW_BYTES, kept_within
 from mgs.policy import criteria, tour
-from mgs.policy.context import Policy
 from mgs.policy.directional import squared_weights
-from mgs.policy.from_file import in_file, is_function, name_of
-from mgs.policy.registry import policy_of
 from mgs.prior.build import Prior
+from mgs.progress import Progress, listening, no_progress, report
 from mgs.run.candidates import Named, Site, refusals
+from mgs.run.flight import allowed, flight_of, free, reachable
 from mgs.run.folder import Run
-from mgs.run.loop import Chooser, choose, choose_batch, information
-from mgs.run.operations import operations_of
-from mgs.run.planning import plan_flight, rated, surface_information
-from mgs.run.problem import Operations, Problem, Progress, no_progress
+from mgs.run.loop import appraised, choose_batch
+from mgs.run.planning import plan_flight, rated
+from mgs.run.policies import Policy
+from mgs.run.policy_file import in_file, is_function, name_of, policy_of
 from mgs.run.settings import NbvSettings, check_settings, validated
-from mgs.run.state import Fitted
+from mgs.scene import Choice, Scene, State, information, surface_information
 
 COARSE = 8000
 """About the most Gaussians on the surface of the model that candidates are rated by. A chosen
@@ -113,31 +113,39 @@ def suggest(
     why = refusals(poses, taken, site, safe_distance, elevations)
     flyable = [pose for pose, reason in zip(poses, why, strict=True) if not reason]
     dropped = {reason: why.count(reason) for reason in dict.fromkeys(why) if reason}
-    known = _settings(run, len(taken), min(views, len(flyable)), settings)
-    _check_left(len(poses), len(flyable), dropped, views, known.flies)
-    scores = None if policy is None else policy_of(policy)
-    problem, state = _problem(run, images, flyable, known, progress, scores)
-    fisher = problem.view_information(state.gaussians)
-    weights = _weights(problem, fisher, len(taken))
-    blind = [i for i, seen in weights.items() if not seen.any()]
-    _drop(dropped, "sees nothing of the object", blind, problem)
-    ruled_out = [i for i in weights if not problem.allowed[i] and i not in blind]
-    _drop(dropped, "ruled out by flight.no_fly or flight.clearance", ruled_out, problem)
-    free = [i for i in weights if problem.allowed[i]]
-    _check_left(len(poses), len(free), dropped, views, known.flies)
-    order = rated(problem, problem.context(state, free, fisher))
-    described = _described(problem, state, flyable, weights)
-    ranking = [
-        described(frame, score, criteria.d_optimal(fisher(frame), state.H, problem.lam))
-        for frame, score in order
-    ]
-    plan, frames = _plan(problem, state, fisher, described)
-    way = [0, *frames, 0]
-    radius, axis = known.flight.no_fly or 0.0, problem.centre[:2]
-    ends = [problem.positions[i] for i in way]
-    corners = [tour.leg_corners(a, b, axis, radius) @ problem.turn for a, b in pairwise(ends)]
-    metres = tour.tour_length(problem.flight.legs, way)
-    seconds = metres / known.flight.speed + known.flight.hover * len(plan)
+    mission = _settings(run, len(taken), min(views, len(flyable)), settings)
+    _check_left(len(poses), len(flyable), dropped, views, mission.flies)
+    rule = policy_of(policy or mission.policy)
+    with listening(progress):
+        scene, state = _coarse_scene(run, images, flyable, mission)
+        weights = _weights(scene, state, len(taken))
+        may = allowed(scene, mission)
+        blind = [i for i, seen in weights.items() if not seen.any()]
+        ruled_out = [i for i in weights if not may[i] and i not in blind]
+        for reason, frames in (
+            ("sees nothing of the object", blind),
+            ("ruled out by flight.no_fly or flight.clearance", ruled_out),
+        ):
+            dropped |= {reason: len(frames)} if frames else {}
+        state = replace(
+            state,
+            frames=tuple(
+                replace(frame, given_up=i in blind) for i, frame in enumerate(state.frames)
+            ),
+        )
+        stops = free(scene, state, mission)
+        _check_left(len(poses), len(stops), dropped, views, mission.flies)
+        describe = _describer(scene, state, flyable, weights)
+        ranking = [
+            describe(appraised(scene, state, view, score)[0])
+            for view, score in rated(scene, state, rule, stops)
+        ]
+        plan, way = _plan(scene, state, rule, mission, describe)
+    radius, axis = mission.flight.no_fly or 0.0, scene.centre[:2]
+    ends = scene.positions(state.frames)[way]
+    corners = [tour.leg_corners(a, b, axis, radius) @ scene.turn for a, b in pairwise(ends)]
+    metres = tour.tour_length(flight_of(scene, state, mission).legs, way)
+    seconds = metres / mission.flight.speed + mission.flight.hover * len(plan)
     return Suggestion(ranking, plan, metres, seconds, dropped, corners)
 
 
@@ -172,86 +180,104 @@ def _check_left(count: int, left: int, dropped: dict[str, int], views: int, flie
         )
 
 
-def _drop(dropped: dict[str, int], reason: str, frames: list[int], problem: Problem) -> None:
-    problem.allowed[frames] = False
-    if frames:
-        dropped[reason] = len(frames)
+def _weights(scene: Scene, state: State, taken: int) -> dict[int, NDArray[np.float32]]:
+    """Squared blending weights of the surface's Gaussians in each candidate, by its index."""
+    weights, count = {}, len(scene.frames)
+    for i in range(taken, count):
+        report("looking from the candidates", i - taken, count - taken)
+        F = scene.information(state, i)
+        weights[i] = squared_weights(F)[: len(scene.prior.points)]
+    return weights
 
 
-def _weights(problem: Problem, fisher: Any, taken: int) -> dict[int, NDArray[np.float32]]:
-    """Squared blending weights of the surface's Gaussians in each candidate, by its frame."""
-    found = {}
-    for i in range(taken, len(problem.frames)):
-        problem.progress("looking from the candidates", i - taken, len(problem.frames) - taken)
-        found[i] = squared_weights(fisher(i))[: problem.on_surface]
-    return found
-
-
-def _described(
-    problem: Problem, state: Fitted, poses: Sequence[Named], weights: dict[int, Any]
+def _describer(
+    scene: Scene, state: State, poses: Sequence[Named], weights: dict[int, Any]
 ) -> Callable[..., View]:
-    """A function (frame, score, information gain, place in the plan or 0) -> `View`."""
-    unseen = ~criteria.observed(state.surface, problem.prior_lam)
-    left = criteria.uncertainty(state.H, problem.lam)[: problem.on_surface]
-    taken = len(state.taken)
-    here = problem.positions[taken - 1]
+    """A function (choice, place in the plan or 0) -> `View`."""
+    unseen = ~criteria.observed(state.surface, scene.surface_lam)
+    uncertain = criteria.uncertainty(state.H, scene.lam)[: len(scene.prior.points)]
+    taken, positions = len(state.taken), scene.positions(state.frames)
 
-    def view(frame: int, score: float, gain: float, planned: int = 0) -> View:
-        seen, (name, camera) = weights[frame], poses[frame - taken]
-        x, y, z = offset = problem.positions[frame] - problem.centre
+    def describe(choice: Choice, planned: int = 0) -> View:
+        seen, (name, camera) = weights[choice.view], poses[choice.view - taken]
+        x, y, z = offset = positions[choice.view] - scene.centre
         return View(
             name,
             camera,
-            score=score,
-            information_gain=gain,
+            score=choice.score,
+            information_gain=choice.information_gain,
             unseen=float(seen[unseen].sum() / seen.sum()),
-            unknown=float((seen * left).sum() / seen.sum()),
-            distance=float(np.linalg.norm(problem.positions[frame] - here)),
+            unknown=float((seen * uncertain).sum() / seen.sum()),
+            distance=float(np.linalg.norm(positions[choice.view] - positions[taken - 1])),
             azimuth=float(np.degrees(np.arctan2(y, x)) % 360),
             elevation=float(np.degrees(np.arcsin(z / np.linalg.norm(offset)))),
             planned=planned,
         )
 
-    return view
+    return describe
 
 
 def _plan(
-    problem: Problem, state: Fitted, fisher: Any, described: Callable[..., View]
+    scene: Scene,
+    state: State,
+    policy: Policy,
+    mission: NbvSettings,
+    describe: Callable[..., View],
 ) -> tuple[list[View], list[int]]:
-    """Views of the plan in flying order, and their frames."""
-    chooser: Chooser = choose
-    if problem.settings.flies:
-        if not problem.reachable(state.taken):
+    """Views of the plan in flying order, and the way: indices of its poses from home to home."""
+    flight = flight_of(scene, state, mission)
+    if mission.flies:
+        if not reachable(scene, state, mission):
             raise InputError(
                 "suggest: no candidate is within the limits of the flight; raise `flight.length` "
                 "or `flight.time`"
             )
-        stops = list(plan_flight(problem, state, fisher))
-        problem.settings = problem.settings.model_copy(update={"batch": len(stops)})
-        chooser = _following(stops)
-    _, choices, _ = choose_batch(problem, state, chooser)
-    frames = [choice.frame for choice in choices]
-    if not problem.settings.flies:
-        frames = tour.flying_order(problem.flight.legs, 0, frames, 0)
-    chosen = {c.frame: (c.score, c.information_gain, k) for k, c in enumerate(choices, 1)}
-    return [described(frame, *chosen[frame]) for frame in frames], frames
+        choices, planned = list[Choice](), state
+        for view, score in plan_flight(scene, state, policy, mission):
+            choice, planned = appraised(scene, planned, view, score)
+            choices.append(choice)
+        order = [choice.view for choice in choices]
+    else:
+        _, choices, _ = choose_batch(scene, state, policy, mission)
+        order = [choice.view for choice in choices]
+        order = tour.flying_order(flight.legs, flight.home, order, flight.home)
+    chosen = {choice.view: (choice, k) for k, choice in enumerate(choices, 1)}
+    return [describe(*chosen[view]) for view in order], [flight.home, *order, flight.home]
 
 
-def _following(stops: Sequence[tuple[int, float]]) -> Chooser:
-    """A chooser that takes these stops in turn."""
-    left = iter(stops)
-    return lambda problem, state, fisher: next(left)
+@dataclass(frozen=True, eq=False)
+class _CoarseScene(Scene):
+    """A scene whose information is about one model; no image of it is read.
+
+    model: also stands for the Gaussians before training.
+    factor: ratio of the information of an image at its own size to that of a view.
+    """
+
+    model: Gaussians | None = None
+    factor: float = 1.0
+
+    def initial(self, frames: Sequence[Frame]) -> Gaussians:
+        """The model."""
+        assert self.model is not None
+        return self.model
+
+    def fisher(self, model: Gaussians, camera: Camera, estimator: str = "exact") -> np.ndarray:
+        """Information [N,P] about the model, measured once for each view."""
+        return self._measured((camera, estimator))
+
+    @cached_property
+    def _measured(self) -> Callable[[tuple[Camera, str]], np.ndarray]:
+        def measure(key: tuple[Camera, str]) -> np.ndarray:
+            F = super(_CoarseScene, self).fisher(self.initial(()), *key)
+            return np.asarray(F * np.float32(self.factor))
+
+        return kept_within(VIEW_BYTES, measure, lambda F: F.nbytes)
 
 
-def _problem(
-    run: Run,
-    images: Sequence[Frame],
-    poses: Sequence[Named],
-    settings: NbvSettings,
-    progress: Progress,
-    policy: Policy | None,
-) -> tuple[Problem, Fitted]:
-    """Selection problem of the images taken, then the poses, with a coarse model; and its state.
+def _coarse_scene(
+    run: Run, images: Sequence[Frame], poses: Sequence[Named], settings: NbvSettings
+) -> tuple[Scene, State]:
+    """Scene of the images taken, then the poses, with a coarse model; and its state.
 
     The first image counts as the last view taken, since the flight starts there.
     """
@@ -267,13 +293,11 @@ def _problem(
     frames += [Frame(f"{name}/candidate", small(camera), 0.0, Path(name)) for name, camera in poses]
     dataset = Dataset(run.dataset.root, tuple(frames), run.dataset.up, run.dataset.unit)
     count, ratio = len(images), images[0].camera.width / frames[0].camera.width
-    usual = operations_of(dataset, prior, settings)
-    operations = _of_model(usual, model, settings.estimator, ratio**2 * thinning)
-    problem = Problem(dataset, settings, operations, progress, policy, seeds=range(count))
-    problem.skipped = count
-    taken = [*range(1, count), 0]
-    H = information(problem, model, taken)
-    return problem, Fitted(model, H, surface_information(problem, taken), taken)
+    scene = _CoarseScene(dataset, prior, settings, model=model, factor=ratio**2 * thinning)
+    taken = (*range(1, count), 0)
+    H = information(scene, model, [frames[i] for i in taken])
+    state = State(scene.frames, taken, count, model, H, H, skipped=count)
+    return scene, replace(state, surface=surface_information(scene, state, taken))
 
 
 def coarse_prior(prior: Prior, most: int = COARSE) -> tuple[Prior, NDArray[np.int64]]:
@@ -311,23 +335,3 @@ def _coarse(model: Gaussians, rows: np.ndarray, thinning: float) -> Gaussians:
     some = model if thinning == 1 else model[rows]
     grown = some.log_scales - np.float32(0.5 * np.log(thinning))
     return replace(some, log_scales=grown, sh=np.maximum(some.sh, np.float32(-0.49 / SH_C0)))
-
-
-def _of_model(usual: Operations, model: Gaussians, estimator: str, factor: float) -> Operations:
-    """Operations whose information is about one model, measured once for each view.
-
-    The model also stands for the Gaussians before training, so no image is read. factor: ratio of
-    the information of an image at its own size to that of a view.
-    """
-
-    def measured(key: tuple[Camera, str]) -> NDArray[np.float32]:
-        return np.asarray(usual.estimate(model, *key) * np.float32(factor))
-
-    kept = kept_within(VIEW_BYTES, measured, lambda F: F.nbytes)
-    return replace(
-        usual,
-        initial=lambda frames: model,
-        fisher=lambda _, camera: kept((camera, estimator)),
-        exact=lambda _, camera: kept((camera, "exact")),
-        estimate=lambda _, camera, name: kept((camera, name)),
-    )

@@ -9,13 +9,13 @@ import numpy as np
 
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Dataset
-from mgs.run.state import State
+from mgs.run.state import Checkpoint
 
 SCALARS = ("score", "information_gain", "coverage", "uncertainty", "residual", "loss")
 """Keys of steps.jsonl that are logged, with every PSNR."""
 
 
-def tensorboard(folder: str | Path, dataset: Dataset | None = None) -> Callable[[State], None]:
+def tensorboard(folder: str | Path, dataset: Dataset | None = None) -> Callable[[Checkpoint], None]:
     """Make a callback for `on_step` that logs each new step to a TensorBoard folder.
 
     It logs SCALARS and every PSNR (dB) against the number of images, and, of a dataset, the truth
@@ -25,7 +25,7 @@ def tensorboard(folder: str | Path, dataset: Dataset | None = None) -> Callable[
 
     writer, known = SummaryWriter(str(folder), flush_secs=10), 0
 
-    def on_step(state: State) -> None:
+    def on_step(state: Checkpoint) -> None:
         nonlocal known
         for line in state.steps[known:]:
             for key, value in line.items():

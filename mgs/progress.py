@@ -1,0 +1,32 @@
+"""Progress of long work: what works reports it, and what shows it listens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+Progress = Callable[[str, int, int], None]
+"""Called as progress(stage, done, total)."""
+
+
+def no_progress(stage: str, done: int, total: int) -> None:
+    """Default callback: does nothing."""
+
+
+_listener: ContextVar[Progress] = ContextVar("progress", default=no_progress)
+
+
+def report(stage: str, done: int, total: int) -> None:
+    """Tell the listener how far a stage is."""
+    _listener.get()(stage, done, total)
+
+
+@contextmanager
+def listening(progress: Progress) -> Iterator[None]:
+    """Context manager in which `report` calls `progress`."""
+    token = _listener.set(progress)
+    try:
+        yield
+    finally:
+        _listener.reset(token)

@@ -1,0 +1,240 @@
+"""Policies of a user's own: from a file, named FILE.py:NAME, or a Python function or object."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+import traceback
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mgs.errors import InputError
+from mgs.progress import report
+from mgs.run.policies import POLICIES, Policy, policy_named
+
+if TYPE_CHECKING:
+    from mgs.scene import Scene, State
+
+
+def _seen(scene: Scene, state: State, views: list[int]) -> np.ndarray:
+    return np.stack([scene.surface(state).seen(i) for i in views])
+
+
+ARGUMENTS: dict[str, Callable[[Scene, State, list[int]], Any]] = {
+    "scene": lambda scene, state, views: scene,
+    "state": lambda scene, state, views: state,
+    "views": lambda scene, state, views: views,
+    "candidates": lambda scene, state, views: scene.positions(state.frames)[views],
+    "taken": lambda scene, state, views: scene.positions(state.frames)[list(state.taken)],
+    "centre": lambda scene, state, views: scene.centre,
+    "H": lambda scene, state, views: state.H,
+    "lam": lambda scene, state, views: scene.lam,
+    "points": lambda scene, state, views: scene.surface(state).points,
+    "surface_H": lambda scene, state, views: state.surface,
+    "surface_lam": lambda scene, state, views: scene.surface_lam,
+    "seen": _seen,
+    "seen_taken": lambda scene, state, views: _seen(scene, state, list(state.taken)),
+}
+"""Arguments that are the same for all candidates of a step, by parameter name. seen, seen_taken:
+squared blending weights of the surface's Gaussians in the candidates [C,N] and in the views taken
+[T,N]. `rng` is added by the policy, since it depends on its name."""
+
+OF_ONE: dict[str, Callable[[Scene, State, int], Any]] = {
+    "F": lambda scene, state, view: scene.information(state, view),
+    "surface_F": lambda scene, state, view: scene.surface(state).information(view),
+    "candidate": lambda scene, state, view: scene.positions(state.frames)[view],
+}
+"""Arguments of one candidate, by parameter name: its information about the model and about the
+surface, and its camera centre [3]."""
+
+OF_THE_FIT = {"scene", "state", "F", "H"}
+"""Arguments that depend on the fitted model."""
+
+OPTIONAL = ("plan", "tour_gains", "geometric")
+"""Attributes that a policy may have (`mgs.run.policies`)."""
+
+
+FUNCTION = "python:"
+"""Start of the name of a policy that is a Python function: python:MODULE.NAME."""
+
+
+def name_of(policy: str | Callable[..., Any]) -> str:
+    """Name of a policy: itself, or the import path of a function or of an object's class."""
+    if isinstance(policy, str):
+        return absolute(policy)
+    if (name := getattr(policy, "name", None)) in POLICIES and POLICIES[name] == policy:
+        return str(name)
+    name = getattr(policy, "__qualname__", type(policy).__qualname__)
+    return f"{FUNCTION}{policy.__module__}.{name}"
+
+
+def is_function(name: str) -> bool:
+    """Whether the name of a policy is that of a Python function."""
+    return name.startswith(FUNCTION)
+
+
+def source_of(policy: Callable[..., Any]) -> str:
+    """Source text of a function, or of an object and its class; empty where Python does not know
+    it."""
+    plain = inspect.isroutine(policy) or isinstance(policy, type)
+    try:
+        source = inspect.getsource(policy if plain else type(policy))
+    except (OSError, TypeError):
+        return ""
+    return source if plain else f"{source}\n# {policy!r}\n"
+
+
+def in_file(name: str) -> bool:
+    """Whether the name of a policy has the form FILE.py:FUNCTION."""
+    return ".py:" in name
+
+
+def absolute(name: str) -> str:
+    """The name of a policy, with the absolute path of its file if it has one."""
+    return str(Path(name).resolve()) if in_file(name) else name
+
+
+def label(name: str, budget: int = 1) -> str:
+    """The name of a policy without the folder of its file, or its module; "fit" if no view is to be
+    chosen, as in a run of `mgs fit`."""
+    if budget == 0:
+        return "fit"
+    if is_function(name):
+        return name.rpartition(".")[2]
+    return Path(name).name if in_file(name) else name
+
+
+def file_of(name: str) -> Path:
+    """The file of a policy FILE.py:FUNCTION."""
+    return Path(name.rpartition(":")[0])
+
+
+def load(name: str) -> Policy:
+    """The policy FILE.py:NAME. A file is executed once per process, unless it changes.
+
+    Raises InputError if the file is missing or fails, has no such function, class or object, or it
+    has an unknown parameter.
+    """
+    path = file_of(name)
+    if not path.is_file():
+        raise InputError(
+            f"policy {name}: no such file {path}; correct the path "
+            "(for a run, `policy` in its config.json)"
+        )
+    try:
+        module = _executed(path, path.read_bytes())
+    except (Exception, SystemExit) as error:
+        raise InputError(f"policy {name}: {_failed(path, error)}") from error
+    wanted = name.rpartition(":")[2]
+    function = getattr(module, wanted, None)
+    if not callable(function):
+        raise InputError(
+            f"policy {name}: {path} has no function {wanted}; give the name of one that it has"
+        )
+    return Own(name, function() if isinstance(function, type) else function, path)
+
+
+@cache
+def _executed(path: Path, source: bytes) -> ModuleType:
+    module = ModuleType(f"policy {path.resolve()}")
+    sys.modules[module.__name__] = module  # dataclasses look up their annotations there
+    exec(compile(source, str(path), "exec"), module.__dict__)
+    return module
+
+
+class Own:
+    """A function or an object as a policy; its arguments are passed by parameter name.
+
+    A function with a parameter of OF_ONE is called once for each candidate and returns its score.
+    Any other is called once a step and returns the scores of all candidates [C]. An object may have
+    the attributes of `mgs.run.policies`.
+
+    path: its file, where the user named one: then its errors are InputError, with their line.
+    Raises InputError for an unknown parameter without a default.
+    """
+
+    def __init__(self, name: str, function: Callable[..., Any], path: Path | None = None) -> None:
+        self.name, self.full, self.function, self.path = label(name), name, function, path
+        names = ["rng", *OF_ONE, *ARGUMENTS]
+        parameters = [
+            parameter.name
+            for parameter in inspect.signature(function).parameters.values()
+            if parameter.default is parameter.empty or parameter.name in names
+        ]
+        if unknown := [parameter for parameter in parameters if parameter not in names]:
+            raise InputError(
+                f"policy {name}: unknown parameter {unknown[0]}; choose from {', '.join(names)}"
+            )
+        self.parameters = parameters
+        by_arguments = bool(OF_THE_FIT & set(parameters))
+        self.needs_fit = bool(getattr(function, "needs_fit", by_arguments))
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in OPTIONAL:
+            raise AttributeError(name)
+        return getattr(self.function, name)
+
+    def __call__(self, scene: Scene, state: State, views: list[int]) -> Any:
+        shared = {p: ARGUMENTS[p](scene, state, views) for p in self.parameters if p in ARGUMENTS}
+        if "rng" in self.parameters:
+            shared["rng"] = scene.rng(state, self.name)
+        single = [p for p in self.parameters if p in OF_ONE]
+        try:
+            if not single:
+                return self.function(**shared)
+            scores = []
+            for done, i in enumerate(views):
+                report("scoring candidates", done, len(views))
+                of_one = {p: OF_ONE[p](scene, state, i) for p in single}
+                scores.append(self.function(**shared, **of_one))
+            return scores
+        except InputError:
+            raise
+        except (Exception, SystemExit) as error:
+            if self.path is None:
+                raise
+            raise InputError(f"policy {self.full}: {_failed(self.path, error)}") from error
+
+
+def check_policy(name: str) -> None:
+    """Raise InputError for a name that is neither a row of POLICIES nor of a user's own policy.
+
+    No file is read: `policy_of` does so.
+    """
+    if not in_file(name) and not is_function(name):
+        policy_named(name)
+
+
+def policy_of(policy: Any) -> Policy:
+    """The policy of a name, or a Python function or object as one. Executes a user's file.
+
+    Raises InputError as `check_policy` and `load`.
+    """
+    if not isinstance(policy, str):
+        return policy if _complete(policy) else Own(name_of(policy), policy)
+    if in_file(policy):
+        return load(policy)
+    if is_function(policy):
+        raise InputError(f"policy {policy}: is a Python function; give it again in Python")
+    return policy_named(policy)
+
+
+def _complete(policy: Any) -> bool:
+    return hasattr(policy, "name") and hasattr(policy, "needs_fit")
+
+
+def _failed(path: Path, error: BaseException) -> str:
+    """Message for an exception of a user's file: the last line of that file in the traceback."""
+    if isinstance(error, SyntaxError):
+        line, message = error.lineno, error.msg
+    else:
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [frame.lineno for frame in frames if frame.filename == str(path)]
+        line, message = lines[-1] if lines else None, str(error)
+    where = f"line {line} of {path}" if line else str(path)
+    return f"{where} failed: {type(error).__name__}: {message}"

@@ -1,0 +1,377 @@
+"""`Scene`, which stays fixed in a run, and `State`, which each step makes anew. Neither is mutated.
+
+A scene is frames, a surface, and how a model of them is fitted. A state is the views taken, the
+model fitted to them, and their Fisher information. No image of another view is ever read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache, partial
+from typing import Any, TypeVar
+
+import numpy as np
+
+from mgs.camera import Camera
+from mgs.data.dataset import Dataset, target_of
+from mgs.data.frames import Frame, as_asked
+from mgs.data.up import upright
+from mgs.fit.fitting import Fit, fit
+from mgs.fit.settings import ALPHA_WEIGHT, ModelSettings, TrainSettings
+from mgs.fit.stopping import DivergedError, StopReason
+from mgs.gaussians import Gaussians
+from mgs.memory import IMAGE_BYTES, KEPT_BYTES, Deferred, kept_within, release
+from mgs.policy import criteria, poses
+from mgs.policy.visibility import Visibility
+from mgs.prior.build import Prior
+from mgs.prior.exposure import exposure_of, without_gain
+from mgs.prior.initial import colours_of, initial_gaussians, pixel_on, warm_start
+from mgs.progress import report
+from mgs.seeds import generator
+from mgs.splat import ListCache, fisher, groups, render
+
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A chosen view.
+
+    view: its index. score: the policy's own number. information_gain: Eq. 7 of this view by the
+    scene's estimator, whatever the policy. coverage: Eq. 9 of all views taken with this one, 0 to
+    1.
+    """
+
+    view: int
+    score: float
+    information_gain: float
+    coverage: float
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The views taken, the model fitted to them, and their Fisher information.
+
+    - frames: all V frames; those taken as they were captured, some as given up.
+    - taken: indices of the views taken, in order. The first `seeds` of them began the run.
+    - gaussians: the model. H: [N,P] information of the views taken at it, diagonal of J^T J.
+    - surface: [S,P] their exact information about the S Gaussians on the prior's surface, as they
+      were before training; without columns of means.
+    - skipped: number of views taken before the flight began.
+    - fit: how the model was found. exposure: [V,3] gains of the views taken, if estimated.
+      choices: the views chosen since the fit before.
+    """
+
+    frames: tuple[Frame, ...]
+    taken: tuple[int, ...]
+    seeds: int
+    gaussians: Gaussians
+    H: np.ndarray
+    surface: np.ndarray
+    skipped: int = 0
+    fit: Fit | None = None
+    exposure: np.ndarray | None = None
+    choices: tuple[Choice, ...] = ()
+
+    @property
+    def step(self) -> int:
+        """Number of views chosen after the seeds."""
+        return len(self.taken) - self.seeds
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Cameras of all frames."""
+        return [frame.camera for frame in self.frames]
+
+    @property
+    def moved(self) -> tuple[tuple[int, Camera], ...]:
+        """Views whose picture was taken from another pose than was asked for, with its camera."""
+        return tuple((i, f.camera) for i, f in enumerate(self.frames) if f.asked is not None)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Frames, a surface, and how a model of them is fitted.
+
+    - dataset: V frames. prior: the surface on which the Gaussians lie.
+    - settings: of fits and of information. Default: `ModelSettings`, with alpha matched where all
+      frames have a mask or a rock image.
+    - capture(frame): returns the frame once its images exist, which it makes where they do not. Its
+      camera is that of the picture; it is `given_up` where there is none to be had.
+    - keep: most bytes of the information of views about one model that are kept for several
+      choices (`mgs.memory.VIEW_BYTES`).
+
+    Values are computed at their first use and kept. Raises InputError as
+    `ModelSettings.regularisation`.
+    """
+
+    dataset: Dataset
+    prior: Prior
+    settings: ModelSettings = None  # type: ignore[assignment]
+    capture: Callable[[Frame], Frame] = lambda frame: frame
+    keep: int = 0
+
+    def __post_init__(self) -> None:
+        if self.settings is None:
+            weight = ALPHA_WEIGHT if self.dataset.outlined else 0.0
+            settings = ModelSettings(train=TrainSettings(alpha_weight=weight))
+            object.__setattr__(self, "settings", settings)
+
+    @cached_property
+    def frames(self) -> tuple[Frame, ...]:
+        """All frames, with the cameras that a live capture asks for."""
+        return tuple(as_asked(frame) for frame in self.dataset.frames)
+
+    @cached_property
+    def turn(self) -> np.ndarray:
+        """Rotation [3,3] that turns the world's up to +Z."""
+        return upright(self.prior.up)
+
+    @cached_property
+    def centre(self) -> np.ndarray:
+        """Middle of the object [3], metres, +Z up."""
+        return self.turn @ self.prior.points.mean(axis=0)
+
+    @cached_property
+    def ground(self) -> float:
+        """Height of the object's lowest point, metres."""
+        return float((self.prior.mesh.vertices @ np.array(self.prior.up)).min())
+
+    @cached_property
+    def groups(self) -> dict[str, slice]:
+        """Columns of the Fisher information by kind of parameter."""
+        return groups(self.settings.sh, self.settings.train.means)
+
+    @cached_property
+    def lam(self) -> np.ndarray:
+        """Lambda of each parameter [P], the prior's information (`criteria.regularisation`)."""
+        return self.settings.regularisation(self.groups)
+
+    @cached_property
+    def surface_lam(self) -> np.ndarray:
+        """Lambda of the surface before training: without means and without the setting `lam`."""
+        kinds = {kind: columns for kind, columns in self.groups.items() if kind != "mean"}
+        settings = self.settings
+        return criteria.regularisation(kinds, settings.pixel_noise, settings.prior_std)
+
+    @cached_property
+    def cache(self) -> ListCache:
+        """Block lists of the cameras."""
+        return ListCache()
+
+    @cached_property
+    def memo(self) -> dict[Any, Any]:
+        """Values of `once` by key."""
+        return {}
+
+    def once(self, key: Any, make: Callable[[], Value]) -> Value:
+        """Return make(), computed once for each key."""
+        if key not in self.memo:
+            self.memo[key] = make()
+        return self.memo[key]
+
+    def rng(self, state: State, name: str) -> np.random.Generator:
+        """Random generator of a policy, new in each step."""
+        return generator(self.settings.seed, f"{name}/{state.step + 1}")
+
+    # --- The model -------------------------------------------------------------------------------
+
+    @cached_property
+    def colours(self) -> Callable[[Frame], Any]:
+        """colours(frame) -> which samples of the prior a frame sees, and their colours."""
+        size = lambda parts: sum(part.nbytes for part in parts)  # noqa: E731
+        return kept_within(IMAGE_BYTES, colours_of(self.prior), size)
+
+    @cached_property
+    def measured_exposure(self) -> Callable[[Sequence[Frame]], np.ndarray]:
+        """measured_exposure(frames) -> gains [V,3]."""
+        return exposure_of(self.prior)
+
+    @cached_property
+    def pixel(self) -> float:
+        """Size of a pixel of the closest cameras on the surface, metres."""
+        return pixel_on(self.prior, self.dataset.cameras)
+
+    def initial(self, frames: Sequence[Frame]) -> Gaussians:
+        """Gaussians before training, in the colours of these frames."""
+        gains = self.measured_exposure(frames) if self.settings.exposure else None
+        how = self.pixel, gains, self.colours, self.settings.train.antialiased
+        return initial_gaussians(self.prior, frames, *how)[0].with_degree(self.settings.sh)
+
+    @cached_property
+    def start(self) -> Callable[[tuple[Frame, ...]], Gaussians]:
+        """start(frames) -> `initial`; the last results are kept."""
+        return lru_cache(3)(self.initial)
+
+    def untrained(self, state: State) -> Gaussians:
+        """Gaussians before training, in the colours of the seeds."""
+        return self.start(tuple(state.frames[i] for i in state.taken[: state.seeds]))
+
+    @cached_property
+    def image(self) -> Callable[[Frame], np.ndarray]:
+        """image(frame) -> target of a fit [H,W,4 or 5] (`mgs.data.dataset.target_of`)."""
+        alpha = self.settings.train.alpha_weight > 0
+        return kept_within(
+            IMAGE_BYTES, lambda frame: target_of(frame, alpha), lambda image: image.nbytes
+        )
+
+    def targets(self, frames: Sequence[Frame], gains: np.ndarray | None) -> Sequence[np.ndarray]:
+        """Targets of a fit to frames; colours are divided by `gains` [V,3], if given."""
+        if gains is None:
+            return Deferred(range(len(frames)), lambda k: self.image(frames[k]))
+        return Deferred(range(len(frames)), lambda k: without_gain(self.image(frames[k]), gains[k]))
+
+    def fitted(
+        self,
+        model: Gaussians,
+        frames: Sequence[Frame],
+        gains: np.ndarray | None = None,
+        train: TrainSettings | None = None,
+    ) -> Fit:
+        """Fit a model to frames; the prior's mean is `start` of these frames. train: settings of
+        the fit, by default those of the scene."""
+        report("fitting", 0, 1)
+        train = train or self.settings.train
+        lam = criteria.lam_by_kind(self.lam, self.groups)
+        cameras = [frame.camera for frame in frames]
+        on_pass = partial(report, "fitting")
+        targets, start = self.targets(frames, gains), self.start(tuple(frames))
+        release(KEPT_BYTES)  # what scores took, and then what the fit took
+        fit_ = fit(model, cameras, targets, train, on_pass, self.cache, start, lam)
+        release(KEPT_BYTES)
+        return fit_
+
+    def render(self, model: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Linear RGB [H,W,3] and alpha [H,W] of a model."""
+        image = render(model, camera, cache=self.cache)
+        return np.asarray(image.rgb), np.asarray(image.alpha)
+
+    # --- Information -----------------------------------------------------------------------------
+
+    def fisher(self, model: Gaussians, camera: Camera, estimator: str = "exact") -> np.ndarray:
+        """Fisher information of a view about a model [N,P]; no image is read."""
+        means = self.settings.train.means
+        return fisher(model, camera, estimator, cache=self.cache, means=means)
+
+    def information(self, state: State, view: int, estimator: str | None = None) -> np.ndarray:
+        """Information of a view about the model of a state [N,P].
+
+        estimator: a name in `mgs.splat.ESTIMATORS`, by default that of the scene.
+        """
+        if not self.keep:
+            return self._information(state.gaussians, state.frames[view].camera, estimator)
+        model, kept = self.memo.get("views", (None, None))
+        if model is not state.gaussians:
+            # Copies: the kernel's array has padded rows, and Dr.Jit keeps its memory.
+            make = lambda key: np.array(self._information(state.gaussians, *key))  # noqa: E731
+            kept = kept_within(self.keep, make, lambda F: F.nbytes)
+            self.memo["views"] = state.gaussians, kept
+        return kept((state.frames[view].camera, estimator))
+
+    def _information(self, model: Gaussians, camera: Camera, estimator: str | None) -> np.ndarray:
+        name = estimator or self.settings.estimator
+        return self.fisher(model, camera, name)
+
+    def surface(self, state: State) -> Visibility:
+        """Visibility of the prior's surface from each pose; it depends on poses and prior alone."""
+        key = "surface", state.taken[: state.seeds], state.moved
+        return self.once(key, lambda: self._visibility(state))
+
+    def _visibility(self, state: State) -> Visibility:
+        start = self.untrained(state)
+        count, columns = len(self.prior.points), len(self.surface_lam)
+
+        def exact(camera: Camera) -> np.ndarray:
+            return self.fisher(start, camera, "exact")[:count, :columns]
+
+        def progress(done: int, total: int) -> None:
+            report("scoring candidates", done, total)
+
+        points, lam = start.means[:count] @ self.turn.T, float(self.surface_lam[0])
+        return Visibility(state.cameras, exact, points, self.centre, lam, self.turn, progress)
+
+    def positions(self, frames: Sequence[Frame]) -> np.ndarray:
+        """Camera centres [V,3], metres, +Z up."""
+        return np.array([frame.camera.position for frame in frames]) @ self.turn.T
+
+    def seeds(self, count: int, among: Sequence[int] | None = None) -> list[int]:
+        """Views to begin with, spread over the directions of the poses (`poses.seed_views`).
+
+        among: indices to choose from, by default all.
+        """
+        views = range(len(self.frames)) if among is None else among
+        positions = self.positions([self.frames[i] for i in views])
+        return [int(views[k]) for k in poses.seed_views(positions, self.centre, count)]
+
+
+def captured(scene: Scene, frames: tuple[Frame, ...], views: Sequence[int]) -> tuple[Frame, ...]:
+    """Capture the images of some views: the frames afterwards, up to the first given up."""
+    result = list(frames)
+    for done, i in enumerate(views):
+        report("capturing", done, len(views))
+        result[i] = scene.capture(frames[i])
+        if result[i].given_up:
+            break
+    return tuple(result)
+
+
+def learn(
+    scene: Scene,
+    taken: Sequence[int],
+    before: State | None = None,
+    frames: tuple[Frame, ...] | None = None,
+    choices: Sequence[Choice] = (),
+) -> State:
+    """Capture the views that are new in `taken`, fit to all of `taken`, and sum their information.
+
+    before: the last state, where the fit starts; by default it starts at the prior, and all of
+    `taken` are seeds. frames: those of `before`, by default, or as they are before any capture.
+    choices: recorded in the result. Raises DivergedError, and InputError if a frame cannot be read.
+    """
+    taken = tuple(taken)
+    if frames is None:
+        frames = before.frames if before else scene.frames
+    new = taken[len(before.taken) :] if before else taken
+    frames = captured(scene, frames, new)
+    shown = tuple(frames[i] for i in taken)
+    for i in new:
+        scene.image(frames[i])
+    gains = scene.measured_exposure(shown) if scene.settings.exposure else None
+    model, train = scene.start(shown), scene.settings.train
+    if before is not None:
+        old = scene.start(tuple(frames[i] for i in before.taken))
+        model, train = warm_start(before.gaussians, old, model), scene.settings.train_at(1)
+    result = scene.fitted(model, shown, gains, train)
+    seeds = before.seeds if before else len(taken)
+    if result.stop_reason == StopReason.DIVERGED:
+        raise DivergedError(len(taken) - seeds, result.losses)
+    H = information(scene, result.gaussians, shown)
+    state = State(frames, taken, seeds, result.gaussians, H, H, fit=result)
+    surface = surface_information(scene, state, new, before)
+    return replace(state, surface=surface, exposure=gains, choices=tuple(choices))
+
+
+def information(scene: Scene, model: Gaussians, frames: Sequence[Frame]) -> np.ndarray:
+    """Sum the Fisher information of frames at a model: H [N,P], diagonal of J^T J."""
+    H = np.zeros((len(model), len(scene.lam)))
+    for done, frame in enumerate(frames):
+        report("information of the training set", done, len(frames))
+        H += scene.fisher(model, frame.camera, scene.settings.estimator)
+    return H
+
+
+def surface_information(
+    scene: Scene, state: State, new: Sequence[int], before: State | None = None
+) -> np.ndarray:
+    """`State.surface` after new views; it depends on poses and the prior alone."""
+    of_views = [scene.surface(state).information(i) for i in new]
+    if before is None:
+        return np.zeros((len(scene.prior.points), len(scene.surface_lam))) + sum(of_views)
+    return sum(of_views, before.surface)
+
+
+def with_view(scene: Scene, state: State, view: int, F: np.ndarray) -> State:
+    """The state as if a view were taken, its model unchanged. F: its information [N,P]."""
+    surface = surface_information(scene, state, [view], state)
+    return replace(state, taken=(*state.taken, view), H=state.H + F, surface=surface)
