@@ -162,7 +162,7 @@ def test_bad_input_has_one_line():
 def test_a_certificate_holds_for_every_set(kind):
     made, gain = case(kind, 4)
     plan = certificate.greedy(made, 1.0, most=3)
-    held = certificate.certify(made, plan)
+    held = certificate.certify(made, plan, kind)
     largest, fewer = (max(gain(some) for some in combinations(range(POSES), k)) for k in (3, 2))
     assert gain(plan) >= held.share * largest * (1 - 1e-6)
     assert held.share >= 0.9

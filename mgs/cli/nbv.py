@@ -245,7 +245,7 @@ def resume_and_print(
     """
     from functools import partial
 
-    from mgs.cli.printing import print_run, step_line
+    from mgs.cli.printing import certificate_line, print_run, step_line
     from mgs.cli.progress import progress_bar
     from mgs.report.evaluation import evaluate_run
     from mgs.run.folder import Run, open_run
@@ -263,6 +263,8 @@ def resume_and_print(
             for line in new:
                 if not console.is_terminal:
                     progress.print(step_line(line))
+                if "certificate" in line:
+                    progress.print(certificate_line(line["certificate"]))
                 for warning in line.get("warnings", []):
                     progress.print(f"step {line['step']}: {warning}")
 

@@ -148,8 +148,8 @@ def parse_up(text: str) -> tuple[float, float, float] | None:
         ) from None
 
 
-def parse_gaussians(text: str | None) -> int | Literal["auto"] | None:
-    """Number of an option --gaussians, or auto. Raises InputError for anything else."""
+def parse_gaussians(text: str | None, key: str = "gaussians") -> int | Literal["auto"] | None:
+    """Number of an option, or auto. Raises InputError for anything else."""
     if text is None or text == "auto":
         return text  # type: ignore[return-value]
     try:
@@ -157,5 +157,5 @@ def parse_gaussians(text: str | None) -> int | Literal["auto"] | None:
     except ValueError:
         count = 0
     if count < 1:
-        raise InputError(f"gaussians {text!r}: expected a whole number of at least 1, or auto")
+        raise InputError(f"{key} {text!r}: expected a whole number of at least 1, or auto")
     return count

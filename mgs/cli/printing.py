@@ -174,6 +174,13 @@ def step_line(line: Mapping[str, Any]) -> str:
     return ", ".join([*parts, f"{sum(line['seconds'].values()):.1f} s"])
 
 
+def certificate_line(record: Mapping[str, Any]) -> str:
+    """Sentence of a certificate in steps.jsonl."""
+    from mgs.policy.certificate import Certificate
+
+    return Certificate(**record).sentence()
+
+
 def _quality_lines(metrics: dict[str, Any], exposure: bool) -> list[str]:
     """Mean quality over each set of views in metrics.json."""
     from mgs.report.tables import table_cell

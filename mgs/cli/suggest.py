@@ -26,7 +26,7 @@ from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
-from mgs.run.settings import FlightLimits, NbvSettings, Positive, validated
+from mgs.run.settings import ENOUGH, FlightLimits, NbvSettings, Positive, validated
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -65,6 +65,8 @@ class Candidates(BaseModel):
     grid, else 0."""
     flight: FlightLimits = FlightLimits()
     """Limits of the flight and of its poses."""
+    enough: Annotated[float, Field(gt=0, le=1)] = ENOUGH
+    """With --views auto: share of the criterion's gain of all candidates that is enough."""
 
     @field_validator("elevations")
     @classmethod
@@ -83,11 +85,13 @@ def suggest(
     ] = None,
     dome: Annotated[int | None, option("Candidates: poses on a dome.", min=1, metavar="N")] = None,
     views: Annotated[
-        int,
+        str,
         option(
-            "Views to plan together, in flying order; with a limit of the flight, at most.", min=1
+            "Views to plan together, in flying order; with a limit of the flight, at most. auto: "
+            "as few as have the share `enough` of the gain of all candidates.",
+            metavar="N|auto",
         ),
-    ] = 1,
+    ] = "1",
     out: Annotated[
         Path | None,
         option("New folder for suggestions.json, transforms.json and suggestions.png."),
@@ -135,7 +139,8 @@ def suggest(
         )
     values = parse_settings(settings, suggest)
     asked = validated(Candidates, values)
-    changes = given(flight=values.get("flight"), policy=policy)
+    changes = given(flight=values.get("flight"), policy=policy, enough=values.get("enough"))
+    count = parse_gaussians(views, "views") or 1
     ours = Ours(FILES, [path for path in (source, poses, prior) if path]) if force else None
     if out is not None:
         check_new_folder(out, ours)
@@ -155,7 +160,7 @@ def suggest(
         found = suggested(
             run,
             candidates,
-            views,
+            count,
             safe_distance=safe,
             elevations=band,
             progress=progress,
@@ -173,7 +178,7 @@ def suggest(
                 write_suggestion(unfinished, run, found)
         for path in plan or ():
             _write_plan(path, run, found, place, asked.flight)
-    _print(console, found, views, run, crossed)
+    _print(console, found, run, crossed)
     for written in [*([out] if out else []), *(plan or ())]:
         console.print(f"wrote {written}", soft_wrap=True)
 
@@ -264,13 +269,13 @@ def _write_plan(path: Path, run: Run, found: Suggestion, place: Any, limits: Fli
     write_flight_plan(path, stops, place, limits.hover, limits.speed)
 
 
-def _print(console: Terminal, found: Suggestion, views: int, run: Run, crossed: str) -> None:
+def _print(console: Terminal, found: Suggestion, run: Run, crossed: str) -> None:
     """Print what was dropped, the views as a table, and the flight."""
     from mgs.policy.criteria import GAIN_UNIT
 
     for reason, count in found.dropped.items():
         console.print(f"candidates left out: {count} {reason}")
-    rows = found.plan if views > 1 else found.ranking[:SHOWN]
+    rows = found.plan if len(found.plan) > 1 else found.ranking[:SHOWN]
     table = Table(box=None)
     numbers = ("score", "gain", "distance", "azimuth", "elevation", "unseen", "unknown")
     for heading in ("", "pose", *numbers):
@@ -285,6 +290,8 @@ def _print(console: Terminal, found: Suggestion, views: int, run: Run, crossed: 
         f"flight: {found.metres:.1f} {unit} and {found.seconds:.0f} s from the first image through "
         f"{plan} and back"
     )
+    if found.certificate:
+        console.print(found.certificate.sentence(), soft_wrap=True)
     if crossed:
         console.print(f"{crossed}; give flight.no_fly to plan around it")
 

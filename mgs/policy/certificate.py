@@ -285,13 +285,15 @@ def _newton_step(H: Floats, slope: Floats, x: Floats, lo: Floats, hi: Floats) ->
 
 @dataclass(frozen=True)
 class Certificate:
-    """What a plan of k of C candidates is worth, by its criterion; it says nothing about PSNR.
+    """What a plan of k of C candidates is worth, by a criterion; it says nothing about PSNR.
 
+    criterion: name of the policy. views, candidates: k and C.
     share: gain of the plan over the bound of any k. fewer: bound of any k - 1 over that gain; None
     for one view. of_all: gain of the plan over that of all candidates. prices: of the bound of any
     k [C] (`Bound`), over its value.
     """
 
+    criterion: str
     views: int
     candidates: int
     share: float
@@ -299,21 +301,22 @@ class Certificate:
     of_all: float
     prices: list[float]
 
-    def sentence(self, criterion: str) -> str:
+    def sentence(self) -> str:
         """The certificate in words; shares are rounded to the safe side."""
-        k, C = self.views, self.candidates
-        share = np.floor(1000 * self.share + 1e-6) / 10
+        k, share = self.views, np.floor(1000 * self.share + 1e-6) / 10
         fewer = np.ceil(1000 * (self.fewer or 1)) / 10
-        text = f"These {k} views have at least {share:.1f} % of the gain that any {k} of the {C}"
-        text = f"{text} candidates could have" if share < 100 else f"No {k} of the {C} candidates"
-        if share == 100:
-            text += " have a larger gain than these"
-        if fewer < 100:
-            text += f", and no {k - 1} can have more than {fewer:.1f} % of theirs"
-        return f"{text} (by {criterion}, which is not PSNR)."
+        largest = f"the largest that {k} can have"
+        if share < 100:
+            largest = f"at least {share:.1f} % of {largest}"
+        text = f"These {k} views have" if k > 1 else "This view has"
+        text += f" {100 * self.of_all:.1f} % of the gain of all {self.candidates} candidates"
+        less = f"; no {k - 1} can have more than {fewer:.1f} % of theirs" if fewer < 100 else ""
+        return f"{text}, {largest}{less} (by {self.criterion}, which is not PSNR)."
 
 
-def certify(relaxation: Relaxation, plan: Sequence[int], seconds: float = SECONDS) -> Certificate:
+def certify(
+    relaxation: Relaxation, plan: Sequence[int], criterion: str, seconds: float = SECONDS
+) -> Certificate:
     """Certificate of a plan: `best_set` for as many views, and `upper_bound` for one less.
 
     Raises InputError as `upper_bound`.
@@ -323,7 +326,7 @@ def certify(relaxation: Relaxation, plan: Sequence[int], seconds: float = SECOND
     fewer = upper_bound(relaxation, k - 1, seconds=seconds).value / gain if k > 1 else None
     of_all = gain / relaxation.gain(range(count))
     prices = (best.prices / best.bound).tolist()
-    return Certificate(k, count, gain / best.bound, fewer, of_all, prices)
+    return Certificate(criterion, k, count, gain / best.bound, fewer, of_all, prices)
 
 
 def greedy(relaxation: Relaxation, share: float, most: int | None = None) -> list[int]:

@@ -9,6 +9,8 @@
 A step is one chosen view; of a batch only the last step has a fit. A line of `steps.jsonl` holds:
 
 - `step`: 0 for the seeds. `frame`, `name`: the chosen view; at step 0 `seeds`, `seed_names`.
+- `certificate`: at step 0, bounds of the plan (`mgs.policy.certificate.Certificate`), where a
+  policy plans all views as a set.
 - `images`: number of views taken. `score`: the policy's own number.
 - `information_gain`: Eq. 7 of the chosen view by the run's estimator, whatever the policy.
 - `coverage`: Eq. 9. `uncertainty`: mean variance that is left, over that of the prior.

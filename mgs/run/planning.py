@@ -9,11 +9,15 @@ import numpy as np
 
 from mgs.errors import InputError
 from mgs.policy import poses, tour
+from mgs.policy.certificate import Certificate, certify, greedy
 from mgs.progress import report
-from mgs.run.flight import flight_of, reachable, views_left
+from mgs.run.flight import flight_of, free, reachable, views_left
 from mgs.run.policies import Policy
 from mgs.run.settings import Mission
 from mgs.scene import Scene, State, with_view
+
+CERTIFY_SECONDS = 5.0
+"""Time limit of each bound of a certificate. A chosen constant."""
 
 
 def rated(
@@ -107,3 +111,45 @@ def planned_flight(scene: Scene, state: State, policy: Policy, mission: Mission)
         if plan[: len(done)] == done and plan[len(done) :]:
             return plan[len(done) :]
     return []
+
+
+def certificate(
+    scene: Scene, state: State, policy: Policy, plan: Sequence[int], views: Sequence[int]
+) -> Certificate | None:
+    """What a plan of some of `views` is worth by the policy's criterion; None where the policy has
+    no `relaxation`, or the plan has no view or all of them."""
+    relaxation = getattr(policy, "relaxation", None)
+    if relaxation is None or not 0 < len(plan) < len(views):
+        return None
+    report("bounding the plan", 0, 1)
+    made = relaxation(scene, state, views)
+    places = [views.index(i) for i in plan]
+    return made and certify(made, places, policy.name, CERTIFY_SECONDS)
+
+
+def planned_certificate(
+    scene: Scene, state: State, policy: Policy, mission: Mission
+) -> Certificate | None:
+    """`certificate` of all views that a run plans to take; None where it plans no set of views."""
+    plan = getattr(policy, "plan", None)
+    limited = mission.travel is not None or mission.flies or mission.nearest is not None
+    if plan is None or limited or views_left(state, mission) <= 0:
+        return None
+    views = free(scene, state, mission)
+    planned = plan(scene, state, views, views_left(state, mission), None)
+    return certificate(scene, state, policy, planned, views)
+
+
+def enough_views(scene: Scene, state: State, policy: Policy, mission: Mission) -> int:
+    """Fewest views of a greedy plan that have the share `enough` of the gain of all candidates.
+
+    Raises InputError where the policy has no `relaxation`.
+    """
+    relaxation, views = getattr(policy, "relaxation", None), free(scene, state, mission)
+    made = relaxation(scene, state, views) if relaxation and views else None
+    if made is None:
+        raise InputError(
+            f"policy {policy.name}: has no bound by which a number of views could be enough; give "
+            "the number, or use directional-i, directional-d or d-optimal"
+        )
+    return len(greedy(made, mission.enough))

@@ -14,6 +14,7 @@ and may have
 - plan(scene, state, views, count, nearest): the views to choose from, those of a plan of at most
   `count` of `views`; with `nearest`, each among so many nearest to the one before.
 - tour_gains(scene, state): gains by which a flight is planned (`PoolGains`), if any.
+- relaxation(scene, state, views): concave criterion that bounds plans (`Relaxation`), if any.
 
 To add one, write a class and a row of POLICIES, or a file of your own (docs/howto/policy.md).
 """
@@ -29,7 +30,10 @@ import numpy as np
 from mgs.colour import SH_C0
 from mgs.errors import InputError
 from mgs.policy import criteria, poses
+from mgs.policy import relaxation as relaxed
 from mgs.policy.criteria import Array
+from mgs.policy.directional import Views
+from mgs.policy.relaxation import Relaxation
 from mgs.policy.visibility import FEW
 from mgs.progress import report
 
@@ -71,6 +75,13 @@ class Information:
     def __call__(self, scene: Scene, state: State, views: list[int]) -> np.ndarray:
         F, H, lam = scene.information, state.H, scene.lam
         return each(views, lambda i: self.criterion(F(state, i), H, lam))
+
+    def relaxation(self, scene: Scene, state: State, views: Sequence[int]) -> Relaxation | None:
+        """Eq. 7 of these views, at the model so far."""
+        if self.criterion is not criteria.d_optimal:
+            return None
+        F = np.stack([scene.information(state, i) for i in views])
+        return relaxed.d_optimal(F, state.H, scene.lam)
 
 
 def DOptimal() -> Information:
@@ -174,6 +185,18 @@ class Directional:
     def tour_gains(self, scene: Scene, state: State) -> PoolGains | None:
         """Gains by which a flight is planned, for some of the Gaussians."""
         return scene.surface(state).plan_gains(self.tour, FEW)
+
+    def relaxation(self, scene: Scene, state: State, views: Sequence[int]) -> Relaxation:
+        """Gain of these views together."""
+        surface = scene.surface(state)
+        pool = surface.pool()
+        taken, others = (
+            Views(pool.positions[list(some)], pool.seen[list(some)])
+            for some in (state.taken, views)
+        )
+        dome = surface.dome() if self.over_dome else None
+        lam, degree, tau = surface.lam, self.degree, self.tau
+        return relaxed.directional(surface.points, lam, degree, tau, taken, others, dome)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,10 @@ from mgs.progress import Progress, listening, no_progress, report
 from mgs.run import inputs
 from mgs.run.checks import Checks
 from mgs.run.ending import RunEnd, diverged, run_end
-from mgs.run.flight import flight_of, reachable
+from mgs.run.flight import flight_of, free, reachable
 from mgs.run.folder import check_settings, read_checkpoint, write_checkpoint, write_steps
 from mgs.run.loop import select_views, uncertainty
+from mgs.run.planning import planned_certificate
 from mgs.run.policies import Policy
 from mgs.run.policy_file import policy_of
 from mgs.run.settings import NbvSettings
@@ -231,6 +232,8 @@ class Recorder:
             "loss": float(fit.loss),
             "stop_reason": str(fit.stop_reason),
         }
+        if not state.choices:
+            line |= self.certificate(state)
         if state.exposure is not None:
             names = [state.frames[i].name for i in state.taken]
             line["exposure"] = dict(zip(names, state.exposure.tolist(), strict=True))
@@ -251,6 +254,16 @@ class Recorder:
         model, taken = fit.gaussians, list(state.taken)
         checkpoint = Checkpoint(model, state.H, state.surface, taken, [*steps, *lines], made_from)
         return self.marked(state, checkpoint)
+
+    def certificate(self, state: State) -> dict[str, Any]:
+        """Entry of the seeds' line: what the plan of all views to come is worth."""
+        scene, policy, settings = self.scene, self.policy, self.settings
+        worth = planned_certificate(scene, state, policy, settings)
+        if worth is None:
+            return {}
+        names = [state.frames[i].name for i in free(scene, state, settings)]
+        prices = dict(zip(names, worth.prices, strict=True))
+        return {"certificate": asdict(worth) | {"prices": prices}}
 
     def lines(self, state: State) -> list[dict[str, Any]]:
         """Lines of the new steps, with all that is known before their images are read."""

@@ -40,6 +40,18 @@ class _End(_Strict):
     given_up: int = 0
 
 
+class _Certificate(_Strict):
+    """A `mgs.policy.certificate.Certificate`, with prices by name."""
+
+    criterion: str
+    views: int
+    candidates: int
+    share: float
+    fewer: float | None
+    of_all: float
+    prices: dict[str, float]
+
+
 class _Line(_Strict, extra="allow"):
     """A line of steps.jsonl. All other keys are numbers, as PSNR."""
 
@@ -60,6 +72,7 @@ class _Line(_Strict, extra="allow"):
     warnings: list[str] = []
     seconds: dict[str, float] = {}
     ended: _End | None = None
+    certificate: _Certificate | None = None
 
 
 class _Inputs(_Strict):

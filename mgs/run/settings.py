@@ -50,6 +50,10 @@ PRESETS = {
 }
 
 
+ENOUGH = 0.95
+"""Default of `Mission.enough` (docs/certificate.md)."""
+
+
 class FlightLimits(BaseModel):
     """Limits of a flight, which starts and ends at the first view taken, and of its poses."""
 
@@ -78,6 +82,8 @@ class Mission(BaseModel):
     """Number of seed views for the first fit, spread evenly over the directions of the poses."""
     budget: Annotated[int, Field(ge=0)] = 50
     """Most views to choose beyond the seed views. Default: 50, or all candidates if fewer."""
+    enough: Annotated[float, Field(gt=0, le=1)] = ENOUGH
+    """With an automatic number of views: share of the criterion's gain of all candidates."""
     batch: Annotated[int, Field(ge=1)] = 1
     """Views to choose before the next fit; the last batch may be smaller."""
     nearest: Annotated[int, Field(ge=1)] | None = None

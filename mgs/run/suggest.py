@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.memory import VIEW_BYTES, kept_within
 from mgs.policy import criteria, tour
+from mgs.policy.certificate import Certificate
 from mgs.policy.directional import squared_weights
 from mgs.prior.build import Prior
 from mgs.progress import Progress, listening, no_progress, report
@@ -32,7 +33,7 @@ from mgs.run.candidates import Named, Site, refusals
 from mgs.run.flight import allowed, flight_of, free, reachable
 from mgs.run.folder import Run
 from mgs.run.loop import appraised, choose_batch
-from mgs.run.planning import plan_flight, rated
+from mgs.run.planning import certificate, enough_views, plan_flight, rated
 from mgs.run.policies import Policy
 from mgs.run.policy_file import in_file, is_function, name_of, policy_of
 from mgs.run.settings import NbvSettings, check_settings, validated
@@ -77,6 +78,8 @@ class Suggestion:
     flight from the first image taken through the plan and back; seconds: its time. dropped:
     reasons for which candidates cannot be flown, with their numbers. corners: points of the way
     before each planned view and before home, where it leads around the no-fly cylinder.
+    certificate: bounds of the plan by the policy's criterion, with prices in the order of
+    `ranking`; None where the policy has none, or all candidates are planned.
     """
 
     ranking: list[View]
@@ -85,12 +88,13 @@ class Suggestion:
     seconds: float
     dropped: dict[str, int]
     corners: list[NDArray[np.float64]]
+    certificate: Certificate | None = None
 
 
 def suggest(
     run: Run,
     poses: Sequence[Named],
-    views: int = 1,
+    views: int | Literal["auto"] = 1,
     *,
     safe_distance: float = 0.0,
     elevations: tuple[float, float] | None = None,
@@ -99,7 +103,8 @@ def suggest(
 ) -> Suggestion:
     """Rank poses by what a picture from each would add to the model of a run, and plan `views`.
 
-    With a limit of the flight, `views` is the most, and the plan is that of `plan_flight`. The
+    views: "auto" for the fewest that have the share `enough` of the gain of all candidates. With a
+    limit of the flight it is the most, and the plan is that of `plan_flight`. The
     flight starts and ends at the first image taken. safe_distance, elevations: as `refusals`.
     settings: fields of `NbvSettings` in place of the run's. Raises InputError if no
     pose can be flown, fewer can than `views`, a setting is invalid, or the policy fails.
@@ -113,8 +118,9 @@ def suggest(
     why = refusals(poses, taken, site, safe_distance, elevations)
     flyable = [pose for pose, reason in zip(poses, why, strict=True) if not reason]
     dropped = {reason: why.count(reason) for reason in dict.fromkeys(why) if reason}
-    mission = _settings(run, len(taken), min(views, len(flyable)), settings)
-    _check_left(len(poses), len(flyable), dropped, views, mission.flies)
+    most = len(flyable) if views == "auto" else views
+    mission = _settings(run, len(taken), min(most, len(flyable)), settings)
+    _check_left(len(poses), len(flyable), dropped, most, mission.flies)
     rule = policy_of(policy or mission.policy)
     with listening(progress):
         scene, state = _coarse_scene(run, images, flyable, mission)
@@ -134,19 +140,22 @@ def suggest(
             ),
         )
         stops = free(scene, state, mission)
-        _check_left(len(poses), len(stops), dropped, views, mission.flies)
+        _check_left(len(poses), len(stops), dropped, 1 if views == "auto" else most, mission.flies)
+        if views == "auto":
+            most = enough_views(scene, state, rule, mission)
+            mission = mission.model_copy(update={"budget": most, "batch": max(most, 2)})
         describe = _describer(scene, state, flyable, weights)
-        ranking = [
-            describe(appraised(scene, state, view, score)[0])
-            for view, score in rated(scene, state, rule, stops)
-        ]
+        rated_views = rated(scene, state, rule, stops)
+        ranking = [describe(appraised(scene, state, view, score)[0]) for view, score in rated_views]
         plan, way = _plan(scene, state, rule, mission, describe)
+        order = [view for view, _ in rated_views]
+        worth = certificate(scene, state, rule, way[1:-1], order)
     radius, axis = mission.flight.no_fly or 0.0, scene.centre[:2]
     ends = scene.positions(state.frames)[way]
     corners = [tour.leg_corners(a, b, axis, radius) @ scene.turn for a, b in pairwise(ends)]
     metres = tour.tour_length(flight_of(scene, state, mission).legs, way)
     seconds = metres / mission.flight.speed + mission.flight.hover * len(plan)
-    return Suggestion(ranking, plan, metres, seconds, dropped, corners)
+    return Suggestion(ranking, plan, metres, seconds, dropped, corners, worth)
 
 
 def taken_in_order(run: Run) -> list[Frame]:
