@@ -6,7 +6,7 @@ everywhere except inside `mgs.splat`, where they are Dr.Jit tensors.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -98,6 +98,14 @@ class Gaussians:
         """Select Gaussians by a slice, a mask [N], indices [M] in their order, or one index."""
         chosen = [index] if isinstance(index, int | np.integer) else index
         return self.map(lambda array: array[chosen])
+
+    def counted_from(self, origin: Sequence[float]) -> Gaussians:
+        """The same Gaussians in a world whose coordinates count from `origin` [3], metres. Those
+        without an origin of their own count from there already."""
+        if not any(self.origin):
+            return self
+        x, y, z = np.subtract(self.origin, origin).tolist()
+        return replace(self, origin=(x, y, z))
 
     def map(self, function: Callable[[Any], Any]) -> Gaussians:
         """Gaussians of the results of a function of each array."""

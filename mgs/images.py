@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from mgs.camera import MAX_PIXELS, MAX_SIDE
+import mgs
+from mgs.camera import MAX_PIXELS, MAX_SIDE, Camera
 from mgs.colour import linear_from_pixels, srgb_from_linear
 from mgs.errors import InputError
 from mgs.files import atomic_path, not_writable, reading
@@ -45,10 +46,10 @@ def around(mask: np.ndarray, margin: int) -> tuple[slice, ...]:
 
 
 def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> None:
-    """Write an 8-bit PNG; the file appears complete. The type of `image` decides:
+    """Write a PNG; the file appears complete. The type of `image` decides:
 
     - bool [H,W]: a mask, black and white.
-    - uint8 [H,W,3]: sRGB, unchanged.
+    - uint8 [H,W,3]: sRGB, unchanged. uint16 [H,W]: other numbers, of 16 bits.
     - float [H,W,3]: linear RGB, converted to sRGB; with linear=False, sRGB in [0,1].
 
     Raises InputError as `mgs.files.atomic_path`.
@@ -57,7 +58,7 @@ def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> No
 
     if image.dtype == bool:
         pixels = image.astype(np.uint8) * 255
-    elif image.dtype == np.uint8:
+    elif image.dtype in (np.uint8, np.uint16):
         pixels = image
     else:
         display = srgb_from_linear(image) if linear else np.clip(image, 0, 1)
@@ -253,16 +254,29 @@ def read_mask(path: str | Path) -> np.ndarray:
     return rgba[..., :3] @ LUMA >= 0.5 * np.iinfo(rgba.dtype).max
 
 
-def write_exr(path: str | Path, channels: dict[str, np.ndarray]) -> None:
+def write_exr(
+    path: str | Path,
+    channels: dict[str, np.ndarray],
+    camera: Camera | None = None,
+    unit: str | None = None,
+) -> None:
     """Write an OpenEXR file with a float32 channel for each named array [H,W]; the file appears
     complete.
 
-    Raises InputError if it cannot be written.
+    The header names the program, the unit of lengths, and the camera: `fx`, `fy`, `cx`, `cy`,
+    pixels, and `worldToCamera` as OpenEXR defines it (a row vector times the matrix; x right, y up,
+    z backward). Raises InputError if it cannot be written.
     """
     import OpenEXR
 
     data = {name: np.ascontiguousarray(array, np.float32) for name, array in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header |= {"software": f"mgs {mgs.__version__}"}
+    header |= {} if unit is None else {"unit": unit}
+    if camera is not None:
+        K, pose = camera.K, np.diag([1.0, -1, -1, 1]) @ camera.world_to_camera
+        header |= {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        header |= {"worldToCamera": np.ascontiguousarray(pose.T, np.float32)}
     with atomic_path(path) as temporary, OpenEXR.File(header, data) as file:
         try:
             file.write(str(temporary))
@@ -292,13 +306,19 @@ def _exr_size(path: Path) -> tuple[int, int]:
 
     with reading(path, "EXR file"), path.open("rb") as opened:
         opened.read(1)  # OpenEXR would not say why it cannot open a file
+
+    def unsupported(what: str, instead: str) -> InputError:
+        return InputError(f"{path}: has {what}, which mgs does not read; save {instead} as EXR")
+
     with _reading_exr(path), OpenEXR.File(str(path), header_only=True) as file:
         if len(file.parts) != 1:
-            raise ValueError(f"{len(file.parts)} parts instead of one")
+            raise unsupported(f"{len(file.parts)} parts", "one of them")
+        if file.header()["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile):
+            raise unsupported("several samples in a pixel (deep)", "a flat image")
         low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
         channels = file.header()["channels"]
         if any((one.xSampling, one.ySampling) != (1, 1) for one in channels):
-            raise ValueError("subsampled channels")
+            raise unsupported("subsampled channels (luminance and chroma)", "RGB")
     width, height = (int(side) for side in high - low + 1)
     check_pixels(path, width, height, 8 * len(channels))
     return width, height
@@ -310,6 +330,8 @@ def _reading_exr(path: Path) -> Iterator[None]:
     try:
         with _silent():
             yield
+    except InputError:
+        raise
     except (RuntimeError, OSError, ValueError, TypeError, KeyError) as error:
         raise InputError(
             f"{path}: not a readable EXR ({error}); the file is damaged, write it again"

@@ -118,14 +118,15 @@ def write_gaussians(path: str | Path, gaussians: Gaussians, kind: str, to_y_up: 
     """Write Gaussians (NumPy fields) in a format of FORMATS; the file appears complete.
 
     Compressed PLY and SPZ cannot say that colours are linear. to_y_up: for a GLB (`write_glb`).
-    Raises InputError as `mgs.files.atomic_path`, if a package is missing, and if there are no
-    Gaussians or their positions are too far for the format.
+    The two lose an origin, with a Notice. Raises InputError as `mgs.files.atomic_path`, if a
+    package is missing, and if there are no Gaussians or their positions are too far for the format.
     """
     if len(gaussians) == 0:
         raise InputError(f"{path}: there are no Gaussians to write")
     if any(gaussians.origin) and kind not in ("ply", "glb"):
         place = ", ".join(f"{x:.0f}" for x in gaussians.origin)
-        raise InputError(f"{path}: the model lies at {place}, too far for {kind}; use ply or glb")
+        notice = f"{path}: positions count from {place}, which only PLY and GLB can hold"
+        warnings.warn(notice, Notice, stacklevel=2)
     if kind == "glb":
         write_glb(path, gaussians, to_y_up)
     elif kind == "spz":

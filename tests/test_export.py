@@ -11,16 +11,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import tiny
 from program import command
 from refusals import refused
 from test_render_command import CAMERAS, gaussians
 from test_splat_ply import assert_close
 
 from mgs.colour import srgb_from_linear
+from mgs.data.dataset import load_cameras, load_dataset
 from mgs.errors import InputError, Notice
 from mgs.gaussians import Gaussians
+from mgs.images import read_mask
 from mgs.report.exporting import in_srgb, to_y_up
 from mgs.rotation import rotmat_from_quat
+from mgs.run.folder import open_run
 from mgs.splat import reference, render
 from mgs.splat.reference import sh_basis
 from mgs.splat_files import FORMATS, load_gaussians, upward, write_gaussians
@@ -141,9 +145,10 @@ def test_a_model_far_from_the_origin(tmp_path):
         np.testing.assert_allclose(*images, atol=2e-5)
     exact = reference.render(far, shifted)["rgb"]
     np.testing.assert_allclose(exact, reference.render(near, CAMERAS[0])["rgb"], atol=1e-5)
-    for kind in ("spz", "compressed-ply"):
-        with pytest.raises(InputError, match="448262, 5411932, 412, too far"):
-            written(tmp_path, kind, far)
+    with pytest.warns(Notice, match="count from 448262, 5411932, 412"):
+        written(tmp_path, "compressed-ply", far)
+    assert far.counted_from(np.subtract(place, 1)).origin == (1, 1, 1)
+    assert near.counted_from(place) == near
 
 
 def test_numbers_that_mean_no_number(tmp_path):
@@ -371,3 +376,51 @@ def test_spz_without_its_package(tmp_path, monkeypatch, capsys):
     write_ply(tmp_path / "a.ply", gaussians(0))
     line = refused(capsys, ["export", tmp_path / "a.ply", "--to", "spz"], tmp_path)
     assert "`pip install gsply`" in line
+
+
+@pytest.fixture(scope="module")
+def chosen(tmp_path_factory):
+    """A run of a dataset with masks and depth."""
+    root = tmp_path_factory.mktemp("chosen")
+    tiny.write_dataset(root / "data")
+    tiny.run(root / "run", load_dataset(root / "data"))
+    return open_run(root / "run")
+
+
+def test_the_views_taken_as_colmap_reads_them(chosen, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    command("export", chosen.folder, "--to", "colmap", "--out", tmp_path / "c")
+    model, taken = pycolmap.Reconstruction(tmp_path / "c/sparse/0"), chosen.taken
+    images = {image.name: image for image in model.images.values()}
+    assert sorted(images) == sorted(frame.image_path.name for frame in taken)
+    places = np.random.default_rng(0).normal(size=(5, 3)) * 0.3
+    for frame in taken:
+        image = images[frame.image_path.name]
+        ours = frame.camera.project(places)[0]
+        theirs = [image.project_point(point) for point in places]
+        np.testing.assert_allclose(theirs, ours, atol=1e-6)
+        mask = read_mask(tmp_path / "c/masks" / f"{image.name}.png")
+        assert np.array_equal(mask, frame.mask())
+        copy = tmp_path / "c/images" / image.name
+        assert copy.read_bytes() == frame.image_path.read_bytes()
+    points = np.array([model.points3D[number].xyz for number in sorted(model.points3D)])
+    opaque = chosen.gaussians.opacities >= 0.5
+    np.testing.assert_allclose(points, chosen.gaussians.means[opaque], atol=1e-6)
+
+
+def test_all_views_as_nerfstudio_reads_them(chosen, tmp_path):
+    """`mgs import` reads them back: cameras, masks, depth and its unit."""
+    given = ["export", chosen.folder, "--to", "nerfstudio", "--out", tmp_path / "n"]
+    command(*given, "--views", "all")
+    content = json.loads((tmp_path / "n/transforms.json").read_text())
+    assert (tmp_path / "n" / content["ply_file_path"]).is_file()
+    assert content["depth_unit_scale_factor"] == 1e-3
+    command("import", tmp_path / "n", "--unit", 1, "--out", tmp_path / "back")
+    back = load_dataset(tmp_path / "back")
+    assert len(back) == len(chosen.dataset)
+    for one, frame in zip(back.frames, chosen.dataset.frames, strict=True):
+        assert np.abs(one.camera.world_to_camera - frame.camera.world_to_camera).max() < 1e-12
+        np.testing.assert_allclose(one.depth(), frame.depth(), atol=0.51e-3)
+        assert np.array_equal(one.mask(), frame.mask())
+    command(*given, "--force")
+    assert len(load_cameras(tmp_path / "n")) == len(chosen.taken)

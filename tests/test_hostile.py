@@ -90,6 +90,16 @@ def test_a_damaged_exr_is_one_line(tmp_path, capfd):
     assert capfd.readouterr().err == ""
 
 
+def test_an_exr_of_several_parts_is_not_called_damaged(tmp_path):
+    import OpenEXR
+
+    kind, grey = OpenEXR.scanlineimage, np.zeros((4, 4), np.float32)
+    parts = [OpenEXR.Part({"type": kind}, {"Z": grey}, name) for name in "ab"]
+    OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
+    with pytest.raises(InputError, match="has 2 parts, which mgs does not read; save one of them"):
+        read_exr(tmp_path / "a.exr")
+
+
 def test_a_full_disk_behind_the_standard_output():
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-m", "mgs", "--version"]

@@ -5,6 +5,7 @@ import struct
 from dataclasses import replace
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 from program import command
@@ -70,6 +71,15 @@ def foreign_ply(path, g: Gaussians, encoding: str = "ascii") -> None:
         layout = endian + "".join(named[name][1] for name in order)
         body = struct.pack(f"{endian}f", 1.5) + b"".join(struct.pack(layout, *row) for row in rows)
     path.write_bytes("\n".join(header).encode() + body)
+
+
+def camera_in(path) -> np.ndarray:
+    """World to camera [4,4], OpenCV axes, of the header of an EXR."""
+    with OpenEXR.File(str(path), header_only=True) as file:
+        header = dict(file.header())
+    assert header["software"].startswith("mgs ")
+    assert header["fx"] == K[0, 0]
+    return np.diag([1, -1, -1, 1]) @ np.asarray(header["worldToCamera"]).T
 
 
 def write_cameras(path, names=("images/a.png", "images/b.png"), cameras=CAMERAS) -> None:
@@ -165,6 +175,7 @@ def test_colour_spaces(folder):
         expected = truth if linear else linear_from_srgb(truth)
         np.testing.assert_allclose(rgb, expected, atol=1e-5)
         np.testing.assert_allclose(channels["A"], alpha, atol=1e-6)
+        assert np.allclose(camera_in(folder / out / "a.exr"), CAMERAS[0].world_to_camera)
         np.testing.assert_allclose(channels["Z"], depth, rtol=1e-5)
 
 

@@ -72,7 +72,7 @@ def render(
 
     Writes one PNG for each camera, with the name of the camera's image.
     """
-    from mgs.data.dataset import load_cameras
+    from mgs.data.dataset import load_cameras, load_origin
     from mgs.report.exporting import read_model
     from mgs.report.pictures import draw_views
     from mgs.run.folder import open_run
@@ -87,7 +87,7 @@ def render(
     views = [
         (name, camera.resized(width) if width else camera) for name, camera in load_cameras(cameras)
     ]
-    gaussians, _ = read_model(subject)
+    gaussians = read_model(subject)[0].counted_from(load_origin(cameras))
     if colour_space != "auto":
         gaussians = replace(gaussians, linear=colour_space == "linear")
     if antialiased is not None:

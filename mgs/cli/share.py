@@ -10,7 +10,7 @@ from mgs.cli.options import Force, Runs, argument, option
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import echo
 from mgs.errors import InputError
-from mgs.files import check_new_file
+from mgs.files import Ours, atomic_folder, check_new_file
 
 
 def export(
@@ -19,10 +19,10 @@ def export(
         argument("Folders that `mgs nbv` wrote, or PLY, GLB, SPZ.", metavar="RUN|SPLATS..."),
     ],
     to: Annotated[
-        Literal["glb", "spz", "ply", "compressed-ply"],
+        Literal["glb", "spz", "ply", "compressed-ply", "nerfstudio", "colmap"],
         option(
             "glb: glTF with KHR_gaussian_splatting; spz: needs gsply; compressed-ply: 4 times "
-            "smaller than ply."
+            "smaller than ply. nerfstudio, colmap: the run's views, a folder to train on."
         ),
     ] = "glb",
     out: Annotated[
@@ -36,15 +36,22 @@ def export(
         int | None,
         option("Raise the SH degree, for programs that read degree 3 only.", min=0, max=3),
     ] = None,
+    views: Annotated[
+        Literal["taken", "all"], option("Views of nerfstudio and colmap: those taken, or all.")
+    ] = "taken",
     force: Force = False,
 ) -> None:
-    """Write a model for other programs: viewers, game engines, web pages.
+    """Write a model for other programs: viewers, game engines, web pages; or the views that a run
+    chose, for programs that train on them: cameras, images, masks, depth and points.
 
     All formats can also be read, so the command converts between them, too.
     """
     from mgs.report.exporting import in_srgb, read_model, to_y_up
     from mgs.splat_files import FORMATS, write_gaussians
 
+    if to in ("nerfstudio", "colmap"):
+        _export_views(models, to, out, views == "all", force)
+        return
     defaults = [
         (one if one.is_dir() else one.parent)
         / f"{'export' if one.is_dir() else f'{one.stem}-export'}{FORMATS[to]}"
@@ -61,6 +68,20 @@ def export(
         write_gaussians(path, shown, to, to_y_up(up))
         megabytes = path.stat().st_size / 1e6
         echo(f"wrote {len(shown):,} Gaussians to {path} ({megabytes:.1f} MB)")
+
+
+def _export_views(runs: list[Path], kind: str, out: Path | None, every: bool, force: bool) -> None:
+    """Write the views of each run as a folder. Raises InputError as `check_new_folder`."""
+    from mgs.report.chosen_views import NAMES, write_views
+    from mgs.run.folder import open_run
+
+    if out is not None and len(runs) > 1:
+        raise InputError(f"--out {out}: is one folder for {len(runs)}; leave it out")
+    for run in runs:
+        opened, folder = open_run(run), out or run / f"export.{kind}"
+        with atomic_folder(folder, Ours(NAMES[kind]) if force else None) as unfinished:
+            what = write_views(unfinished, opened, kind, every)
+        echo(f"wrote {what} to {folder}")
 
 
 def _targets(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -246,6 +246,13 @@ def unit_of(path: Path, data: dict[str, Any]) -> str | None:
     return unit or None
 
 
+def load_origin(path: str | Path) -> Position:
+    """`Dataset.origin` of a transforms.json, or of the folder that holds it. Raises InputError as
+    `load_cameras`."""
+    path = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
+    return _origin_of(path, read_records(path)[0])
+
+
 def _origin_of(path: Path, data: dict[str, Any]) -> Position:
     """Origin in a transforms.json. Raises InputError unless it is three finite numbers."""
     given = data.get("origin", [0.0, 0.0, 0.0])
@@ -285,12 +292,12 @@ def write_transforms(
     frames: list[Frame] | tuple[Frame, ...],
     up: Up = PLUS_Z,
     unit: str = "m",
-    notes: dict[str, str] | None = None,
+    notes: Mapping[str, str | float] | None = None,
     origin: Position = (0.0, 0.0, 0.0),
 ) -> None:
     """Write transforms.json into the folder `root`, with paths relative to it.
 
-    up, unit, origin: as `Dataset`. notes: more entries, for people. Frames are either all on demand
+    up, unit, origin: as `Dataset`. notes: more entries. Frames are either all on demand
     or none. Intrinsics equal to those of the first frame are written once. Write this file last:
     its presence marks a complete dataset.
     """
@@ -311,7 +318,7 @@ def write_transforms(
         own = intrinsics(frame.camera)
         record |= {key: value for key, value in own.items() if value != header[key]}
         records.append(record)
-    known = header | world | demand | (notes or {})
+    known = header | world | demand | dict(notes or {})
     write_json(root / "transforms.json", known | {"frames": records})
 
 

@@ -236,7 +236,7 @@ def diagnose_run(
         if opened.settings.estimator != "exact":  # its numbers are not in the units of the panels
             title += f"; by {opened.settings.estimator}"
         files = [out / f"{frame.name}.exr", out / f"{frame.name}.png"]
-        write_exr(files[0], maps)
+        write_exr(files[0], maps, frame.camera, opened.dataset.unit)
         write_preview(files[1], maps, title, opened.dataset.unit)
         written += files
     progress(len(frames), len(frames))

@@ -195,6 +195,7 @@ def evaluate(
     if dataset is None:
         raise InputError(f"{path or 'the model'}: is in no run folder; give its `dataset`")
     views = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
+    subject = subject.counted_from(views.origin)
     names, tests = list(trained), views.test_views()
     if unknown := sorted(set(names) - {frame.name for frame in views.frames}):
         raise InputError(f"{views.root}: has no frame {unknown[0]}, which `trained` names")

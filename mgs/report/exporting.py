@@ -22,13 +22,14 @@ PART = 1 << 16
 
 
 def read_model(source: str | Path) -> tuple[Gaussians, Up]:
-    """Read the model of a run folder, or of a file with the up that it has (`upward`). Raises
-    InputError as `open_run`, `Run.state` and `load_gaussians`."""
+    """Read the model of a run folder, in the coordinates that its dataset was made of, or of a file
+    with the up that it has (`upward`). Raises InputError as `open_run`, `Run.state` and
+    `load_gaussians`."""
     source = Path(source)
     if not source.is_dir():
         return load_gaussians(source), upward(source)
     run = open_run(source)
-    return run.gaussians, run.up
+    return replace(run.gaussians, origin=run.dataset.origin), run.up
 
 
 def in_srgb(g: Gaussians) -> Gaussians:

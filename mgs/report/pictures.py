@@ -43,7 +43,7 @@ def draw_views(
             r, g, b = np.moveaxis(rgb if linear else linear_from_srgb(rgb), -1, 0)
             alpha, depth = np.asarray(image.alpha), np.asarray(image.depth)
             channels = {"R": r, "G": g, "B": b, "A": alpha, "Z": depth}
-            write_exr(out / f"{name}.exr", channels)
+            write_exr(out / f"{name}.exr", channels, camera)
     progress(len(views), len(views))
 
 

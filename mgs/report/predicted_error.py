@@ -244,22 +244,23 @@ def calibrate_run(
     }
     out, shown = opened.folder / "diagnostics", next(iter(unseen.values()))
     write_json(out / "uncertainty.json", record)
-    maps = []
+    maps, files = [], []
     for frame in shown[:: -(-len(shown) // MAPPED)]:
         terms, error, inside = final.look(frame, seed)
-        maps.append((frame.name, error, calibrations["all"].sigma(terms), inside))
+        sigma = calibrations["all"].sigma(terms)
+        maps.append((frame.name, error, sigma, inside))
+        files.append(_write_maps(out, frame, error, sigma))
     uncertainty_figure(out / "uncertainty.png", rows, maps)
-    files = [_write_maps(out, name, error, sigma) for name, error, sigma, _ in maps]
     return [out / "uncertainty.json", out / "uncertainty.png", *files]
 
 
-def _write_maps(folder: Path, name: str, error: Array, sigma: Array) -> Path:
+def _write_maps(folder: Path, frame: Frame, error: Array, sigma: Array) -> Path:
     """Write NAME.errors.exr."""
-    path, channels = folder / f"{name}.errors.exr", {}
+    path, channels = folder / f"{frame.name}.errors.exr", {}
     for kind, values in (("error", error), ("sigma", sigma)):
         for i, channel in enumerate("RGB"):
             channels[f"{kind}.{channel}"] = values[..., i].astype(np.float32)
-    write_exr(path, channels)
+    write_exr(path, channels, frame.camera)
     return path
 
 
