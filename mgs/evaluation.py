@@ -61,9 +61,8 @@ def render_view(
     from mgs.splat import render
 
     image = render(gaussians, camera, cache=cache)
-    rgb = np.asarray(image.rgb)
-    linear = rgb if gaussians.linear else linear_from_srgb(np.clip(rgb, 0, 1))
-    return linear, np.asarray(image.alpha), np.asarray(image.depth)
+    rgb = gaussians.linear_rgb(np.asarray(image.rgb))
+    return rgb, np.asarray(image.alpha), np.asarray(image.depth)
 
 
 def psnr_measure(

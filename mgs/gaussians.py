@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.special import expit
 
-from mgs.colour import SH_C0
+from mgs.colour import SH_C0, linear_from_srgb, srgb_from_linear
 from mgs.errors import InputError
 from mgs.notebook import cloud, html
 
@@ -61,13 +61,13 @@ class Gaussians:
     - log_scales: [N,3] natural logarithm of the standard deviations along the local axes, metres.
     - quats: [N,4] quaternions w x y z of any norm, from the local axes to the world's.
     - logit_opacities: [N] opacity o as its logit, ln(o / (1 - o)).
-    - sh: [N,K,3] colour, linear RGB, as K = (d+1)^2 coefficients of spherical harmonics of degree d
-      from 0 to 3, in the order and with the signs of 3DGS: rgb = max(0, 0.5 + sum over k of
-      Y_k(direction) sh_k), with the direction from the camera.
+    - sh: [N,K,3] colour, in the space of `linear`, as K = (d+1)^2 coefficients of spherical
+      harmonics of degree d from 0 to 3, in the order and with the signs of 3DGS: rgb = max(0, 0.5 +
+      sum over k of Y_k(direction) sh_k), with the direction from the camera.
     - antialiased: whether opacity falls as the low-pass of the image (`EPS2D`) makes a footprint
       larger (Yu et al. 2024, Mip-Splatting; `antialiased` of gsplat); in 3DGS it stays.
-    - linear: whether colours are linear RGB. Files of most other tools have sRGB, which is blended
-      as it is.
+    - linear: whether colours are linear RGB, as light adds up; else sRGB values are blended, as in
+      3DGS, most other programs and their files.
     - origin: place in the world, metres, from which means count, in float64. It is not zero for
       files whose coordinates float32 does not resolve, such as UTM.
 
@@ -92,7 +92,7 @@ class Gaussians:
 
     def _repr_html_(self) -> str:
         g = self.map(np.asarray)
-        return html(repr(self), [cloud(g.means, g.rgb)])
+        return html(repr(self), [cloud(g.means, g.linear_rgb(g.rgb))])
 
     def __getitem__(self, index: Any) -> Gaussians:
         """Select Gaussians by a slice, a mask [N], indices [M] in their order, or one index."""
@@ -124,9 +124,18 @@ class Gaussians:
 
     @property
     def recorded(self) -> tuple[int, ...]:
-        """Constants of a recorded kernel: the shape of sh, and `antialiased` as 0 or 1 (see
-        `mgs.splat.recording.frozen`)."""
-        return (*self.sh.shape, int(self.antialiased))
+        """Constants of a recorded kernel: the shape of sh, and `antialiased` and `linear` as 0 or 1
+        (see `mgs.splat.recording.frozen`)."""
+        return (*self.sh.shape, int(self.antialiased), int(self.linear))
+
+    def blended(self, linear: np.ndarray) -> np.ndarray:
+        """Linear RGB of any shape in the space in which these Gaussians are blended."""
+        return linear if self.linear else srgb_from_linear(linear)
+
+    def linear_rgb(self, blended: np.ndarray) -> np.ndarray:
+        """Linear RGB of any shape from the space in which these Gaussians are blended. sRGB is
+        clipped to [0,1]."""
+        return blended if self.linear else linear_from_srgb(np.clip(blended, 0, 1))
 
     @property
     def sh_degree(self) -> int:
@@ -141,7 +150,7 @@ class Gaussians:
 
     @property
     def rgb(self) -> np.ndarray:
-        """Colour without its dependence on direction, linear RGB [N,3], at least 0."""
+        """Colour without its dependence on direction, [N,3], in the space of `linear`."""
         return np.maximum(0.5 + SH_C0 * self.sh[:, 0, :], 0.0)
 
     @property

@@ -196,7 +196,8 @@ class Scene:
     def initial(self, frames: Sequence[Frame]) -> Gaussians:
         """Gaussians before training, in the colours of these frames."""
         gains = self.measured_exposure(frames) if self.settings.exposure else None
-        how = self.pixel, gains, self.colours, self.settings.train.antialiased
+        train = self.settings.train
+        how = self.pixel, gains, self.colours, train.antialiased, train.space == "linear"
         return initial_gaussians(self.prior, frames, *how)[0].with_degree(self.settings.sh)
 
     @cached_property
@@ -245,7 +246,7 @@ class Scene:
     def render(self, model: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Linear RGB [H,W,3] and alpha [H,W] of a model."""
         image = render(model, camera, cache=self.cache)
-        return np.asarray(image.rgb), np.asarray(image.alpha)
+        return model.linear_rgb(np.asarray(image.rgb)), np.asarray(image.alpha)
 
     # --- Information -----------------------------------------------------------------------------
 

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 import mgs
+from mgs.evaluation import render_view
+from mgs.prior.initial import initial_gaussians
+from mgs.splat_ply import read_ply
 
 
 @pytest.mark.parametrize("policy", [mgs.DOptimal(), mgs.Directional()], ids=lambda p: p.name)
@@ -20,3 +23,26 @@ def test_a_loop_in_memory_gives_the_same_views_and_gaussians(dataset, prior, tmp
     np.testing.assert_array_equal(state.H, whole.H)
     np.testing.assert_array_equal(state.surface, whole.surface)
     assert state.gaussians == whole.gaussians
+
+
+def test_a_run_that_blends_srgb(dataset, prior, tmp_path):
+    """Pictures and PSNR are like those of a linear run; its PLY says that it holds sRGB."""
+    views, errors = {}, {}
+    for space in ("linear", "srgb"):
+        train = {"passes": 8, "space": space}
+        common = {"prior": prior, "policy": "uniform", "seeds": 3, "budget": 2, "train": train}
+        run = mgs.run_nbv(dataset, tmp_path / space, **common)
+        model = read_ply(tmp_path / space / "gaussians.ply")
+        assert model == run.state.gaussians
+        assert mgs.open_run(tmp_path / space).state.gaussians == model
+        assert model.linear == (space == "linear")
+        frame = run.taken[0]
+        views[space] = render_view(model, frame.camera)[0]
+        errors[space] = np.square(views[space] - frame.masked_rgb()).mean()
+    assert errors["srgb"] < 2 * errors["linear"]
+    assert not np.array_equal(*views.values())
+    start, seen = initial_gaussians(run.prior, run.taken)
+    displayed, _ = initial_gaussians(run.prior, run.taken, linear=False)
+    np.testing.assert_allclose(
+        displayed.linear_rgb(displayed.rgb)[seen], start.rgb[seen], atol=1e-5
+    )

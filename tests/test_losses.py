@@ -24,8 +24,9 @@ def srgb(c):
     return np.where(c <= 0.0031308, 12.92 * c, curve)
 
 
-def slow_loss(drawn, pixels, weights):
+def slow_loss(drawn, pixels, weights, linear=True):
     """`l1_dssim` in float64."""
+    encoded = srgb if linear else np.array
     offsets = np.arange(-5, 6)
     window = np.exp(-0.5 * (offsets / 1.5) ** 2)
     window /= window.sum()
@@ -35,8 +36,8 @@ def slow_loss(drawn, pixels, weights):
             correlate1d(image, window, 0, mode="constant"), window, 1, mode="constant"
         )
 
-    y = np.dstack([srgb(pixels[..., :3]), pixels[..., 3:]])
-    x = y + (np.dstack([srgb(drawn[..., :3]), drawn[..., 3:]]) - y) * weights
+    y = np.dstack([encoded(pixels[..., :3]), pixels[..., 3:]])
+    x = y + (np.dstack([encoded(drawn[..., :3]), drawn[..., 3:]]) - y) * weights
     mx, my = blur(x), blur(y)
     vx, vy, cov = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
     c1, c2 = 1e-4, 9e-4
@@ -60,18 +61,19 @@ def flat(image):
     return mi.Float(padded(image.astype(np.float32)).ravel())
 
 
-def test_values_and_gradients_are_those_of_the_reference(images):
+@pytest.mark.parametrize("linear", [True, False])
+def test_values_and_gradients_are_those_of_the_reference(images, linear):
     drawn, pixels, weights = images
     x, size = flat(drawn), (WIDTH, HEIGHT, drawn.shape[2])
     dr.enable_grad(x)
-    values = LOSSES["l1-dssim"](x, flat(pixels), flat(weights), size)
+    values = LOSSES["l1-dssim"](x, flat(pixels), flat(weights), size, linear)
     dr.backward(dr.sum(values))
-    assert np.allclose(np.array(values), slow_loss(*images).ravel(), atol=2e-5)
+    assert np.allclose(np.array(values), slow_loss(*images, linear).ravel(), atol=2e-5)
     found, rng = np.array(dr.grad(x)).reshape(drawn.shape), np.random.default_rng(1)
     for at in rng.permutation(list(np.ndindex(drawn.shape)))[:60]:
         step = np.zeros_like(drawn)
         step[tuple(at)] = 1e-6
-        up, down = (slow_loss(drawn + s * step, pixels, weights).sum() for s in (1, -1))
+        up, down = (slow_loss(drawn + s * step, pixels, weights, linear).sum() for s in (1, -1))
         assert found[tuple(at)] == pytest.approx((up - down) / 2e-6, rel=2e-3, abs=2e-3)
 
 

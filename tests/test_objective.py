@@ -20,12 +20,18 @@ LAM = {"colour": 0.02, "scale": 0.05, "rotation": 0.1, "opacity": 0.01, "mean": 
 
 @pytest.fixture(
     scope="module",
-    params=[("frozen", 0.0), ("normal", 0.0), ("free", 0.0), ("frozen", 0.3), ("free", 2.0)],
+    params=[
+        ("frozen", 0.0, True),
+        ("normal", 0.0, True),
+        ("free", 0.0, True),
+        ("frozen", 0.3, False),
+        ("free", 2.0, True),
+    ],
 )
 def case(request):
     """Objective, model, and from the reference: Jacobian [M,P], residual [M], weights [M], lam [P]
     and offset from the start [P], parameters in the order of `learned`."""
-    means, alpha_weight = request.param
+    means, alpha_weight, linear = request.param
     start = surface_gaussians(N)
     start.log_scales += 0.9
     rng = np.random.default_rng(5)
@@ -35,6 +41,7 @@ def case(request):
             (a + 0.1 * rng.standard_normal(a.shape)).astype(np.float32)
             for a in (start.log_scales, start.quats, start.logit_opacities, start.sh)
         ),
+        linear=linear,
     )
     normals = rng.standard_normal((N, 3))
     directions = reference.mean_directions(N, means, normals)
@@ -51,7 +58,10 @@ def case(request):
     channels = 4 if alpha_weight else 3
     truths = [rng.uniform(0, 1, (20, 24, channels)).astype(np.float32) for _ in cameras]
     weights = [(rng.uniform(size=(20, 24, 1)) > 0.2).astype(np.float32) for _ in cameras]
-    targets = [np.dstack([t[..., :3], w, t[..., 3:]]) for t, w in zip(truths, weights, strict=True)]
+    targets = [
+        np.dstack([model.linear_rgb(t[..., :3]), w, t[..., 3:]])
+        for t, w in zip(truths, weights, strict=True)
+    ]
     goal = objective(
         model, cameras, targets, start, LAM, means=means, normals=normals, alpha_weight=alpha_weight
     )

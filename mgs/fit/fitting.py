@@ -103,7 +103,8 @@ def _step(
     copy, shift = with_gradients(model, prior), [dr.zeros(mi.Float, len(model)) for _ in slopes]
     dr.enable_grad(shift)
     drawn = view.rendered(copy, shift).array
-    values = LOSSES[error](drawn, view.target.pixels, view.target.weights, view.size)
+    target = view.target
+    values = LOSSES[error](drawn, target.pixels, target.weights, view.size, model.linear)
     loss = dr.mean(dr.detach(values))
     dr.backward(0.5 * dr.sum(values))
     step, moved, kept = mi.Float(t), {}, []
@@ -141,7 +142,8 @@ def fit(
 
     targets: one per camera (`mgs.data.dataset.target_of`): linear RGB [H,W,3], the rock in front of
         black; or [H,W,4] with a weight per pixel, 1 where its colour is known and 0 where not; or
-        [H,W,5] with weight and alpha, required if `settings.alpha_weight` is not 0.
+        [H,W,5] with weight and alpha, required if `settings.alpha_weight` is not 0. They are
+        compared in the space in which the Gaussians are blended (`Gaussians.linear`).
     on_pass(done, most): called after each pass.
     start: mean of the prior; by default the given Gaussians.
     lam: the prior's information about each kind of parameter (`mgs.gaussians.learned`), (pixel

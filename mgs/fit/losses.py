@@ -30,23 +30,25 @@ STRIP = 8
 Size = tuple[int, int, int]
 """Width, height and channels of an image."""
 
-Loss = Callable[[Any, Any, Any, Size], Any]
-"""loss(drawn, pixels, weights, size) -> what each pixel value adds, Float [H*W*C]. Render and image
-are linear RGB, with alpha if there are four channels; weights are factors of the differences."""
+Loss = Callable[[Any, Any, Any, Size, bool], Any]
+"""loss(drawn, pixels, weights, size, linear) -> what each pixel value adds, Float [H*W*C]. Render
+and image are linear RGB, or sRGB where `linear` is false, with alpha if there are four channels;
+weights are factors of the differences."""
 
 
-def squared(drawn: Any, pixels: Any, weights: Any, size: Size) -> Any:
+def squared(drawn: Any, pixels: Any, weights: Any, size: Size, linear: bool) -> Any:
     """Squared difference."""
     return dr.square((drawn - pixels) * weights)
 
 
-def l1_dssim(drawn: Any, pixels: Any, weights: Any, size: Size) -> Any:
-    """0.8 |x - y| + 0.2 (1 - SSIM(x, y)) of the images encoded as sRGB (Kerbl et al. 2023).
+def l1_dssim(drawn: Any, pixels: Any, weights: Any, size: Size, linear: bool) -> Any:
+    """0.8 |x - y| + 0.2 (1 - SSIM(x, y)) of the images as sRGB (Kerbl et al. 2023).
 
     Alpha is not encoded. SSIM takes values beyond the border as 0, as the authors' program does.
     """
-    y = _encoded(pixels, size)
-    x = y + (_encoded(drawn, size) - y) * weights
+    if linear:
+        drawn, pixels = _encoded(drawn, size), _encoded(pixels, size)
+    x, y = pixels + (drawn - pixels) * weights, pixels
     dissimilar = 1 - similarity(x, y, size)
     return dr.lerp(dr.abs(x - y), dissimilar, DSSIM_SHARE)
 

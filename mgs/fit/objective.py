@@ -221,7 +221,8 @@ class Objective:
         errors = []
         for photo in self.photos:
             drawn, target = _rendered(model, photo, self.cache), photo.target
-            values = LOSSES[self.error](drawn, target.pixels, target.weights, photo.size)
+            compared = drawn, target.pixels, target.weights, photo.size, model.linear
+            values = LOSSES[self.error](*compared)
             errors.append(dr.mean(values) + penalty / len(target))
             dr.eval(errors[-1])  # frees the rendered image
         return float(np.mean([float(error[0]) for error in errors]))
@@ -329,7 +330,7 @@ def objective(
         raise ValueError(f"there are {len(cameras)} cameras, but {len(targets)} targets")
 
     def photo(i: int) -> Photo:
-        return _photo(cameras[i], targets[i], alpha_weight)
+        return _photo(gaussians, cameras[i], targets[i], alpha_weight)
 
     photos = Deferred(range(len(cameras)), kept_within(IMAGE_BYTES, photo, lambda p: p.nbytes))
     start = gaussians if start is None else start
@@ -363,9 +364,9 @@ def filled(values: float | np.ndarray, shape: tuple[int, ...]) -> Any:
     return mi.Float(padded(np.broadcast_to(values, shape).astype(np.float32)).ravel())
 
 
-def _photo(camera: Camera, target: np.ndarray, alpha_weight: float) -> Photo:
-    """A `Photo` from a target of `fit`. Raises InputError if alpha has a weight and the target has
-    no alpha."""
+def _photo(gaussians: Gaussians, camera: Camera, target: np.ndarray, alpha_weight: float) -> Photo:
+    """A `Photo` from a target of `fit`, in the space in which the Gaussians are blended. Raises
+    InputError if alpha has a weight and the target has no alpha."""
     factor, stored = None, target.shape[-1]
     if alpha_weight:
         if stored < 5:
@@ -374,6 +375,8 @@ def _photo(camera: Camera, target: np.ndarray, alpha_weight: float) -> Photo:
                 "alpha as the last"
             )
         factor = dr.opaque(mi.Float, float(np.sqrt(alpha_weight)))
+    if not gaussians.linear:
+        target = padded(np.dstack([gaussians.blended(target[..., :3]), target[..., 3:]]))
     values = mi.Float(adopted(target).ravel())
     return Photo(camera, camera_array(camera), Target(values, factor, stored))
 

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.special import logit
 
 from mgs.camera import Camera
+from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
 from mgs.data.visibility import in_image, in_mask, visible
 from mgs.gaussians import ARRAYS, Gaussians, sh_from_rgb
@@ -65,7 +66,7 @@ RANDOM_OPACITY = 0.1
 """Opacity of a Gaussian of a random start, as in 3DGS (Kerbl et al. 2023)."""
 
 GREY = 0.5
-"""Linear RGB of a Gaussian that no frame sees: all its spherical harmonics are zero."""
+"""Colour of a Gaussian that no frame sees: all its spherical harmonics are zero."""
 
 
 Colours = tuple[np.ndarray, np.ndarray]
@@ -79,13 +80,14 @@ def initial_gaussians(
     gains: np.ndarray | None = None,
     colours: Callable[[Frame], Colours] | None = None,
     antialiased: bool = True,
+    linear: bool = True,
 ) -> tuple[Gaussians, np.ndarray]:
     """Place one flat Gaussian per sample of a prior, in its mean colour, then one behind each
     backed sample.
 
     pixel: unit of INSET, metres, by default `pixel_on` for the frames' cameras. gains: [V,3]
     exposures that divide the colours (`mgs.prior.exposure`). colours: `colours_of(prior)`, to reuse
-    it between calls. antialiased: as in `Gaussians`.
+    it between calls. antialiased, linear: as in `Gaussians`.
 
     Returns (N + backed Gaussians of degree 0, seen [N] bool). A frame sees a sample that lies in
     its rock mask, faces the camera and agrees with the depth image (or else the mesh's depth) up to
@@ -93,7 +95,7 @@ def initial_gaussians(
     a file of a frame cannot be read, and as `mesh_depth`.
     """
     if prior.numbers.get("from") == "random":
-        start, seen = round_gaussians(prior.points, frames, gains)
+        start, seen = round_gaussians(prior.points, frames, gains, linear)
         return replace(start, antialiased=antialiased), seen
     n = len(prior.points)
     total, count = np.zeros((n, 3)), np.zeros(n)
@@ -103,7 +105,6 @@ def initial_gaussians(
         total[seen] += rgb if gains is None else rgb / gains[k]
         count[seen] += 1
     seen = count > 0
-    rgb = np.where(seen[:, None], total / np.maximum(count, 1)[:, None], GREY)
     if pixel is None:
         pixel = pixel_on(prior, [frame.camera for frame in frames])
     below = INSET[antialiased] * pixel
@@ -113,18 +114,29 @@ def initial_gaussians(
         log_scales=np.tile(scales, (n, 1)).astype(np.float32),
         quats=quat_from_normals(prior.normals).astype(np.float32),
         logit_opacities=np.full(n, logit(INITIAL_OPACITY), np.float32),
-        sh=sh_from_rgb(rgb),
+        sh=_mean_sh(total, count, linear),
         antialiased=antialiased,
+        linear=linear,
     )
     return _with_backing(surface, prior), seen
 
 
+def _mean_sh(total: np.ndarray, count: np.ndarray, linear: bool) -> np.ndarray:
+    """Coefficients [N,1,3] of mean colours, from sums [N,3] of linear RGB over `count` [N] frames;
+    GREY where there is none. linear: as in `Gaussians`."""
+    rgb = total / np.maximum(count, 1)[:, None]
+    return sh_from_rgb(np.where(count[:, None] > 0, rgb if linear else srgb_from_linear(rgb), GREY))
+
+
 def round_gaussians(
-    points: np.ndarray, frames: Sequence[Frame], gains: np.ndarray | None = None
+    points: np.ndarray,
+    frames: Sequence[Frame],
+    gains: np.ndarray | None = None,
+    linear: bool = True,
 ) -> tuple[Gaussians, np.ndarray]:
     """Round, nearly transparent Gaussians at points [N,3], and whether a frame shows them [N].
 
-    gains: as in `initial_gaussians`.
+    gains, linear: as in `initial_gaussians`.
     """
     total, count = np.zeros((len(points), 3)), np.zeros(len(points))
     for k, frame in enumerate(frames):
@@ -134,14 +146,14 @@ def round_gaussians(
         total[here] += frame.rgb()[row, column] / (1 if gains is None else gains[k])
         count[here] += 1
     seen = count > 0
-    rgb = np.where(seen[:, None], total / np.maximum(count, 1)[:, None], GREY)
     size = np.log(cKDTree(points).query(points, min(4, len(points)))[0][:, 1:].mean(1))
     start = Gaussians(
         means=points.astype(np.float32),
         log_scales=np.tile(size[:, None], 3).astype(np.float32),
         quats=np.tile(np.array([1, 0, 0, 0], np.float32), (len(points), 1)),
         logit_opacities=np.full(len(points), logit(RANDOM_OPACITY), np.float32),
-        sh=sh_from_rgb(rgb),
+        sh=_mean_sh(total, count, linear),
+        linear=linear,
     )
     return start, seen
 

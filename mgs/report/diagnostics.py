@@ -28,6 +28,7 @@ from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
 from mgs.errors import InputError
+from mgs.evaluation import render_view
 from mgs.files import atomic_path
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr
@@ -79,10 +80,9 @@ def view_maps(
     from mgs.splat import ListCache, render
 
     cache = ListCache()
-    image = render(gaussians, camera, cache=cache)
-    rgb, alpha = np.asarray(image.rgb), np.asarray(image.alpha)
+    rgb, alpha, depth = render_view(gaussians, camera, cache)
     maps = {channel: rgb[..., i] for i, channel in enumerate("RGB")}
-    maps |= {"A": alpha, "Z": np.asarray(image.depth)}
+    maps |= {"A": alpha, "Z": depth}
     names, shown = list(scalars), np.where(alpha > 0, alpha, 1.0)
     for first in range(0, len(names), 3):
         three = names[first : first + 3]

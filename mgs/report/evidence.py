@@ -28,6 +28,7 @@ from mgs.data.dataset import target_of
 from mgs.data.frames import Frame
 from mgs.data.up import upright
 from mgs.errors import InputError
+from mgs.evaluation import render_view
 from mgs.fit.fitting import fit
 from mgs.fit.objective import Objective, Vector, objective
 from mgs.fit.stopping import StopReason
@@ -39,7 +40,7 @@ from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of, without_gain
 from mgs.prior.initial import initial_gaussians, initial_normals, pixel_on
 from mgs.run.settings import NbvSettings
-from mgs.splat import ListCache, as_drjit, groups, render
+from mgs.splat import ListCache, as_drjit, groups
 
 DIRECTIONAL = "directional"
 """Kind of the colour coefficients of degrees above 0."""
@@ -114,7 +115,8 @@ def last_images(
     pixel = pixel_on(prior, cameras)
 
     def start(views: Sequence[int]) -> Gaussians:
-        how = pixel, gains[list(views)], None, settings.train.antialiased
+        train = settings.train
+        how = pixel, gains[list(views)], None, train.antialiased, train.space == "linear"
         return initial_gaussians(prior, [frames[i] for i in views], *how)[0]
 
     def target(view: int) -> np.ndarray:
@@ -261,7 +263,7 @@ def directional_gain(
 
 def _squared_error(model: Gaussians, camera: Camera, target: np.ndarray, cache: ListCache) -> float:
     """Mean squared error of the pixels whose colour is known, (linear RGB)^2."""
-    rgb = np.asarray(render(model, camera, cache=cache).rgb, np.float64)
+    rgb = render_view(model, camera, cache)[0].astype(np.float64)
     return float(np.square(rgb - target[..., :3])[target[..., 3] > 0].mean())
 
 

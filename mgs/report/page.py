@@ -16,10 +16,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mgs.data.frames import Frame
 from mgs.data.up import upright
+from mgs.evaluation import render_view
 from mgs.files import write_text
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.page_facts import (
@@ -100,8 +99,6 @@ def draw_pictures(
 
     Raises InputError if a file of a frame cannot be read.
     """
-    from mgs.splat import render
-
     frames = [*views, *(frame for run in runs.values() for frame in run.taken)]
     taken = len(frames) - len(views)
     total, done = taken + len(views) * len(runs), 0
@@ -119,8 +116,7 @@ def draw_pictures(
         for frame in views:
             name = f"{frame.name}/{label}"
             if f"render/{name}" not in album.pictures:
-                rgb = np.asarray(render(run.gaussians, frame.camera).rgb)
-                draw_render(album, name, frame, rgb)
+                draw_render(album, name, frame, render_view(run.gaussians, frame.camera)[0])
             drawn()
     return album
 

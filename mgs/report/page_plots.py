@@ -189,7 +189,7 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
 def _model_points(model: Gaussians, turn: np.ndarray) -> dict[str, Any]:
     """Trace of up to POINTS Gaussians of a model in their colours. turn: [3,3]."""
     some = model[:: max(1, -(-len(model) // POINTS))]
-    colours = np.round(srgb_from_linear(some.rgb) * 255).astype(int).tolist()
+    colours = np.round(srgb_from_linear(some.linear_rgb(some.rgb)) * 255).astype(int).tolist()
     marker = {"size": 2, "color": [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in colours]}
     trace = _points("model", np.round(some.means.astype(float) @ turn.T, 4), marker)
     return trace | {"hoverinfo": "skip"}

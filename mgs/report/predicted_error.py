@@ -102,7 +102,7 @@ def residual_variance(gaussians: Gaussians, frames: Sequence[Frame]) -> Array:
     for frame in frames:
         truth, weight = frame.target()
         rendered = np.asarray(render(gaussians, frame.camera).rgb)
-        error = np.square(rendered - truth[..., :3]).mean(axis=-1) * weight
+        error = np.square(rendered - gaussians.blended(truth[..., :3])).mean(axis=-1) * weight
         for row, pixels in zip(sums, (error, weight), strict=True):
             sh = mi.TensorXf(padded(grey.sh))
             dr.enable_grad(sh)
@@ -126,8 +126,9 @@ class Predictor:
     residual: Array
 
     def look(self, frame: Frame, seed: int) -> tuple[dict[str, Array], Array, NDArray[np.bool_]]:
-        """Errors of one view: each of TERMS, [H,W,3], squared linear RGB; the true error, [H,W,3]
-        linear RGB; and the pixels that are wholly on the rock, [H,W]."""
+        """Errors of one view, in the space in which the Gaussians are blended: each of TERMS,
+        [H,W,3], squared RGB; the true error, [H,W,3] RGB; and the pixels that are wholly on the
+        rock, [H,W]."""
         # Drawn as colours of about 1, for which float32 is precise.
         largest = max(float(self.residual.max(initial=0)), 1e-30)
         image = render(_coloured(self.gaussians, self.residual / largest), frame.camera)
@@ -143,7 +144,7 @@ class Predictor:
         }
         truth, weight = frame.target()
         inside = frame.mask() & (truth[..., 3] > 0.999) & (weight > 0)
-        return terms, rgb - truth[..., :3], inside
+        return terms, rgb - self.gaussians.blended(truth[..., :3]), inside
 
 
 def predictor(

@@ -288,6 +288,7 @@ def write_checkpoint(out: Path, state: Checkpoint) -> None:
             "steps": state.steps,
             "inputs": state.inputs,
             "antialiased": state.gaussians.antialiased,
+            "linear": state.gaussians.linear,
         },
         allow_nan=False,
     )
@@ -355,7 +356,8 @@ def read_checkpoint(out: Path) -> Checkpoint | None:
             name: _member(file, name, "f") for name in (*ARRAYS, "H", "surface")
         }
         H, surface = arrays.pop("H"), arrays.pop("surface")
-        gaussians = Gaussians(**arrays, antialiased=record.pop("antialiased"))
+        antialiased, linear = record.pop("antialiased"), record.pop("linear")
+        gaussians = Gaussians(**arrays, antialiased=antialiased, linear=linear)
         gaussians.check(f"{out / CHECKPOINT}: not a readable checkpoint")
         if H.ndim != 2 or surface.ndim != 2 or len(H) != len(gaussians):
             raise ValueError(f"H has shape {H.shape} of {len(gaussians)} Gaussians")

@@ -91,6 +91,7 @@ class Record(_Strict, extra="forbid"):
     steps: list[_Line]
     inputs: _Inputs
     antialiased: bool
+    linear: bool = True
 
     @model_validator(mode="after")
     def _agree(self) -> Record:

@@ -47,7 +47,7 @@ def gaussian_colours(subject: Subject, layer: str) -> np.ndarray:
     """Colours of the Gaussians in a layer, sRGB uint8 [N,3]; grey for depth."""
     g = subject.model
     if layer == "colour":
-        return _display(g, g.rgb)
+        return _eight_bits(g.linear_rgb(g.rgb))
     if layer in subject.scalars:
         return painted(subject.scalars[layer], PANELS[layer][1], *scale(subject, layer))
     return np.full((len(g), 3), 255 if layer == "alpha" else 128, np.uint8)
@@ -69,7 +69,7 @@ def kernel_image(
     depth = np.where(seen, maps["Z"], FAR).astype(np.float32)
     if layer == "colour":
         rgb = np.stack([maps[channel] for channel in "RGB"], axis=-1)
-        return _display(subject.model, rgb), depth, (0.0, 1.0)
+        return _eight_bits(rgb), depth, (0.0, 1.0)
     if layer == "alpha":
         grey = np.round(255 * np.clip(maps["A"], 0, 1)).astype(np.uint8)
         return np.stack([grey] * 3, axis=-1), depth, (0.0, 1.0)
@@ -94,8 +94,6 @@ def legend(layer: str, ends: tuple[float, float], unit: str) -> str:
     return LEGENDS[layer].format(low=ends[0], high=ends[1], unit=plain(unit))
 
 
-def _display(g: Gaussians, rgb: np.ndarray) -> np.ndarray:
-    """Colours of a model as sRGB, uint8."""
-    return np.round(255 * (srgb_from_linear(rgb) if g.linear else np.clip(rgb, 0, 1))).astype(
-        np.uint8
-    )
+def _eight_bits(linear: np.ndarray) -> np.ndarray:
+    """Linear RGB as sRGB, uint8."""
+    return np.round(255 * srgb_from_linear(linear)).astype(np.uint8)
