@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import re
 import shutil
 import struct
 import subprocess
@@ -17,11 +18,13 @@ from refusals import refused
 from test_render_command import CAMERAS, gaussians
 from test_splat_ply import assert_close
 
+import mgs
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_cameras, load_dataset
 from mgs.errors import InputError, Notice
 from mgs.gaussians import Gaussians
 from mgs.images import read_mask
+from mgs.report.evaluation import compare_models
 from mgs.report.exporting import in_srgb, to_y_up
 from mgs.rotation import rotmat_from_quat
 from mgs.run.folder import open_run
@@ -29,7 +32,7 @@ from mgs.splat import reference, render
 from mgs.splat.reference import sh_basis
 from mgs.splat_files import FORMATS, load_gaussians, upward, write_gaussians
 from mgs.splat_places import mirrored
-from mgs.splat_ply import write_ply
+from mgs.splat_ply import read_ply, write_ply
 
 TOLERANCES = {
     "ply": (0, 0, 0, 0, 0),
@@ -320,6 +323,28 @@ def test_the_command_converts_and_keeps_what_is_there(tmp_path, capsys):
     assert np.array_equal(read.means, model.means)
     assert read.sh.shape == (40, 16, 3)
     assert "is there already" in refused(capsys, given, tmp_path)
+
+
+def test_the_export_of_a_run_fits_its_colours_again(dataset, prior, tmp_path, capsys):
+    """What is printed is measured; alone, colours are converted, and what that changes is said."""
+    settings = {"prior": prior, "seeds": 4, "budget": 0, "train": {"passes": 10}}
+    run = mgs.run_nbv(dataset, tmp_path / "run", **settings)
+    command("export", tmp_path / "run", "--to", "ply", "--out", tmp_path / "fitted.ply")
+    said = [float(number) for number in re.findall(r"([0-9.]+) dB", capsys.readouterr().out)]
+    fitted, converted = read_ply(tmp_path / "fitted.ply"), in_srgb(run.state.gaussians)
+    models = run.state.gaussians, fitted, converted
+    np.testing.assert_allclose(compare_models(models, run)[1], said, atol=0.006)
+    assert said[2] < said[1]
+    assert replace(fitted, sh=converted.sh) == converted, "only colours change"
+    command(
+        "export", tmp_path / "run/gaussians.ply", "--to", "ply", "--out", tmp_path / "alone.ply"
+    )
+    (lost,) = re.findall(r"([0-9.]+) dB", capsys.readouterr().out)
+    assert read_ply(tmp_path / "alone.ply") == converted
+    assert 20 < float(lost) < 60
+    command("export", tmp_path / "fitted.ply", "--to", "ply", "--out", tmp_path / "same.ply")
+    assert "dB" not in capsys.readouterr().out
+    assert read_ply(tmp_path / "same.ply") == fitted
 
 
 def glb(content: object) -> bytes:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from mgs.cli.options import Force, Runs, argument, option
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import echo
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file
+
+if TYPE_CHECKING:
+    from mgs.gaussians import Gaussians
 
 
 def export(
@@ -30,7 +34,10 @@ def export(
     ] = None,
     colour_space: Annotated[
         Literal["srgb", "linear"],
-        option("Colours to write: sRGB, as most viewers expect, or linear RGB, in which mgs fits."),
+        option(
+            "Colours to write: sRGB, as viewers expect, or linear RGB, as they were fitted. Those "
+            "of a linear run are fitted once more, blended in sRGB."
+        ),
     ] = "srgb",
     sh: Annotated[
         int | None,
@@ -46,7 +53,7 @@ def export(
 
     All formats can also be read, so the command converts between them, too.
     """
-    from mgs.report.exporting import in_srgb, read_model, to_y_up
+    from mgs.report.exporting import read_model, to_y_up
     from mgs.splat_files import FORMATS, write_gaussians
 
     if to in ("nerfstudio", "colmap"):
@@ -63,7 +70,9 @@ def export(
             raise InputError(
                 f"{model}: its colours are sRGB already; leave out --colour-space linear"
             )
-        shown = in_srgb(gaussians) if colour_space == "srgb" else gaussians
+        shown = gaussians
+        if shown.linear and colour_space == "srgb":
+            shown = _in_srgb(model, gaussians)
         shown = shown.with_degree(max(sh or 0, shown.sh_degree))
         write_gaussians(path, shown, to, to_y_up(up))
         megabytes = path.stat().st_size / 1e6
@@ -82,6 +91,35 @@ def _export_views(runs: list[Path], kind: str, out: Path | None, every: bool, fo
         with atomic_folder(folder, Ours(NAMES[kind]) if force else None) as unfinished:
             what = write_views(unfinished, opened, kind, every)
         echo(f"wrote {what} to {folder}")
+
+
+def _in_srgb(model: Path, linear: Gaussians) -> Gaussians:
+    """Gaussians of a linear model, of this file or run folder, for sRGB blending. Prints what that
+    costs."""
+    from mgs.report.evaluation import compare_models
+    from mgs.report.exporting import difference, in_srgb, refit_in_srgb
+    from mgs.run.folder import open_run
+
+    if not model.is_dir():
+        converted = in_srgb(linear)
+        echo(
+            "colours are converted from linear RGB to sRGB one by one: blended there, pictures "
+            f"differ from the model's own by {difference(linear, converted):.1f} dB; "
+            "the export of a run folder fits them again"
+        )
+        return converted
+    run = open_run(model)
+    with progress_bar() as bar:
+        fitted = refit_in_srgb(run, partial(bar, "fitting colours, blended in sRGB"))
+    name, values = compare_models([run.gaussians, in_srgb(run.gaussians), fitted], run)
+    if values is not None:
+        before, between, after = values
+        echo(
+            f"PSNR of the {name} views: {before:.2f} dB blended in linear RGB, as in the run; "
+            f"{after:.2f} dB blended in sRGB, as exported, with colours fitted again to the views "
+            f"taken ({between:.2f} dB with converted colours)"
+        )
+    return replace(fitted, origin=linear.origin)
 
 
 def _targets(

@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from mgs.camera import Camera, look_at
 from mgs.colour import srgb_from_linear
+from mgs.data.dataset import target_of
 from mgs.data.up import Up, upright
+from mgs.evaluation import render_view
+from mgs.fit.settings import RATES, TrainSettings
 from mgs.gaussians import Gaussians
-from mgs.run.folder import open_run
+from mgs.memory import Deferred
+from mgs.metrics import psnr
+from mgs.prior.exposure import exposure_of, without_gain
+from mgs.run.folder import Run, open_run
 from mgs.splat.reference import sh_basis
 from mgs.splat_files import load_gaussians, upward
 
 DIRECTIONS = 64
 """Directions to which the coefficients of a converted colour are fitted."""
+
+REFIT = TrainSettings(
+    optimiser="adam", tolerance=0, rates=dict.fromkeys(RATES, 0.0) | {"colour": RATES["colour"]}
+)
+"""Fit of colours alone, after which a linear model blends well in sRGB."""
+
+AROUND = 8
+"""Views in which `difference` compares two models."""
 
 PART = 1 << 16
 """Gaussians whose colours are converted at a time."""
@@ -52,6 +68,36 @@ def in_srgb(g: Gaussians) -> Gaussians:
         colours = srgb_from_linear(0.5 + np.einsum("dk,nkc->ndc", basis, g.sh[part]))
         sh[part] = np.einsum("kd,ndc->nkc", inverse, colours - 0.5)
     return replace(g, sh=sh, linear=False)
+
+
+def refit_in_srgb(run: Run, progress: Callable[[int, int], None]) -> Gaussians:
+    """Fit the colours of a run's linear model, blended in sRGB, to the views taken; the rest is
+    unchanged.
+
+    progress(done, all) is called after each pass. Raises InputError if a file of a frame or, where
+    exposures differ, of the prior cannot be read.
+    """
+    from mgs.fit.fitting import fit
+
+    frames = run.taken
+    gains = exposure_of(run.prior)(frames) if run.settings.exposure else np.ones((len(frames), 3))
+    targets = Deferred(range(len(frames)), lambda i: without_gain(target_of(frames[i]), gains[i]))
+    cameras = [frame.camera for frame in frames]
+    return fit(in_srgb(run.state.gaussians), cameras, targets, REFIT, progress).gaussians
+
+
+def difference(one: Gaussians, other: Gaussians) -> float:
+    """PSNR of the pictures of two models of the same means against each other, dB, over AROUND
+    views from all sides."""
+    centre = one.means.mean(0, dtype=np.float64)
+    radius = max(float(np.percentile(np.linalg.norm(one.means - centre, axis=1), 99)), 1e-6)
+    K = np.array([[320, 0, 160], [0, 320, 120], [0, 0, 1]])
+    pictures = []
+    for turn in 2 * np.pi * np.arange(AROUND) / AROUND:
+        eye = centre + 3 * radius * np.array([np.cos(turn), np.sin(turn), np.sin(2 * turn)])
+        camera = Camera(K, 320, 240, look_at(eye, centre))
+        pictures.append([srgb_from_linear(render_view(g, camera)[0]) for g in (one, other)])
+    return psnr(*np.concatenate(pictures, 1))
 
 
 def to_y_up(up: Up) -> np.ndarray:

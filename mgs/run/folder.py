@@ -102,7 +102,7 @@ class Run:
             return html(repr(self), [])
         taken, g = thumbnails([frame.image_path for frame in self.taken]), self.gaussians
         turn = upright(self.prior.up)
-        return html(repr(self), [*taken, cloud(g.means @ turn.T, g.rgb)])
+        return html(repr(self), [*taken, cloud(g.means @ turn.T, g.linear_rgb(g.rgb))])
 
     @property
     def label(self) -> str:
