@@ -17,7 +17,7 @@ from mgs.data.raycast import mesh_depth
 from mgs.data.visibility import visible
 from mgs.errors import InputError
 from mgs.images import write_exr, write_png
-from mgs.prior.build import build_prior, load_prior, prior_and_cloud, save_prior
+from mgs.prior.build import build_prior, load_prior, outline_error, prior_and_cloud, save_prior
 from mgs.prior.segmentation import Plane, degrade, ground_plane, rock_cluster
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import poisson_mesh, sample_surface
@@ -69,6 +69,23 @@ def test_ground_plane_of_a_tilted_noisy_floor(dataset):
     points = rng.standard_normal((4000, 3))  # no plane dominates
     with pytest.raises(InputError, match="no ground plane"):
         ground_plane(Cloud(points, points, 0.05, 0.0, 4000), dataset.frames, seed=0)
+
+
+def test_parts_of_an_overhang_are_kept_together(dataset, built):
+    """A cap, a base under it, and a stone beside them, of which no point joins them."""
+    rng = np.random.default_rng(5)
+    cap, base = (rng.uniform([-0.5, -0.5, z], [0.5, 0.5, z + 0.3], (3000, 3)) for z in (0.8, 0.1))
+    stone = rng.uniform([2.0, 0, 0.1], [2.3, 0.3, 0.4], (1000, 3))
+    points = np.concatenate([cap, base[:2000], stone])
+    near = {"belongs": lambda part, rock: part[:, 0].max() < 1}
+    inside, _, count = rock_cluster(points, 0.05, X, **near)
+    assert count == 3
+    assert inside[:5000].mean() > 0.99
+    assert not inside[5000:].any()
+    mesh, frames = built[0].mesh, dataset.frames
+    half = mesh.faces[mesh.vertices[mesh.faces].mean(1)[:, 0] > synthetic.CENTRE[0]]
+    assert outline_error(mesh, frames) < 0.02
+    assert outline_error(Mesh(mesh.vertices, half, np.ones(len(half), bool)), frames) > 0.1
 
 
 def test_the_largest_cluster_wins_and_a_low_rise_weighs_little():

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 FILES = ("prior.json", "mesh.ply", "points.ply", "prior.png")
 """Names in a folder of this command."""
 
+OUTLINE = 0.05
+"""Disagreement of the outlines of mesh and masks, share of the covered pixels, beyond which a line
+says so."""
+
 WHY = {
     "depth": ": the dataset has depth images",
     "points": ": the dataset has points (sparse.ply) and no depth",
@@ -96,9 +100,10 @@ def prior(
     spread samples evenly over the faces that some frame sees. Writes mesh.ply, points.ply,
     prior.json and prior.png.
     """
+    from mgs.data.check import taken_frames
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF
-    from mgs.prior.build import prior_from_mesh, save_prior
+    from mgs.prior.build import outline_error, prior_from_mesh, save_prior
     from mgs.prior.figure import draw_prior
     from mgs.prior.initial import AGREEMENT, colour_agreement
     from mgs.prior.photographs import source_of
@@ -120,7 +125,9 @@ def prior(
         segmented = None
         if mesh is not None:
             cameras = [frame.camera for frame in loaded.frames]
-            result = prior_from_mesh(mesh, settings, axis or loaded.up, loaded.unit, cameras)
+            result = prior_from_mesh(
+                mesh, settings, axis or loaded.up, loaded.unit, cameras, loaded.origin
+            )
             if mesh.suffix.lower() in GLTF:
                 console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
         else:
@@ -135,6 +142,10 @@ def prior(
             if not math.isnan(agreed):
                 numbers = result.numbers | {"colour_agreement": agreed}
                 result = replace(result, numbers=numbers)
+        if result.numbers["from"] != "random":
+            wrong = outline_error(result.mesh, taken_frames(loaded))
+            if not math.isnan(wrong):
+                result = replace(result, numbers=result.numbers | {"outline_error": wrong})
         progress("figure")
         save_prior(unfinished, result)
         draw_prior(unfinished / "prior.png", result, segmented)
@@ -144,6 +155,14 @@ def prior(
         console.print(
             f"the photographs agree on only {agreed:.0%} of the surface's colours (on a correct "
             f"surface on {AGREEMENT:.0%} or more), so it may be wrong; fit with `--means free`",
+            soft_wrap=True,
+        )
+    wrong = result.numbers.get("outline_error", 0.0)
+    if wrong > OUTLINE:
+        console.print(
+            f"the outlines of mesh and masks disagree in {wrong:.1%} of the covered pixels of the "
+            f"median view (limit {OUTLINE:.0%}): a part of the object is missing or too much, or "
+            "masks and poses do not fit",
             soft_wrap=True,
         )
     if "resolution" in result.numbers:
@@ -209,6 +228,8 @@ def _table(numbers: dict[str, Any]) -> Table:
     if "colour_agreement" in numbers:
         agreed = f"{numbers['colour_agreement']:.0%}"
         table.add_row("colour variance that all frames agree on", agreed)
+    if "outline_error" in numbers:
+        table.add_row("outline against masks, median", f"{numbers['outline_error']:.2%} of pixels")
     table.add_row("up", _up(numbers))
     truth = numbers.get("truth")
     if truth is None:

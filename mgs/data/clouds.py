@@ -40,6 +40,13 @@ class SparseCloud:
         return SparseCloud(self.points * factor, self.views, self.track, self.error)
 
 
+def towards(points: np.ndarray, origin: Sequence[float]) -> np.ndarray:
+    """Points [N,3] in a dataset whose `origin` was subtracted from the data that was imported: less
+    that origin if they are in the place of that data, else as they are."""
+    centre = points.mean(0)
+    return points - origin if np.linalg.norm(centre - origin) < np.linalg.norm(centre) else points
+
+
 def write_cloud(path: str | Path, cloud: SparseCloud) -> None:
     """Write a binary PLY, float32, atomically: x y z, and if known nx ny nz (views), track, error.
 

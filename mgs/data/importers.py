@@ -16,8 +16,8 @@ from mgs.camera import Camera
 from mgs.data.clouds import write_cloud
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, resumes, write_transforms
 from mgs.data.frames import Frame
-from mgs.data.lens import Undo, read_fitting, shrunk, shrunk_to, undistorter
-from mgs.data.meshes import Mesh, read_mesh
+from mgs.data.lens import Undo, read_fitting, shrunk, undistorter
+from mgs.data.meshes import Mesh
 from mgs.data.rock_image import premultiplied, write_rock_image
 from mgs.data.shots import Shot, Source
 from mgs.data.sources import find_image
@@ -28,9 +28,6 @@ from mgs.images import PNG_BIT_DEPTH, read_depth, read_mask, read_rgba, write_ex
 
 CHECKED = 4
 """About the number of pictures that are checked before an import."""
-
-SMALL = 40_000
-"""Pixels of a picture in which a mesh is searched."""
 
 RECORD = "import.json"
 """Record of what is imported; an interrupted import of the same continues."""
@@ -68,7 +65,11 @@ def import_source(
         shots = [replace(shot, mask=_mask_file(masks, shot, every), rock=None) for shot in shots]
     elif mesh is not None:
         shots = [replace(shot, mask=None, rock=None) for shot in shots]
-        silhouette = silhouette_of(in_sight(mesh, read_mesh(mesh), shots, source.origin))
+        from mgs.data.raycast import mesh_in_sight  # imported here because it loads Mitsuba
+
+        silhouette = silhouette_of(
+            mesh_in_sight(mesh, [shot.camera for shot in shots], source.origin)
+        )
     asked = {
         "kind": source.kind,
         "frames": len(shots),
@@ -238,24 +239,6 @@ def _png_header(path: Path) -> bytes:
     with path.open("rb") as file:
         header = file.read(26)
     return header if header[:8] == b"\x89PNG\r\n\x1a\n" else b""
-
-
-def in_sight(path: Path, mesh: Mesh, shots: Sequence[Shot], origin: Sequence[float]) -> Mesh:
-    """The mesh, in the world of the shots, from which `origin` was subtracted. Raises InputError if
-    none of a few cameras sees it, as happens with another unit or other axes."""
-    from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
-
-    mesh = replace(mesh, vertices=mesh.vertices - origin)
-    depth = mesh_depth(mesh)
-    some = shots[:: max(1, len(shots) // CHECKED)]
-    if any((depth(shrunk_to(shot.camera, SMALL)[0]) > 0).any() for shot in some):
-        return mesh
-    size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    near = min(float(np.linalg.norm(shot.camera.position)) for shot in some)
-    raise InputError(
-        f"{path}: the mesh is in no picture: it is {size:.3g} across, and a camera is {near:.3g} "
-        "from the origin; give it in the unit and axes of the cameras"
-    )
 
 
 def _warn_of_bits(shots: Sequence[Shot]) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -11,10 +12,34 @@ import numpy as np
 
 from mgs import runtime
 from mgs.camera import Camera
+from mgs.data.clouds import towards
+from mgs.data.lens import shrunk_to
+from mgs.data.meshes import Mesh, read_mesh
+from mgs.errors import InputError
 from mgs.memory import padded
 
-if TYPE_CHECKING:
-    from mgs.data.meshes import Mesh
+SMALL = 40_000
+"""Pixels of a picture in which a mesh is searched."""
+
+
+def mesh_in_sight(path: Path, cameras: Sequence[Camera], origin: Sequence[float]) -> Mesh:
+    """Read a mesh, move it to a dataset of this origin (`towards`), and check that it is in some
+    picture.
+
+    Raises InputError as `read_mesh`, and if none of a few cameras sees the mesh, as happens with
+    another unit or other axes.
+    """
+    mesh = read_mesh(path)
+    mesh = replace(mesh, vertices=towards(mesh.vertices, origin))
+    depth, some = mesh_depth(mesh), cameras[:: max(1, len(cameras) // 4)]
+    if any((depth(shrunk_to(camera, SMALL)[0]) > 0).any() for camera in some):
+        return mesh
+    size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    near = min(float(np.linalg.norm(camera.position - mesh.vertices.mean(0))) for camera in some)
+    raise InputError(
+        f"{path}: the mesh is in no picture: it is {size:.3g} across, and the nearest camera is "
+        f"{near:.3g} from its middle; give it in the unit and axes of the cameras"
+    )
 
 
 def mesh_depth(mesh: Mesh) -> Callable[[Camera], np.ndarray]:

@@ -6,6 +6,7 @@ Steps: cloud, ground plane, rock, Poisson mesh, samples of its surface. Without 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 from plyfile import PlyData
+from scipy.ndimage import binary_dilation, binary_erosion
 
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud, write_cloud
@@ -251,15 +253,18 @@ def prior_from_mesh(
     up: Up = PLUS_Z,
     unit: str = "m",
     cameras: Sequence[Camera] = (),
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Prior:
     """Sample a given mesh file in world coordinates, all over.
 
-    up, unit, cameras: of the dataset; the cameras decide the number of Gaussians if the settings do
-    not. Raises InputError if the mesh cannot be read or sampled, and for settings that only a cloud
-    has: noise, holes, poisson_depth and density.
+    up, unit, cameras, origin: of the dataset; the cameras decide the number of Gaussians if the
+    settings do not. Raises InputError if the mesh cannot be read or sampled, if no camera sees it,
+    and for settings that only a cloud has: noise, holes, poisson_depth and density.
     """
     settings.refuse_shaping("`mesh` gives one")
-    mesh = read_mesh(path)
+    from mgs.data.raycast import mesh_in_sight  # imported here because it loads Mitsuba
+
+    mesh = mesh_in_sight(Path(path), cameras, origin) if cameras else read_mesh(path)
     if settings.density is not None:
         raise InputError(
             f"{path}: a density is relative to the voxels of a cloud, and a mesh has none; "
@@ -277,6 +282,22 @@ def prior_from_mesh(
         "settings": used,
     }
     return Prior(mesh, points, normals, spacing, spacing, numbers, sampled["backed"], up)
+
+
+def outline_error(mesh: Mesh, frames: Sequence[Frame]) -> float:
+    """Share of the pixels covered by mask or mesh where the two disagree by more than two pixels,
+    median over the frames with a mask; NaN without masks."""
+    from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
+
+    depth, errors = mesh_depth(mesh), list[float]()
+    for frame in frames:
+        if frame.mask_path is None and frame.rock_path is None:
+            continue
+        mask, drawn = frame.mask(), depth(frame.camera) > 0
+        wrong = drawn & ~binary_dilation(mask, iterations=2)
+        wrong |= binary_erosion(mask, iterations=2, border_value=1) & ~drawn
+        errors.append(float(wrong.sum() / max((mask | drawn).sum(), 1)))
+    return float(np.median(errors)) if errors else math.nan
 
 
 def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:

@@ -38,6 +38,16 @@ EQUAL_SIZE = 0.8
 NEARER = 1.25
 """Least ratio of distances from the focus that tells equally large clusters apart."""
 
+IN_MASKS = 0.9
+"""Least share of the masks that the median point of another cluster of the rock lies in."""
+
+STACKED = 0.5
+"""Without masks another cluster belongs to the rock if the gap between them is at most this share
+of the rock's extent, and their middles are, level, at most half as far apart: an overhang."""
+
+LEAST_PART = 0.02
+"""Least number of points of another part of the rock, over that of the rock's largest."""
+
 NORMAL_NEIGHBOURS = (16, 128)
 """Neighbours for a normal: without noise, and at most."""
 
@@ -134,6 +144,7 @@ def rock_cluster(
     name: str = "cloud",
     weight: Callable[[np.ndarray], np.ndarray] = lambda points: np.ones(len(points)),
     sparse: float = 0.0,
+    belongs: Callable[[np.ndarray, np.ndarray], bool] = lambda part, rock: False,
 ) -> tuple[np.ndarray, float, int]:
     """Find the rock among points above the ground [N,3], by DBSCAN (Ester et al. 1996,
     scikit-learn).
@@ -142,9 +153,10 @@ def rock_cluster(
     name: of the cloud, for messages. weight: points [N,3] -> weights [N]. sparse: distance between
     neighbours where the cloud is sparse, metres; DBSCAN sees no finer points, since it takes one
     density for all. The rock is the cluster of largest weight, or of several nearly as large ones
-    (EQUAL_SIZE) the nearest to the target. Returns (inside [N] bool, eps in metres, number of
-    clusters). Raises InputError if there is no cluster, or two are equally large and about equally
-    near.
+    (EQUAL_SIZE) the nearest to the target; with it go the clusters of which belongs(points of the
+    cluster, points of the rock) is true. Returns (inside [N] bool, eps in metres, number of
+    clusters). Raises InputError if there is no cluster, or two that do not belong together are
+    equally large and about equally near.
     """
     from sklearn.cluster import DBSCAN
 
@@ -169,15 +181,24 @@ def rock_cluster(
     large = np.flatnonzero(sizes >= EQUAL_SIZE * sizes.max())
     away = np.array([np.linalg.norm(thin[labels == k].mean(0) - target) for k in large])
     order = np.argsort(away, kind="stable")
-    if len(large) > 1 and away[order[1]] < NEARER * away[order[0]]:
+    rock = int(large[order[0]])
+    parts = [
+        k
+        for k in range(count)
+        if k == rock
+        or (
+            (labels == k).sum() >= LEAST_PART * (labels == rock).sum()
+            and belongs(thin[labels == k], thin[labels == rock])
+        )
+    ]
+    if len(large) > 1 and away[order[1]] < NEARER * away[order[0]] and large[order[1]] not in parts:
         first, second = ((labels == large[k]).sum() for k in order[:2])
         raise InputError(
             f"{name}: clusters of {first} and {second} points are equally large and equally near "
             "to what the cameras look at; aim them at one rock"
         )
-    rock = int(large[order[0]])
     distance, nearest = cKDTree(thin).query(points, distance_upper_bound=eps)
-    inside = np.isfinite(distance) & (np.append(labels, -1)[nearest] == rock)
+    inside = np.isfinite(distance) & np.isin(np.append(labels, -1)[nearest], parts)
     return inside, eps, count
 
 
@@ -253,8 +274,18 @@ def segment_dataset(
         masked = has_masks(dataset.frames)
         return height * (mask_share(points, dataset.frames)[0] if masked else 1)
 
+    def belongs(part: np.ndarray, rock: np.ndarray) -> bool:
+        if has_masks(dataset.frames):
+            return float(np.median(mask_share(part, dataset.frames)[0])) >= IN_MASKS
+        offset = part.mean(0) - rock.mean(0)
+        level = np.linalg.norm(offset - plane.normal * (offset @ plane.normal))
+        reach = STACKED * float(np.ptp(rock, axis=0).max())
+        gap = float(cKDTree(rock).query(part)[0].min())
+        return bool(level < reach / 2 and gap < reach)
+
+    name = str(dataset.root)
     inside, eps, clusters = rock_cluster(
-        cloud.points[above], cloud.voxel, target, str(dataset.root), weight, cloud.sparse
+        cloud.points[above], cloud.voxel, target, name, weight, cloud.sparse, belongs
     )
     points, views = cloud.points[above][inside], cloud.views[above][inside]
     rng = generator(settings.seed, "prior/degrade")
