@@ -149,7 +149,7 @@ def test_broken_prior(capsys, dataset, prior, tmp_path, given, named):
 
 
 @pytest.mark.parametrize(
-    "command", [["nbv", "--resume"], ["eval"], ["diagnose"], ["prune"], ["refit"], ["view"]]
+    "command", [["nbv", "--resume"], ["eval"], ["diagnose"], ["simplify"], ["view"]]
 )
 def test_broken_run(capsys, dataset, prior, tmp_path, command):
     run = tiny.write_run(tmp_path / "run", dataset, prior)

@@ -259,8 +259,8 @@ def test_every_command_that_reads_a_run_reads_this_one(captured, tmp_path, capsy
     assert calibration["views"] == {"folds": 6, "test": 2}
     page_path = tmp_path / "page.html"
     command("report", captured, "--out", tmp_path / "report", "--html", page_path)
-    command("prune", captured)
-    command("refit", captured)
+    command("simplify", captured)
+    command("simplify", captured, "--method", "refit")
     assert there(dataset) == before
     for checked in (dataset, dataset.survey()):
         assert not any("no run has taken" in line for line in check_dataset(checked).problems)

@@ -347,7 +347,7 @@ CHECKPOINTS = {
 }
 
 
-PLACES = {"report": "report", "diagnose": "diagnostics", "eval": "", "prune": "", "refit": ""}
+PLACES = {"report": "report", "diagnose": "diagnostics", "eval": "", "simplify": ""}
 """Command on a run -> folder in the run that it locks."""
 
 

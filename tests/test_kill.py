@@ -47,7 +47,7 @@ COMMANDS = {
     "capture": f"nbv --capture {{scene}} --gaussians 150 --out {{out}} {LOOP}",
     "synth-orbit": "synth-orbit {out} --scene {scene} --frames 6 --size 64x48 --spp 2",
     "import": "import {data} --mesh {data}/rock.glb --out {out}",
-    "refit": "refit {out}",
+    "refit": "simplify {out} --method refit",
 }
 """Name -> arguments; refit gets a copy of {run}."""
 

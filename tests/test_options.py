@@ -37,10 +37,11 @@ OPTIONS: dict[str, list[tuple[str, str]]] = {
         ("kf_9999", "kf_9999"),
         ("''", "--views"),
     ],
-    "refit {run}": [
-        ("--learn some", "--learn some: is unknown; choose one of all, auto"),
-        ("--learn all --sh 0", "leaves nothing to choose; leave out one of them"),
-        ("--loss nan", "--loss nan: must be from 0 to 10 dB"),
+    "simplify {run} --method refit": [
+        ("--learn some", "learn 'some': unknown; choose one of all, auto"),
+        ("--learn all --sh 0", "leave nothing to choose; leave out one of them"),
+        ("--loss nan", "loss nan: must be from 0 to 10 dB"),
+        ("--noise 0.1", "--noise: is not used by the method refit"),
     ],
     "nbv": [
         ("--resume {run} --budget 9", "nbv: budget: --resume takes its settings from"),

@@ -17,12 +17,7 @@ from scipy.stats import multivariate_normal
 from mgs.bench import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
-from mgs.fit.fitting import fit
-from mgs.fit.settings import TrainSettings
-from mgs.gaussians import LEARNED
-from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD
-from mgs.report.evaluation import evaluate_run
-from mgs.report.evidence import (
+from mgs.fit.evidence import (
     BLOCKS,
     DIRECTIONAL,
     Images,
@@ -34,7 +29,12 @@ from mgs.report.evidence import (
     regularisation,
     worth,
 )  # fmt: skip
-from mgs.report.smaller import REFITTED, refit_run
+from mgs.fit.fitting import fit
+from mgs.fit.settings import TrainSettings
+from mgs.gaussians import LEARNED
+from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD
+from mgs.report.evaluation import evaluate_run
+from mgs.report.simplify import REFITTED, refit_run
 from mgs.run.folder import open_run
 from mgs.run.nbv import run_nbv
 from mgs.run.settings import NbvSettings
@@ -208,7 +208,7 @@ def run(tmp_path_factory, coarse_priors):
 
 def test_a_run_is_refitted_beside_its_model(run, capsys):
     before = {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
-    command("refit", run)
+    command("simplify", run, "--method", "refit")
     said = capsys.readouterr().out
     after = {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
     refitted = after.pop(REFITTED)
@@ -250,14 +250,15 @@ def test_a_run_is_pruned_beside_its_model(run, capsys):
         assert informed[kind]["informed"] == expected
     assert 0 < informed["rotation"]["informed"] < 1600
     whole = (run / "gaussians.ply").read_bytes()
-    command("prune", run)
+    command("simplify", run)
     said = capsys.readouterr().out
     left = read_ply(run / "gaussians_pruned.ply")
     assert 0 < len(left) < 400
     assert f"400 Gaussians, {len(left)} stay" in said
     assert "PSNR on the test views" in said
     assert (run / "gaussians.ply").read_bytes() == whole
-    assert "noise 0.0 must be positive" in refused(capsys, ["prune", run, "--force", "--noise", 0])
+    said = refused(capsys, ["simplify", run, "--force", "--noise", 0])
+    assert "noise 0.0 must be positive" in said
 
 
 def test_the_images_of_the_last_fit_are_those_of_the_run(run):

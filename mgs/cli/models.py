@@ -1,13 +1,13 @@
-"""`mgs eval`, `diagnose`, `prune`, `refit`: measure the model of a run, or make a smaller one."""
+"""`mgs eval`, `diagnose`, `simplify`: measure the model of a run, or make a smaller one."""
 
 from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from mgs import runtime
-from mgs.cli.options import Force, Runs, argument, option
+from mgs.cli.options import Force, Runs, argument, given, option
 from mgs.cli.printing import print_quality
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal, echo
@@ -16,7 +16,7 @@ from mgs.files import below, check_new_file, folder_locked, working_in
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
 
 if TYPE_CHECKING:
-    from mgs.report.smaller import RefittedRun
+    from mgs.report.simplify import PrunedRun, RefittedRun
 
 
 def evaluate(
@@ -48,7 +48,7 @@ def evaluate(
     the dataset has their truth.
     """
     from mgs.report.evaluation import evaluate as measured
-    from mgs.report.smaller import PRUNED, REFITTED
+    from mgs.report.simplify import PRUNED, REFITTED
     from mgs.report.tables import metrics_row
 
     runtime.start()
@@ -150,74 +150,83 @@ def diagnose(
             echo(f"wrote {path}")
 
 
-def prune(
+def simplify(
     runs: Runs,
+    method: Annotated[
+        Literal["prune", "refit"],
+        option("prune: fewer Gaussians, no new fit; refit: fewer parameters, fitted again."),
+    ] = "prune",
     noise: Annotated[
-        float, option("Allowed change of the training images: rms of a pixel, linear RGB.")
-    ] = PRUNE_NOISE,
-    force: Force = False,
-) -> None:
-    """Remove Gaussians of a run that its images hardly need; write RUN/gaussians_pruned.ply.
-
-    The change of the training images is measured and stays within --noise. Nothing is fitted
-    again. The run itself is not changed.
-    """
-    from mgs.report.smaller import PRUNED, prune_run
-    from mgs.run.folder import open_run
-
-    for run in runs:
-        check_new_file(open_run(run).folder / PRUNED, force)
-    runtime.start()
-    for run in runs:
-        with working_in(run), progress_bar() as bar:
-            found = prune_run(run, noise, bar)
-        share = 1 - found.after / found.before
-        lines = [
-            f"{found.before:,} Gaussians, {found.after:,} stay: {share:.0%} are left out",
-            f"rms change of a pixel value: predicted {found.predicted:.2g}, "
-            f"measured {found.actual:.2g}, allowed {noise:.2g}",
-        ]
-        if found.psnr:
-            before, after = found.psnr
-            lines.append(
-                f"PSNR on the {found.views} views: {before:.2f} dB before, {after:.2f} dB after"
-            )
-        _print([*lines, f"wrote {run / PRUNED}"])
-
-
-def refit(
-    runs: Runs,
+        float | None,
+        option(
+            "Of prune: allowed change of the training images, rms of a pixel, linear RGB. "
+            f"Default: {PRUNE_NOISE}."
+        ),
+    ] = None,
     learn: Annotated[
-        str,
-        option("auto: each Gaussian learns the kinds that the evidence supports; all: all kinds."),
-    ] = "auto",
+        str | None,
+        option(
+            "Of refit: auto (default), each Gaussian learns the kinds of parameters that the "
+            "evidence supports; all: all kinds."
+        ),
+    ] = None,
     sh: Annotated[
-        str, option("SH degree: 0, or auto: 1 if it predicts left-out views better, else 0.")
-    ] = "auto",
+        str | None,
+        option("Of refit: SH degree 0, or auto (default): 1 if it predicts left-out views better."),
+    ] = None,
     loss: Annotated[
-        float, option("Allowed rise of the objective from parameters not learned, dB.")
-    ] = LEARN_LOSS,
+        float | None,
+        option(
+            "Of refit: allowed rise of the objective from parameters not learned, dB. "
+            f"Default: {LEARN_LOSS}."
+        ),
+    ] = None,
     force: Force = False,
 ) -> None:
-    """Fit the views of a run again, with no more parameters than they need; write
-    RUN/gaussians_refitted.ply.
+    """Make the model of a run smaller; write RUN/gaussians_pruned.ply or gaussians_refitted.ply.
 
-    The evidence (marginal likelihood of the images) and --loss choose the kinds of parameters that
-    each Gaussian learns; views left out choose the SH degree. No test view is used. Parameters that
-    are not learned keep the prior's values, and are marked in the file. The run itself is not
-    changed.
+    prune removes Gaussians that the training images hardly need. The change of these images is
+    measured and stays within --noise.
+
+    refit fits the views of the run again. The evidence (marginal likelihood of the images) and
+    --loss choose the kinds of parameters that each Gaussian learns, and views left out the SH
+    degree. Parameters that are not learned keep the prior's values, and are marked in the file.
+
+    No test view is used, and the run itself is not changed.
     """
-    from mgs.report.smaller import REFITTED, refit_run
+    from mgs.report.simplify import PRUNED, REFITTED, prune_run, refit_run
     from mgs.run.folder import open_run
 
+    of_prune, of_refit = given(noise=noise), given(learn=learn, sh=sh, loss=loss)
+    if other := of_refit if method == "prune" else of_prune:
+        raise InputError(f"--{next(iter(other))}: is not used by the method {method}; leave it out")
+    name = PRUNED if method == "prune" else REFITTED
     for run in runs:
-        check_new_file(open_run(run).folder / REFITTED, force)
+        check_new_file(open_run(run).folder / name, force)
     runtime.start()
-    options: Any = {"learn": learn, "sh": sh, "loss": loss}
     for run in runs:
         with working_in(run), progress_bar() as bar:
-            found = refit_run(run, say=bar, **options)
-        _print([*_refitted(found), f"wrote {run / REFITTED}"])
+            if method == "prune":
+                lines = _pruned(prune_run(run, say=bar, **of_prune), noise or PRUNE_NOISE)
+            else:
+                lines = _refitted(refit_run(run, say=bar, **of_refit))
+        _print([*lines, f"wrote {run / name}"])
+
+
+def _pruned(result: PrunedRun, noise: float) -> list[str]:
+    """Describe a pruned run."""
+    share = 1 - result.after / result.before
+    lines = [
+        f"{result.before:,} Gaussians, {result.after:,} stay: {share:.0%} are left out",
+        f"rms change of a pixel value: predicted {result.predicted:.2g}, "
+        f"measured {result.actual:.2g}, allowed {noise:.2g}",
+    ]
+    if result.psnr:
+        before, after = result.psnr
+        lines.append(
+            f"PSNR on the {result.views} views: {before:.2f} dB before, {after:.2f} dB after"
+        )
+    return lines
 
 
 def _refitted(found: RefittedRun) -> list[str]:

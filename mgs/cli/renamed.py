@@ -1,4 +1,4 @@
-"""Options of the last release: they still work in this one, and say what they are called now."""
+"""Options and commands of the last release, which still work in this one and say their new form."""
 
 from __future__ import annotations
 
@@ -67,9 +67,16 @@ OPTIONS = {
 the value was KIND=NUMBER, or a setting with its value where there was none."""
 
 
+COMMANDS = {"prune": ["simplify"], "refit": ["simplify", "--method", "refit"]}
+"""Old commands -> what replaces them."""
+
+
 def renewed(arguments: Sequence[str]) -> list[str]:
     """Arguments in today's words; warns once for each old option."""
     command, *words = arguments
+    if command in COMMANDS:
+        _notice(f"mgs {command}", ["mgs", *COMMANDS[command]])
+        return [*COMMANDS[command], *words]
     table, result, rest = OPTIONS.get(command, {}), [command], iter(words)
     for word in rest:
         name, equals, value = word.partition("=")
@@ -84,6 +91,12 @@ def renewed(arguments: Sequence[str]) -> list[str]:
         else:
             value = value if equals else next(rest, "")
             now = ["--set", f"{new}{value}" if new.endswith(".") else f"{new}={value}"]
-        warnings.warn(Notice(f"{name} is now {shlex.join(now)}"), stacklevel=2)
+        _notice(name, now)
         result += now
     return result
+
+
+def _notice(old: str, now: list[str]) -> None:
+    warnings.warn(
+        Notice(f"{old} is now {shlex.join(now)}; it ends with this release"), stacklevel=3
+    )

@@ -21,7 +21,7 @@ PIXEL_NOISE = 0.02
 """sigma_e, standard deviation of a pixel's residual, linear RGB (34 dB). A chosen constant."""
 
 PRUNE_NOISE = PIXEL_NOISE / 5
-"""Root mean square change of pixel values that `mgs prune` may make, linear RGB. It costs about
+"""Root mean square change of pixel values that `mgs simplify` may make, linear RGB. It costs about
 0.1 dB (docs/parsimony.md). A chosen constant."""
 
 DIRECTIONAL_STD = 0.03
@@ -29,7 +29,7 @@ DIRECTIONAL_STD = 0.03
 a rock looks almost the same from all sides. A chosen constant (docs/parsimony.md)."""
 
 LEARN_LOSS = 0.05
-"""Increase of the fit's objective, dB, that `mgs refit` may cause by leaving out parameters. On
+"""Increase of the fit's objective, dB, that a refit may cause by leaving out parameters. On
 held-out views the loss is one to two times that (docs/parsimony.md). A chosen constant."""
 
 PRIOR_STD = {"colour": 1.0, "scale": 0.125, "rotation": 0.0625, "opacity": 2.0}

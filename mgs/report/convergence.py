@@ -12,10 +12,10 @@ from typing import Any
 from mgs.camera import Camera
 from mgs.data.frames import Frame
 from mgs.errors import InputError
+from mgs.fit.evidence import last_images, objective_of
 from mgs.fit.objective import newton_decrease
 from mgs.gaussians import Gaussians
 from mgs.prior.build import Prior
-from mgs.report.evidence import last_images, objective_of
 from mgs.run.settings import NbvSettings
 from mgs.splat import as_drjit
 

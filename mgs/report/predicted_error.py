@@ -27,12 +27,12 @@ from mgs.colour import SH_C0
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import write_json
+from mgs.fit.evidence import Images, fitted, last_images
 from mgs.gaussians import Gaussians, learned, sh_from_rgb
 from mgs.images import write_exr
 from mgs.memory import padded
 from mgs.provenance import versions
 from mgs.report.calibration import NORMAL, Calibration, fit_calibration, judged
-from mgs.report.evidence import Images, fitted, last_images
 from mgs.report.figures import uncertainty_figure
 from mgs.run.folder import Run, open_run
 from mgs.run.settings import NbvSettings

@@ -17,19 +17,19 @@ from typing import Any
 import numpy as np
 
 from mgs.data.dataset import load_dataset
+from mgs.fit.evidence import last_images, lean_fit
+from mgs.fit.pruning import prune
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.policy.poses import seed_views
 from mgs.prior.build import load_prior
-from mgs.report.evidence import last_images, lean_fit
 from mgs.run.loop import fit_views
 from mgs.run.operations import operations_of
 from mgs.run.problem import Problem
 from mgs.run.settings import NbvSettings
 from mgs.run.state import Fitted
 from mgs.splat import groups
-from mgs.splat.pruning import prune
 from mgs.study.case import Case, Rock, Size, judge
 from mgs.study.output import Content, Panel, draw_panels, table, write_table
 from mgs.study.sweep import Cell, Report, run_cells
@@ -190,7 +190,7 @@ def fit_and_judge(
 def fit_lean_and_judge(
     root: Path, out: Path, dataset: str, prior: str, views: int, seeds: int
 ) -> dict[str, Any]:
-    """Task: `mgs.report.evidence.lean_fit` to as many views."""
+    """Task: `mgs.fit.evidence.lean_fit` to as many views."""
     data, known = load_dataset(root / dataset), load_prior(root / prior)
     where: dict[str, Any] = {"dataset": root / dataset, "prior": root / prior}
     settings = NbvSettings(**where, seeds=seeds, train=TrainSettings())

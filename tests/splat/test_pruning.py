@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mgs.errors import InputError
+from mgs.fit.pruning import NEIGHBOURS, prune, removal_cost
 from mgs.splat import reference, render
-from mgs.splat.pruning import NEIGHBOURS, prune, removal_cost
 
 from .scenes import calm, make_camera, make_gaussians
 

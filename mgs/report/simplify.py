@@ -1,4 +1,4 @@
-"""Smaller models of a run, compared with the whole one on other views: `mgs prune`, `mgs refit`."""
+"""Smaller models of a run, compared with the whole one on other views: `mgs simplify`."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from mgs.run.settings import NbvSettings
 from mgs.splat_ply import write_ply
 
 if TYPE_CHECKING:
-    from mgs.report.evidence import LeanModel
+    from mgs.fit.evidence import LeanModel
 
 PRUNED = "gaussians_pruned.ply"
 REFITTED = "gaussians_refitted.ply"
 
-CHOICES = {"--learn": ("all", "auto"), "--sh": ("0", "auto")}
-"""Options of `mgs refit` -> known values of `learn` and `sh` of `refit_run`."""
+CHOICES = {"learn": ("all", "auto"), "sh": ("0", "auto")}
+"""Arguments of `refit_run` -> their known values."""
 
 LARGEST_LOSS = 10.0
 """Largest `loss` of `refit_run`, dB: with that next to nothing is learned but colours."""
@@ -34,7 +34,7 @@ class PrunedRun:
     """Result of `prune_run`.
 
     before, after: number of Gaussians. predicted, actual: rms change of the training images
-    (`mgs.splat.pruning.Pruned`). views: "test" or "held-out". psnr: on these, before and after, dB;
+    (`mgs.fit.pruning.Pruned`). views: "test" or "held-out". psnr: on these, before and after, dB;
     None if there are none.
     """
 
@@ -49,13 +49,13 @@ class PrunedRun:
 def prune_run(
     run: str | Path, noise: float = PRUNE_NOISE, say: Callable[[str], None] = lambda stage: None
 ) -> PrunedRun:
-    """Prune the model of a run by its training views (`mgs.splat.pruning.prune`), and write
+    """Prune the model of a run by its training views (`mgs.fit.pruning.prune`), and write
     RUN/PRUNED.
 
     Both models are compared on the test views of the dataset, or without them on the held-out
     views. say(stage): called as a stage starts. Raises InputError as `open_run` and `prune`.
     """
-    from mgs.splat.pruning import prune
+    from mgs.fit.pruning import prune
 
     opened = open_run(run)
     gaussians, names = opened.state.gaussians, [frame.name for frame in opened.taken]
@@ -91,7 +91,7 @@ def refit_run(
     loss: float = LEARN_LOSS,
     say: Callable[[str], None] = lambda stage: None,
 ) -> RefittedRun:
-    """Fit the views of a run once more (`mgs.report.evidence.lean_fit`), and write RUN/REFITTED.
+    """Fit the views of a run once more (`mgs.fit.evidence.lean_fit`), and write RUN/REFITTED.
 
     A vertex of the file has a byte for each kind of parameter, `learned_colour` and so on: 1 if it
     was learned; otherwise the file holds the prior's value. The models are compared on the test
@@ -100,22 +100,20 @@ def refit_run(
     leave nothing to choose, for a loss that is not from 0 to LARGEST_LOSS, for a run whose density
     is not fixed, and if the prior or the images are not those of the run.
     """
-    from mgs.report.evidence import last_images, lean_fit
+    from mgs.fit.evidence import last_images, lean_fit
 
     if not 0 <= loss <= LARGEST_LOSS:
-        raise InputError(f"--loss {loss}: must be from 0 to {LARGEST_LOSS:g} dB")
-    for (option, known), value in zip(CHOICES.items(), (learn, sh), strict=True):
+        raise InputError(f"loss {loss}: must be from 0 to {LARGEST_LOSS:g} dB")
+    for (name, known), value in zip(CHOICES.items(), (learn, sh), strict=True):
         if value not in known:
-            raise InputError(f"{option} {value}: is unknown; choose one of {', '.join(known)}")
+            raise InputError(f"{name} {value!r}: unknown; choose one of {', '.join(known)}")
     if (learn, sh) == ("all", "0"):
-        raise InputError(
-            "refit: --learn all --sh 0 leaves nothing to choose; leave out one of them"
-        )
+        raise InputError("learn all and sh 0 leave nothing to choose; leave out one of them")
     opened = open_run(run)
     if opened.settings.train.density != "fixed":
         raise InputError(
             f"{opened.folder}: its fit changed the Gaussians of the prior; "
-            "refit needs a run with --density fixed"
+            "refitting needs a run with train.density fixed"
         )
     path = check_writable(opened.folder / REFITTED)
     own, settings, prior = opened.state.gaussians, opened.settings, opened.prior

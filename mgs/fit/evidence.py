@@ -31,6 +31,7 @@ from mgs.errors import InputError
 from mgs.evaluation import render_view
 from mgs.fit.fitting import fit
 from mgs.fit.objective import Objective, Vector, objective
+from mgs.fit.settings import ModelSettings
 from mgs.fit.stopping import StopReason
 from mgs.gaussians import Gaussians
 from mgs.memory import Deferred
@@ -39,7 +40,6 @@ from mgs.policy.poses import azimuths
 from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of, without_gain
 from mgs.prior.initial import initial_gaussians, initial_normals, pixel_on
-from mgs.run.settings import NbvSettings
 from mgs.splat import ListCache, as_drjit, groups
 
 DIRECTIONAL = "directional"
@@ -106,7 +106,7 @@ class LeanModel:
 
 
 def last_images(
-    settings: NbvSettings, prior: Prior, frames: Sequence[Frame], cameras: Sequence[Camera]
+    settings: ModelSettings, prior: Prior, frames: Sequence[Frame], cameras: Sequence[Camera]
 ) -> Images:
     """Input of the last fit of a run. frames: those taken, in their order, so the seeds first.
     cameras: `Dataset.cameras`. Raises InputError if a frame cannot be read."""
@@ -139,7 +139,7 @@ def kinds(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
     return {"colour": slice(0, 3), DIRECTIONAL: slice(3, colour.stop), **of}
 
 
-def regularisation(settings: NbvSettings, sh_degree: int) -> NDArray[np.float64]:
+def regularisation(settings: ModelSettings, sh_degree: int) -> NDArray[np.float64]:
     """lam [P] of a run's settings, in the columns of `kinds`, rounded to float32 as in the fit."""
     lam = settings.regularisation(groups(sh_degree, settings.train.means))
     return lam.astype(np.float32).astype(np.float64)
@@ -194,7 +194,7 @@ def paying(found: Worth, sizes: Mapping[str, int], loss: float) -> dict[str, Mas
 
 def lean_fit(
     images: Images,
-    settings: NbvSettings,
+    settings: ModelSettings,
     learn: Literal["all", "auto"] = "auto",
     sh: Literal["0", "auto"] = "auto",
     loss: float = LEARN_LOSS,
@@ -240,7 +240,7 @@ def lean_fit(
 
 def directional_gain(
     images: Images,
-    settings: NbvSettings,
+    settings: ModelSettings,
     cache: ListCache,
     say: Callable[[str], None] = lambda stage: None,
 ) -> LeftOut:
@@ -267,7 +267,7 @@ def _squared_error(model: Gaussians, camera: Camera, target: np.ndarray, cache: 
     return float(np.square(rgb - target[..., :3])[target[..., 3] > 0].mean())
 
 
-def _worth(model: Gaussians, images: Images, settings: NbvSettings, cache: ListCache) -> Worth:
+def _worth(model: Gaussians, images: Images, settings: ModelSettings, cache: ListCache) -> Worth:
     """Worth of the parameters of a model that was fitted to all images."""
     goal, degree = objective_of(images, model, settings, cache), model.sh_degree
     fields, columns = as_drjit(model), kinds(degree, settings.train.means)
@@ -277,7 +277,7 @@ def _worth(model: Gaussians, images: Images, settings: NbvSettings, cache: ListC
 
 
 def objective_of(
-    images: Images, model: Gaussians, settings: NbvSettings, cache: ListCache | None = None
+    images: Images, model: Gaussians, settings: ModelSettings, cache: ListCache | None = None
 ) -> Objective:
     """Objective of a fit to all images with the settings of a run, in squared differences."""
     degree, train = model.sh_degree, settings.train
@@ -302,7 +302,7 @@ def _flat(vector: Vector, n: int) -> NDArray[np.float64]:
 def fitted(
     images: Images,
     views: Sequence[int],
-    settings: NbvSettings,
+    settings: ModelSettings,
     degree: int,
     cache: ListCache,
     kept: Mapping[str, Mask] | None = None,
