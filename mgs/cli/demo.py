@@ -1,47 +1,40 @@
-"""`mgs demo`: all steps on a small rock."""
+"""`mgs demo`: the other commands in a row, on a small rock."""
 
 from __future__ import annotations
 
 import os
+import shlex
 import time
 from collections.abc import Iterator
 from concurrent.futures import wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 from mgs import runtime
-from mgs.cli.models import diagnose
-from mgs.cli.nbv import resume_and_print, start_and_print
 from mgs.cli.options import Seed, argument
-from mgs.cli.printing import print_quality
-from mgs.cli.prior import prior
 from mgs.cli.progress import progress_bar
-from mgs.cli.synth_orbit import synth_orbit
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import check_new_folder, check_writable, read_json
 
-if TYPE_CHECKING:
-    from mgs.run.folder import Run
-    from mgs.run.state import Checkpoint
-
 POLICIES = ("directional-i", "paper", "d-optimal", "cover", "random")
 
-ORBIT, DISTANCES = "hemisphere", "1,1.5,2"
-"""Options of the orbit. On a ring at one distance even spacing is as good as any choice."""
+TEST_VIEWS = 12
 
-SIZE = "160x120"
-"""Size of the images: so small that all steps take a minute."""
+ORBIT = f"--size 160x120 --orbit hemisphere --distances 1,1.5,2 --test-views {TEST_VIEWS}"
+"""Options of `mgs synth-orbit`. On a ring at one distance even spacing is as good as any choice."""
 
 GAUSSIANS = "auto"
 """Number of Gaussians. With fewer than the images resolve, policies differ less."""
 
-TEST_VIEWS = 12
-"""Test views on a dome around the rock."""
-
 BUDGET = 8
 """Views beyond the four seeds, the same for every policy."""
+
+Words = list[str]
+"""Words of a command line after `mgs`."""
 
 
 def demo(
@@ -50,16 +43,11 @@ def demo(
     ] = Path("demo"),
     seed: Seed = 0,
 ) -> None:
-    """Run all steps in minutes: render a rock orbit, build the prior, choose views by five
-    policies, compare, draw."""
-    from mgs.report.runs import compare_runs
-    from mgs.report.tables import comparison_rows
-    from mgs.report.writing import write_report
-    from mgs.run.folder import open_run
-
+    """Run all steps in a minute: render a rock orbit, build the prior, choose views by five
+    policies, compare, draw. Every command is shown as it is run."""
     runtime.start()
     console, started = Terminal(), time.monotonic()
-    dataset, folder, report = out / "dataset", out / "prior", out / "report"
+    dataset, prior, report = out / "dataset", out / "prior", out / "report"
     runs = [out / policy for policy in POLICIES]
     check_writable(out)
     check_seed(dataset, runs, seed)
@@ -67,61 +55,59 @@ def demo(
         check_new_folder(out)
 
     def heading(text: str) -> None:
-        console.rule(f"{text}   [dim]{time.monotonic() - started:.0f} s", align="left")
+        console.rule(f"{text}   {time.monotonic() - started:.0f} s", align="left")
+
+    def run(*words: str | Path) -> None:
+        called = [str(word) for word in words]
+        console.print(f"$ mgs {shlex.join(called)}", soft_wrap=True)
+        _call(called)
 
     heading(f"1/4 a photoreal orbit: 32 frames with depth and masks, and {TEST_VIEWS} test views")
     if not (dataset / "transforms.json").is_file():
-        views: dict[str, Any] = {"orbit": ORBIT, "distances": DISTANCES, "test_views": TEST_VIEWS}
-        synth_orbit(dataset, size=SIZE, seed=seed, **views)
+        run("synth-orbit", dataset, *ORBIT.split(), "--seed", str(seed))
     heading("2/4 the prior: Gaussians on the rock's mesh, as many as the images resolve")
-    if not (folder / "prior.json").is_file():
-        prior(dataset, out=folder, gaussians=GAUSSIANS, seed=seed)
-    opened: list[Run] = []
-    for policy, run in zip(POLICIES, runs, strict=True):
-        if (run / "config.json").is_file():
-            opened.append(open_run(run))
-            continue
-        settings: Any = {"policy": policy, "budget": BUDGET, "seed": seed, "evaluate_every": 1}
-        opened.append(start_and_print(dataset, run, console, prior=folder, **settings))
+    if not (prior / "prior.json").is_file():
+        run("prior", dataset, "--out", prior, "--gaussians", GAUSSIANS, "--seed", str(seed))
     heading(f"3/4 next best views by {len(runs)} policies, 4 seeds and {BUDGET} views each")
-    for done in completed(opened, console):  # meanwhile the next runs go on
-        heading(f"3/4 {done.label}")
-        resume_and_print(done, console, pictures=True)
-        if done is opened[0]:
-            console.print("what its views say about each Gaussian:")
-            diagnose(runs[:1], force=True)
+    settings = ["--budget", str(BUDGET), "--seed", str(seed), "--set", "evaluate_every=1"]
+    begin = ["nbv", str(dataset), "--prior", str(prior), *settings]
+    jobs = [
+        ["nbv", "--resume", str(folder)]
+        if (folder / "config.json").is_file()
+        else [*begin, "--policy", policy, "--out", str(folder)]
+        for policy, folder in zip(POLICIES, runs, strict=True)
+    ]
+    for words, printed in in_processes(jobs, runs, console):  # meanwhile the next runs go on
+        console.print(f"$ mgs {shlex.join(words)}\n{printed}", soft_wrap=True)
+    run("diagnose", runs[0], "--force")
     heading("4/4 the report")
-    compared = compare_runs(runs)
-    written = write_report(report, list(compared.values()))
-    print_quality(console, comparison_rows(compared))
-    console.print(f"done in {time.monotonic() - started:.0f} s; look at:")
-    for picture in (dataset / "contact_sheet.png", folder / "prior.png", *written):
+    run("report", *runs, "--out", report, "--force")
+    pictures = [dataset / "contact_sheet.png", prior / "prior.png"]
+    console.print(f"done in {time.monotonic() - started:.0f} s; look at these pictures, too:")
+    for picture in pictures:
         console.print(f"  {picture}", soft_wrap=True)
 
 
-def completed(runs: list[Run], console: Terminal) -> Iterator[Run]:
-    """Complete runs, as many at once as there are cores, each in a process; yield them in order.
+def in_processes(
+    jobs: list[Words], runs: list[Path], console: Terminal
+) -> Iterator[tuple[Words, str]]:
+    """Call `mgs nbv` for several runs, as many at once as there are cores, each in a process; yield
+    each command and what it printed, in order.
 
-    The last ones, fewer than the cores, have several threads each. Raises InputError as
-    `resume_nbv`, and if a process is killed.
+    The last ones, fewer than the cores, have several threads each: a run's kernels are small, so
+    many threads mostly wait. Raises InputError as the command, and if a process is killed.
     """
-    left = [run.folder for run in runs if not (run.folder / "metrics.json").is_file()]
     cores = len(os.sched_getaffinity(0))
-    count = max(1, min(len(left), cores))
-    last = len(left) % count or count
-    working = {}
-    with runtime.processes(count) as pool:
-        for k, folder in enumerate(left):
-            together = count if k < len(left) - last else last
-            working[folder] = pool.submit(complete, folder, left[count:], cores // together)
+    count = min(len(jobs), cores)
+    last = len(jobs) % count or count
+    with runtime.processes(count) as pool, progress_bar("steps", console) as progress:
+        threads = [cores // (count if k < len(jobs) - last else last) for k in range(len(jobs))]
+        calls = [pool.submit(nbv_and_eval, *job) for job in zip(jobs, runs, threads, strict=True)]
         try:
-            for run in runs:
-                with progress_bar("steps", console) as progress:
-                    while run.folder in working and not wait([working[run.folder]], 1).done:
-                        progress("steps", sum(map(steps_done, left)), len(left) * (1 + BUDGET))
-                if run.folder in working:
-                    working[run.folder].result()
-                yield run
+            for words, call in zip(jobs, calls, strict=True):
+                while not wait([call], 1).done:
+                    progress("steps", sum(map(steps_done, runs)), len(runs) * (1 + BUDGET))
+                yield words, call.result()
         except BrokenProcessPool:
             raise InputError(
                 "demo: a process was killed (is there too little memory?); give the command again"
@@ -130,22 +116,25 @@ def completed(runs: list[Run], console: Terminal) -> Iterator[Run]:
             pool.shutdown(cancel_futures=True)
 
 
-def complete(run: Path, others: list[Path], threads: int) -> None:
-    """Run or resume a run. others: get the fit to the seeds, the same for every policy, if they
-    have none yet. threads: of Dr.Jit. A run's kernels are small, so many threads mostly wait."""
+def nbv_and_eval(words: Words, run: Path, threads: int) -> str:
+    """Call `mgs nbv` with these words, and draw the run's pictures; return what `nbv` printed.
+    threads: of Dr.Jit."""
     runtime.start()
     import drjit as dr
 
-    from mgs.run.folder import write_checkpoint
-    from mgs.run.nbv import resume_nbv
-
-    def share(state: Checkpoint) -> None:
-        for other in others:
-            if len(state.steps) == 1 and not (other / "checkpoint.npz").is_file():
-                write_checkpoint(other, state)
-
     dr.set_thread_count(threads)
-    resume_nbv(run, share)
+    with redirect_stdout(StringIO()) as printed:
+        _call(words)
+    with redirect_stdout(StringIO()):
+        _call(["eval", str(run)])
+    return printed.getvalue().rstrip()
+
+
+def _call(words: Words) -> None:
+    """Run a command in this process. Raises InputError as it does."""
+    from mgs.cli.app import app
+
+    app(words, prog_name="mgs", standalone_mode=False)
 
 
 def steps_done(run: Path) -> int:
@@ -162,9 +151,9 @@ def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
     if (dataset / "config.json").is_file():
         config = read_json(dataset / "config.json")
         recorded[dataset] = config.get("seed", seed) if isinstance(config, dict) else seed
-    for folder, found in recorded.items():
-        if found != seed:
+    for folder, other in recorded.items():
+        if other != seed:
             raise InputError(
-                f"{folder}: was made with `seed` {found}, not {seed}; "
+                f"{folder}: was made with `seed` {other}, not {seed}; "
                 "give that seed, or another folder"
             )
