@@ -14,13 +14,13 @@ from program import command
 from refusals import refused
 
 from mgs.cli.app import app
+from mgs.cli.nbv import nbv
+from mgs.cli.options import parse_settings
 from mgs.errors import InputError
 from mgs.fit.settings import ALPHA_WEIGHT, COLOURS_ALONE, TrainSettings
 from mgs.run.nbv import run_nbv, start_run
 from mgs.run.settings import PRESETS, NbvSettings, with_defaults
 from mgs.study import case, chart, photographs, timing
-
-DEFAULTS = {**NbvSettings.model_fields, **TrainSettings.model_fields}
 
 
 def test_times_are_ratios_to_a_reference_that_is_timed_beside_each_call(monkeypatch):
@@ -69,11 +69,10 @@ def test_commands_of_points_say_what_was_measured(size):
     assert set(chart.preset_points(size)) == set(PRESETS)
     assert set(chart.preset_points(size).values()) <= set(points)
     for point in points:
-        said, made = parsed(point.command("DATA", "PRIOR", size.seeds)), point.settings(size.seeds)
+        words, made = parsed(point.command("DATA", "PRIOR", size.seeds)), point.settings(size.seeds)
         train = made.pop("train")
-        assert said["alpha_weight"] == 0
-        for key, value in (made | train).items():
-            assert (DEFAULTS[key].default if said[key] is None else said[key]) == value
+        said = parse_settings(words["settings"], nbv)
+        assert said == made | {"train": train | {"alpha_weight": 0}}
         settings = NbvSettings(dataset="DATA", prior="PRIOR", **made, train=train)
         assert settings.train_at(1).passes == min(point.warm_passes, point.passes)
 

@@ -193,5 +193,5 @@ def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(
     (tmp_path / "prior/prior.json").write_text(json.dumps(numbers | {"backed": 1000}))
     with pytest.raises(InputError, match="backed must be a number of the points"):
         load_prior(tmp_path / "prior")
-    with pytest.raises(InputError, match="0 to 1; correct backing"):
+    with pytest.raises(InputError, match="0 to 1; correct `backing`"):
         PriorSettings(gaussians=300, backing=1.5)

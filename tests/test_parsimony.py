@@ -61,7 +61,7 @@ def test_only_cameras_count_that_see_the_face():
     middle = resolution(mesh, [first, camera_above(0.2, focal=400)])
     whole = resolution(mesh, [camera_above(0.2, focal=400, size=4000)])
     assert alone.samples < middle.samples < whole.samples
-    with pytest.raises(InputError, match="give gaussians N"):
+    with pytest.raises(InputError, match="give `gaussians`"):
         resolution(mesh, [camera_above(-2.0)])
 
 

@@ -291,7 +291,8 @@ def test_a_run_that_cannot_be_refitted_is_one_line(run, tmp_path):
     change_settings(tmp_path / "run", prior=str(tmp_path / "nowhere"))
     with pytest.raises(InputError, match="nowhere"):
         refit_run(tmp_path / "run")
-    change_settings(tmp_path / "run", train={"density": "adaptive", "means": "free"})
-    with pytest.raises(InputError, match="needs a run with density fixed"):
+    train = {"density": "adaptive", "means": "free"}
+    change_settings(tmp_path / "run", budget=0, train=train)
+    with pytest.raises(InputError, match="needs a run with train"):
         refit_run(tmp_path / "run")
     assert not (tmp_path / "run" / REFITTED).exists()

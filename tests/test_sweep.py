@@ -88,7 +88,7 @@ def test_names_come_in_the_order_of_those_known():
     assert names_of(None, "abc") == ["a", "b", "c"]
     assert names_of("c, a,c", "abc") == ["a", "c"]
     for only in ("", "a,", "d"):
-        with pytest.raises(InputError, match=r"^only '.?': unknown; choose some of a,b,c"):
+        with pytest.raises(InputError, match=r"^--only '.?': unknown; choose some of a,b,c"):
             names_of(only, "abc")
 
 
@@ -224,7 +224,7 @@ def test_a_cell_that_kills_its_worker_again_and_again_is_one_clear_line(tmp_path
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x"])
 def test_a_scheduler_that_does_not_answer_is_one_clear_line(tmp_path, address, monkeypatch):
     monkeypatch.setattr(sweep, "CONNECT_SECONDS", 0.5)
-    with pytest.raises(InputError, match=f"^scheduler {address}: no Dask scheduler answers"):
+    with pytest.raises(InputError, match=f"^--scheduler {address}: no Dask scheduler answers"):
         run_cells(tmp_path, [cell("a", x=1)], silent, scheduler=address)
 
 

@@ -157,7 +157,7 @@ def test_what_is_taken_as_up_is_said(tmp_path):
     for up in (None, "y"):
         rock_of(SCENE, 0, path, up, notes.append)
     assert "+Z taken as up, since its format does not say (`mesh_up` = y turns it)" in notes[0]
-    assert "+Y is up, as --mesh-up says" in notes[1]
+    assert "+Y is up, as `mesh_up` says" in notes[1]
 
 
 def test_a_dark_rock_does_not_blow_out_the_ground(tmp_path):
