@@ -5,6 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from enum import StrEnum
+
+
+class Stage(StrEnum):
+    """Stages of a run that are timed. Values are shown; `seconds` in steps.jsonl has the names."""
+
+    CAPTURE = "capturing"
+    FIT = "fitting"
+    INFORMATION = "information of the training set"
+    SCORE = "scoring candidates"
+    CHECK = "checking"
+    EVALUATE = "evaluating"
+
 
 Progress = Callable[[str, int, int], None]
 """Called as progress(stage, done, total)."""

@@ -27,7 +27,7 @@ from mgs.policy.visibility import Visibility
 from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of, without_gain
 from mgs.prior.initial import colours_of, initial_gaussians, pixel_on, warm_start
-from mgs.progress import report
+from mgs.progress import Stage, report
 from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups, render
 
@@ -232,11 +232,11 @@ class Scene:
     ) -> Fit:
         """Fit a model to frames; the prior's mean is `start` of these frames. train: settings of
         the fit, by default those of the scene."""
-        report("fitting", 0, 1)
+        report(Stage.FIT, 0, 1)
         train = train or self.settings.train
         lam = criteria.lam_by_kind(self.lam, self.groups)
         cameras = [frame.camera for frame in frames]
-        on_pass = partial(report, "fitting")
+        on_pass = partial(report, Stage.FIT)
         targets, start = self.targets(frames, gains), self.start(tuple(frames))
         release(KEPT_BYTES)  # what scores took, and then what the fit took
         fit_ = fit(model, cameras, targets, train, on_pass, self.cache, start, lam)
@@ -287,7 +287,7 @@ class Scene:
             return self.fisher(start, camera, "exact")[:count, :columns]
 
         def progress(done: int, total: int) -> None:
-            report("scoring candidates", done, total)
+            report(Stage.SCORE, done, total)
 
         points, lam = start.means[:count] @ self.turn.T, float(self.surface_lam[0])
         return Visibility(state.cameras, exact, points, self.centre, lam, self.turn, progress)
@@ -310,7 +310,7 @@ def captured(scene: Scene, frames: tuple[Frame, ...], views: Sequence[int]) -> t
     """Capture the images of some views: the frames afterwards, up to the first given up."""
     result = list(frames)
     for done, i in enumerate(views):
-        report("capturing", done, len(views))
+        report(Stage.CAPTURE, done, len(views))
         result[i] = scene.capture(frames[i])
         if result[i].given_up:
             break
@@ -357,7 +357,7 @@ def information(scene: Scene, model: Gaussians, frames: Sequence[Frame]) -> np.n
     """Sum the Fisher information of frames at a model: H [N,P], diagonal of J^T J."""
     H = np.zeros((len(model), len(scene.lam)))
     for done, frame in enumerate(frames):
-        report("information of the training set", done, len(frames))
+        report(Stage.INFORMATION, done, len(frames))
         H += scene.fisher(model, frame.camera, scene.settings.estimator)
     return H
 

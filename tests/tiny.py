@@ -26,7 +26,7 @@ from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr, write_png
 from mgs.memory import VIEW_BYTES
 from mgs.prior.build import Prior, load_prior, save_prior
-from mgs.progress import report
+from mgs.progress import Stage, report
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
 from mgs.run import recording
@@ -161,7 +161,7 @@ class TinyScene(Scene):
     def fitted(self, model, frames, gains=None, train=None):
         cameras = [frame.camera for frame in frames]
         targets, start = self.targets(frames, gains), self.start(tuple(frames))
-        on_pass = lambda done, total: report("fitting", done, total)  # noqa: E731
+        on_pass = lambda done, total: report(Stage.FIT, done, total)  # noqa: E731
         fit_to = self.parts.get("fit", fit)
         return fit_to(model, start, cameras, targets, train or self.settings.train, on_pass)
 

@@ -10,7 +10,7 @@ import numpy as np
 from mgs.errors import InputError
 from mgs.policy import poses, tour
 from mgs.policy.certificate import Certificate, certify, greedy
-from mgs.progress import report
+from mgs.progress import Stage, report
 from mgs.run.flight import flight_of, free, reachable, views_left
 from mgs.run.policies import Policy
 from mgs.run.settings import Mission
@@ -29,7 +29,7 @@ def rated(
 ) -> list[tuple[int, float]]:
     """(view, score) by falling score / cost [C]; of equals, the farthest from the views taken comes
     first. Raises InputError as `mgs.run.loop.choose`."""
-    report("scoring candidates", 0, len(views))
+    report(Stage.SCORE, 0, len(views))
     where, returned = f"policy {policy.name}: returned", policy(scene, state, views)
     try:
         scores = np.asarray(returned, np.float64)

@@ -35,7 +35,7 @@ from mgs.policy.criteria import Array
 from mgs.policy.directional import Views
 from mgs.policy.relaxation import Relaxation
 from mgs.policy.visibility import FEW
-from mgs.progress import report
+from mgs.progress import Stage, report
 
 if TYPE_CHECKING:
     from mgs.policy.pool_gains import PoolGains
@@ -56,7 +56,7 @@ def each(views: Sequence[int], score: Callable[[int], float]) -> np.ndarray:
     """Score of each view [C], with progress."""
     scores = np.empty(len(views))
     for done, view in enumerate(views):
-        report("scoring candidates", done, len(views))
+        report(Stage.SCORE, done, len(views))
         scores[done] = score(view)
     return scores
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mgs.errors import InputError
-from mgs.progress import report
+from mgs.progress import Stage, report
 from mgs.run.policies import POLICIES, Policy, policy_named
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ class Own:
                 return self.function(**shared)
             scores = []
             for done, i in enumerate(views):
-                report("scoring candidates", done, len(views))
+                report(Stage.SCORE, done, len(views))
                 of_one = {p: OF_ONE[p](scene, state, i) for p in single}
                 scores.append(self.function(**shared, **of_one))
             return scores

@@ -18,7 +18,7 @@ from mgs.files import remove_file, working_in
 from mgs.fit.stopping import DivergedError
 from mgs.gaussians import Gaussians
 from mgs.policy import criteria
-from mgs.progress import Progress, listening, no_progress, report
+from mgs.progress import Progress, Stage, listening, no_progress, report
 from mgs.run import inputs
 from mgs.run.checks import Checks
 from mgs.run.ending import RunEnd, diverged, run_end
@@ -32,16 +32,6 @@ from mgs.run.settings import NbvSettings
 from mgs.run.state import Checkpoint
 from mgs.scene import Choice, Scene, State, captured
 from mgs.splat_ply import write_ply
-
-STAGES = {
-    "capturing": "capture",
-    "fitting": "fit",
-    "information of the training set": "information",
-    "scoring candidates": "score",
-    "checking": "check",
-    "evaluating": "evaluate",
-}
-"""Stage of the progress -> key of `seconds` in steps.jsonl."""
 
 Measure = Callable[[Gaussians, Sequence[int]], dict[str, float]]
 """(model, views taken) -> entries of steps.jsonl (`mgs.evaluation.psnr_measure`)."""
@@ -165,7 +155,7 @@ def check_model(out: Path, scene: Scene, settings: NbvSettings, state: State) ->
 
 
 class Stopwatch:
-    """A progress callback that passes on and measures: seconds between calls, by STAGES.
+    """A progress callback that passes on and measures: seconds between calls, by `Stage`.
 
     Where a choice is finished (stage "chosen"), its seconds are set apart in `laps`.
     """
@@ -187,7 +177,8 @@ class Stopwatch:
     def switch(self, stage: str) -> None:
         """Count the seconds since the last call for the stage that ends, and begin another."""
         now = time.perf_counter()
-        if key := STAGES.get(self.stage):
+        if isinstance(self.stage, Stage):
+            key = self.stage.name.lower()
             self.seconds[key] = round(self.seconds.get(key, 0.0) + now - self.since, 4)
         self.stage, self.since = stage, now
 
@@ -238,12 +229,12 @@ class Recorder:
             names = [state.frames[i].name for i in state.taken]
             line["exposure"] = dict(zip(names, state.exposure.tolist(), strict=True))
         if self.checks:
-            report("checking", 0, 1)
+            report(Stage.CHECK, 0, 1)
             model = before.gaussians if before else None
             line |= self.checks.entries(state, model, new, [*steps, *lines])
         every, first, step = self.settings.evaluate_every, len(steps), line["step"]
         if every and any(k % every == 0 for k in range(first, step + 1)):
-            report("evaluating", 0, 1)
+            report(Stage.EVALUATE, 0, 1)
             line |= self.measure(fit.gaussians, list(state.taken))
         line["seconds"] |= self.stopwatch.take()
         kinds = ["image", "mask", "rock", "depth", "capture"]
