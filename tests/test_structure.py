@@ -11,11 +11,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 ROOMS = [
-    "errors", "seeds", "runtime", "resources", "provenance", "colour", "rotation", "memory",
-    "notebook", "camera", "gaussians", "files", "images", "metrics", "plotting",
+    "errors", "progress", "seeds", "runtime", "resources", "provenance", "colour", "rotation",
+    "memory", "notebook", "camera", "gaussians", "files", "images", "metrics", "plotting",
     "data", "synth", "survey", "prior", "splat",
     "splat_places", "splat_ply", "splat_gltf", "splat_files", "evaluation",
-    "policy", "fit", "run", "report", "view",
+    "policy", "fit", "scene", "run", "report", "view",
     "bench", "study", "cli", "__main__",
 ]  # fmt: skip
 """All rooms; each may import from those before it."""
