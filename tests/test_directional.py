@@ -2,12 +2,14 @@
 computed anew, and plans of views."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
 import tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from program import steps
 
 from mgs.colour import SH_C0
 from mgs.policy import criteria, directional, pool_gains
@@ -362,6 +364,24 @@ def test_a_run_takes_the_views_of_its_plan(loaded, tmp_path, policy):
     assert planned(chosen[:1]) == sorted(chosen[1:])
     other = next(i for i in flight.free(scene, after([]), mission) if i not in chosen)
     assert len(planned([other])) == 3
+
+
+@pytest.mark.parametrize("policy", ["directional-d", "directional-i"])
+def test_a_run_records_what_its_plan_is_worth(loaded, tmp_path, policy):
+    """Scores of the steps add up to the gain of the plan, which has at least the share of the best
+    set that is recorded."""
+    scene, after, mission, chosen = flown(loaded, tmp_path / "run", policy)
+    first, *others = steps(tmp_path / "run")
+    state, recorded = after([]), first["certificate"]
+    views = flight.free(scene, state, mission)
+    made = POLICIES[policy].relaxation(scene, state, views)
+    gain = made.gain([views.index(i) for i in chosen])
+    assert gain == pytest.approx(sum(line["score"] for line in others), rel=1e-5)
+    largest = max(made.gain(some) for some in combinations(range(len(views)), 4))
+    assert recorded["share"] <= gain / largest * (1 + 1e-9)
+    assert recorded["of_all"] == pytest.approx(gain / made.gain(range(len(views))))
+    assert list(recorded["prices"]) == [scene.frames[i].name for i in views]
+    assert (recorded["views"], recorded["candidates"]) == (4, len(views))
 
 
 @pytest.mark.parametrize("policy", ["directional-d", "directional-i"])

@@ -65,6 +65,21 @@ def test_views_are_planned_together_and_flown_in_a_short_order(run, site):
     assert short.metres <= 0.8 * found.metres
 
 
+def test_as_few_views_are_planned_as_have_a_share_of_what_all_would_give(run, site):
+    opened, ring = open_run(run), place_poses("ring", 12, 2.6, (25, 35), site)
+    few, more = (suggest(opened, ring, "auto", enough=share) for share in (0.5, 0.8))
+    assert 1 <= len(few.plan) < len(more.plan) < 12
+    assert few.certificate.of_all >= 0.5
+    assert len(few.certificate.prices) == len(few.ranking)
+    assert suggest(opened, ring, 3, policy="random").certificate is None
+    assert suggest(opened, ring, 3, policy="d-optimal").certificate.share >= 0.9
+    data = opened.dataset.root
+    run = mgs.start_run(data, run.parent / "auto", seeds=2, budget="auto", enough=0.7)
+    assert 1 <= run.settings.budget < 6
+    later = mgs.start_run(data, run.folder.parent / "more", seeds=2, budget="auto", enough=1.0)
+    assert later.settings.budget == 6
+
+
 def test_a_coarse_model_keeps_the_best(run, site, monkeypatch):
     opened, dome = open_run(run), place_poses("dome", 20, 2.6, (10, 80), site)
     thin, rows = coarse_prior(opened.prior, 100)
@@ -223,6 +238,8 @@ BAD = {
     "--set ring=3 --views 4": "views 4 of 3 candidates",
     "--dome 5 --set flight.length=0.1": "within the limits",
     "--dome 5 --set ring=5": "give one of them",
+    "--views few": "views 'few': expected a whole number",
+    "--views auto --policy random": "give the number",
     "--plan a.plan": "`plan` needs `origin`",
     "--plan a.txt --origin 1,2,3": "written as .plan, .waypoints, .kml",
     "--origin 47,8": "origin '47,8': expected LATITUDE",

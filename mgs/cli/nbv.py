@@ -71,7 +71,15 @@ def nbv(
     ] = None,
     gaussians: Gaussians = None,
     policy: Annotated[str | None, setting(NbvSettings, "policy", NAMES)] = None,
-    budget: Annotated[int | None, setting(NbvSettings, "budget")] = None,
+    budget: Annotated[
+        str | None,
+        setting(
+            NbvSettings,
+            "budget",
+            " auto: as few as have the share `enough` of the gain of all candidates.",
+            "N|auto",
+        ),
+    ] = None,
     seeds: Annotated[int | None, setting(NbvSettings, "seeds")] = None,
     batch: Annotated[int | None, setting(NbvSettings, "batch")] = None,
     seed: Annotated[int | None, setting(NbvSettings, "seed")] = None,

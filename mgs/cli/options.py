@@ -25,12 +25,12 @@ def argument(text: str, **more: Any) -> Any:
     return typer.Argument(help=text, **more)
 
 
-def setting(model: type[BaseModel], key: str, more: str = "") -> Any:
+def setting(model: type[BaseModel], key: str, more: str = "", metavar: str | None = None) -> Any:
     """The option of a setting; its help is the docstring of the field, its default and `more`."""
     name, default, text = next(row for row in keys_of(model) if row[0] == key)
     flag = "--" + name.rpartition(".")[2].replace("_", "-")
     shown = f" Default: {default}." if default and "Default" not in text + more else ""
-    return typer.Option(flag, help=f"{text}{shown}{more}", show_default=False)
+    return typer.Option(flag, help=f"{text}{shown}{more}", show_default=False, metavar=metavar)
 
 
 Runs = Annotated[list[Path], argument("Folders that `mgs nbv` wrote.", metavar="RUN...")]

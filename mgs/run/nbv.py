@@ -22,11 +22,14 @@ from mgs.memory import VIEW_BYTES
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.photographs import source_of as source_of_prior
 from mgs.prior.settings import PriorSettings
-from mgs.progress import Progress, no_progress
+from mgs.progress import Progress, listening, no_progress
 from mgs.run import recording
 from mgs.run.flight import check_seeds
 from mgs.run.folder import DATASET, FILES, POLICY_SOURCE, Run, holds_run, open_run, start
 from mgs.run.live import Live, begin, live_capture
+from mgs.run.loop import first_views
+from mgs.run.planning import enough_views
+from mgs.run.policies import Policy
 from mgs.run.policy_file import in_file, is_function, label, name_of, policy_of, source_of
 from mgs.run.settings import (
     ALPHA_WEIGHT,
@@ -38,7 +41,7 @@ from mgs.run.settings import (
 )
 from mgs.run.state import Checkpoint
 from mgs.run.transports import Transport
-from mgs.scene import Scene
+from mgs.scene import Scene, State, information
 from mgs.splat.constants import NEAR
 from mgs.synth.scene_file import load_scene_file
 
@@ -108,8 +111,10 @@ def start_run(
     - preset: a row of `PRESETS`, whose values are defaults. loose: as `NbvSettings.with_spacing`.
     - force: replace an existing run.
     - settings: fields of `NbvSettings`. `policy` may also be a function (docs/howto/policy.md),
-      whose source is kept in the run. The default of `budget` is 50 views or all candidates, that
-      of `alpha_weight` is ALPHA_WEIGHT, or 0 if frames have neither mask nor alpha.
+      whose source is kept in the run. The default of `budget` is 50 views or all candidates;
+      "auto" is the fewest views that have the share `enough` of the gain of all candidates by the
+      policy's criterion, at the model before training. The default of `alpha_weight` is
+      ALPHA_WEIGHT, or 0 if frames have neither mask nor alpha.
 
     Leaves no folder behind if it fails. Raises InputError if the folder is not empty, a setting is
     invalid, the dataset is too small, an input is missing or damaged, or the cameras are too near
@@ -138,6 +143,11 @@ def start_run(
     where = Path(prior) if isinstance(prior, str | Path) else out / "prior"
     policy = settings.get("policy", NbvSettings.model_fields["policy"].default)
     named = name_of(policy) if isinstance(policy, str) or callable(policy) else policy
+    automatic = settings.get("budget") == "auto"
+    if automatic:
+        if loaded is None or live is not None:
+            raise InputError("budget auto: needs the images of the seeds; give a number")
+        settings = settings | {"budget": 1}
     outlined = not loaded or loaded.outlined
     weight = ALPHA_WEIGHT if outlined else 0.0
     wanted = with_defaults(settings | {"policy": named}, row, weight)
@@ -146,7 +156,7 @@ def start_run(
     )
     count = len(loaded) if loaded else _candidates(capture)
     complete = _resolved(known, count, "budget" in settings)
-    policy_of(policy)  # a user's policy fails here, before there is a folder
+    rule = policy_of(policy)  # a user's policy fails here, before there is a folder
     check_settings(complete, count)
     found = load_prior(prior) if isinstance(prior, str | Path) else prior
     read = [path for path in (root if capture is None else None, prior) if isinstance(path, Path)]
@@ -167,6 +177,8 @@ def start_run(
         complete = complete.with_spacing(built.spacing, loose)
         if complete.flies or complete.flight.no_fly or complete.flight.clearance is not None:
             check_seeds(Scene(frames, built, complete), complete)
+        if automatic:
+            complete = _automatic(Scene(frames, built, complete), complete, rule, progress)
         if live is not None:
             begin(unfinished / DATASET, frames, built)
         start(unfinished, complete, frames)
@@ -224,6 +236,19 @@ def _resolved(given: NbvSettings, count: int, budget_given: bool) -> NbvSettings
     if not budget_given:
         resolved["budget"] = min(given.budget, max(0, count - given.seeds))
     return given.model_copy(update=resolved)
+
+
+def _automatic(
+    scene: Scene, settings: NbvSettings, policy: Policy, progress: Progress
+) -> NbvSettings:
+    """The settings with the budget of `enough_views`, by the Gaussians before training."""
+    with listening(progress):
+        seeds, frames = first_views(scene, settings)
+        shown = tuple(frames[i] for i in seeds)
+        model = scene.start(shown)
+        H = information(scene, model, shown)
+        state = State(frames, tuple(seeds), len(seeds), model, H, H)
+        return settings.model_copy(update={"budget": enough_views(scene, state, policy, settings)})
 
 
 def _built_prior(
