@@ -121,7 +121,7 @@ def certificate(
     relaxation = getattr(policy, "relaxation", None)
     if relaxation is None or not 0 < len(plan) < len(views):
         return None
-    report("bounding the plan", 0, 1)
+    report(Stage.SCORE, 0, 1)
     made = relaxation(scene, state, views)
     places = [views.index(i) for i in plan]
     return made and certify(made, places, policy.name, CERTIFY_SECONDS)
