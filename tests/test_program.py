@@ -2,12 +2,20 @@
 
 import subprocess
 import sys
+import warnings
 
+import pytest
 import tiny
+import typer
 from program import command
+from refusals import refused
 
-from mgs.cli.app import _hint
+import mgs
+from mgs.cli.app import COMMANDS, _hint, app
+from mgs.cli.options import keys_of, parse_settings
+from mgs.cli.renamed import OPTIONS, renewed
 from mgs.run.folder import read_checkpoint
+from mgs.run.settings import NbvSettings
 from mgs.splat_ply import read_ply
 
 INTERRUPTED = """
@@ -54,3 +62,57 @@ def test_the_hint_knows_options_with_an_equals_sign(tmp_path):
     again = f"; continue with: mgs nbv --resume {tmp_path} --capture-command 'fly {{pose}}'"
     assert _hint(given) == again
     assert _hint(["fit", "data", "--out", str(tmp_path)]) == again.partition(" --capture")[0]
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_old_options_become_options_and_settings_that_the_command_has(name):
+    command = typer.main.get_command(app).commands[name]
+    options = {flag for parameter in command.params for flag in parameter.opts}
+    for old, new in OPTIONS[name].items():
+        assert old not in options
+        if new.startswith("--"):
+            assert new in options
+        else:
+            key, _, value = new.removesuffix(".").partition("=")
+            pair = f"{key}.colour=1" if new.endswith(".") else f"{key}={value or 1}"
+            assert parse_settings([pair], command)
+
+
+def test_old_words_print_the_new_ones():
+    with warnings.catch_warnings(record=True) as notices:
+        warnings.simplefilter("always")
+        words = renewed(["nbv", "d", "--seed-views=3", "--rate", "colour=1", "--no-antialiased"])
+        assert renewed(["refit", "RUN"]) == ["simplify", "--method", "refit", "RUN"]
+    sets = ["--set", "train.rates.colour=1", "--set", "train.antialiased=false"]
+    assert words == ["nbv", "d", "--seeds=3", *sets]
+    new = ["--seeds=3", " ".join(sets[:2]), " ".join(sets[2:]), "mgs simplify --method refit"]
+    shown = [str(notice.message) for notice in notices]
+    assert all(f" is now {words};" in line for words, line in zip(new, shown, strict=True)), shown
+
+
+def test_help_ends_with_the_settings_that_have_no_option(capsys):
+    command("nbv", "--help")
+    shown = capsys.readouterr().out
+    table = shown[shown.index("KEY=VALUE", shown.rindex("--help")) :]
+    rows = {line.split()[0] for line in table.splitlines() if line[:2].strip()}
+    options = {"dataset", "prior", "policy", "budget", "seeds", "seed", "train.seed", "batch"}
+    assert {key for key, *_ in keys_of(NbvSettings)} - options <= rows
+    assert not options & rows
+
+
+def test_a_setting_has_the_same_name_in_python_and_on_the_command_line(tmp_path, capsys):
+    data, prior = tiny.write_dataset(tmp_path / "data"), tiny.write_prior(tmp_path / "prior")
+    wrong = "train.alpha_weight = -1: must be at least 0"
+    with pytest.raises(mgs.InputError, match=wrong):
+        mgs.run_nbv(data, tmp_path / "run", prior=prior, train={"alpha_weight": -1})
+    words = ["nbv", data, "--prior", prior, "--out", tmp_path / "run"]
+    assert wrong in refused(capsys, [*words, "--set", "train.alpha_weight=-1"], tmp_path)
+    with pytest.raises(mgs.InputError, match=r"runs/--no-such-run/data"):
+        mgs.load_dataset("runs/--no-such-run/data")
+
+
+def test_no_command_has_many_options():
+    commands = typer.main.get_command(app).commands
+    for name in COMMANDS:
+        options = [p for p in commands[name].params if p.param_type_name == "option"]
+        assert len(options) <= (17 if name == "nbv" else 15), name

@@ -54,13 +54,18 @@ def on_post_build(config: MkDocsConfig) -> None:
 
 
 def command_reference() -> str:
-    """Return a heading, the help and a table of options for every command of `mgs`."""
+    """Return a heading, the help and tables of options and settings for every command of `mgs`."""
     parts = []
     for name, command in vars(typer.main.get_command(app))["commands"].items():
         parts.append(f"## mgs {name}\n\n{command.help}\n")
         if command.params:
             rows = "".join(_row(parameter) for parameter in command.params)
             parts.append(f"| argument or option | meaning | default |\n| --- | --- | --- |\n{rows}")
+        if command.keys:
+            rows = "".join(f"| `{key}` | {text} | {shown} |\n" for key, shown, text in command.keys)
+            parts.append(
+                f"| setting (`--set KEY=VALUE`) | meaning | default |\n| --- | --- | --- |\n{rows}"
+            )
     return "\n".join(parts)
 
 
