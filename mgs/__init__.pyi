@@ -19,6 +19,7 @@ from .prior.build import prior_from_mesh as prior_from_mesh
 from .prior.build import save_prior as save_prior
 from .prior.initial import initial_gaussians as initial_gaussians
 from .prior.settings import PriorSettings as PriorSettings
+from .report.diagnostics import diagnose as diagnose
 from .report.evaluation import evaluate as evaluate
 from .report.evaluation import evaluate_run as evaluate_run
 from .report.page import write_page as write_page

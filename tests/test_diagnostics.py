@@ -106,7 +106,7 @@ def run(tmp_path_factory):
 
 
 def test_files(run):
-    written = diagnostics.diagnose_run(run, ["kf_0007"])
+    written = diagnostics.diagnose(run, ["kf_0007"])
     assert [path.name for path in written] == ["information.ply", "kf_0007.exr", "kf_0007.png"]
     channels = read_exr(run / "diagnostics/kf_0007.exr")
     assert set(channels) == CHANNELS
@@ -135,4 +135,4 @@ def test_views(run):
     assert len(diagnostics.choose_views(frames, everything, None)) == diagnostics.VIEWS
     named = "kf_9999: no such frame; the dataset has kf_0000 to kf_0011"
     with pytest.raises(InputError, match=named):
-        diagnostics.diagnose_run(run, ["kf_9999"])
+        diagnostics.diagnose(run, ["kf_9999"])

@@ -20,7 +20,7 @@ from mgs.policy.criteria import DIRECTIONAL_STD, MEAN_STD
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_normals
 from mgs.report.convergence import remaining_decrease
-from mgs.report.diagnostics import diagnose_run
+from mgs.report.diagnostics import diagnose
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
 from mgs.run.nbv import resume_nbv, run_nbv, start_run
@@ -245,7 +245,7 @@ def test_means_that_changed_since_the_start_are_one_line(whole, tmp_path, capsys
 
 def test_diagnostics_and_viewer_read_such_a_run(files, whole):
     means, out, state = whole
-    written = diagnose_run(out, [load_dataset(files[0]).frames[0].name])
+    written = diagnose(out, [load_dataset(files[0]).frames[0].name])
     assert out / "diagnostics/information.ply" in written
     found = read_subject(out)
     assert set(found.scalars) == set(SCALARS)

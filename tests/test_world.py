@@ -99,7 +99,7 @@ def test_the_page_draws_it_upright_too_and_names_the_unit(runs, tmp_path):
 
 def test_maps_of_depth_name_the_unit(runs, drawn):
     for run, unit in zip(runs, ("m", "unit"), strict=True):
-        diagnostics.diagnose_run(run, ["kf_0001"])
+        diagnostics.diagnose(run, ["kf_0001"])
         assert f"depth ({unit})" in [axis.get_title() for axis in drawn["kf_0001.png"].axes]
 
 

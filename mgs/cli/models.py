@@ -124,7 +124,7 @@ def diagnose(
     the run's own views out of a fit once. NAME.errors.exr has the true error and the predicted
     standard deviation of some views.
     """
-    from mgs.report.diagnostics import diagnose_run
+    from mgs.report.diagnostics import diagnose as mapped
     from mgs.run.folder import open_run
 
     if calibrate and views is not None:
@@ -145,7 +145,7 @@ def diagnose(
 
                 written = calibrate_run(run, partial(bar, "calibrating"))
             else:
-                written = diagnose_run(run, wanted, partial(bar, "mapping"))
+                written = mapped(run, wanted, partial(bar, "mapping"))
         for path in written:
             echo(f"wrote {path}")
 

@@ -100,6 +100,11 @@ def view_maps(
     return maps
 
 
+def picture(maps: dict[str, np.ndarray]) -> np.ndarray:
+    """Render of `view_maps`, sRGB in [0,1] [H,W,3]."""
+    return srgb_from_linear(np.stack([maps[channel] for channel in "RGB"], axis=-1))
+
+
 def write_information_ply(
     path: str | Path, gaussians: Gaussians, scalars: dict[str, np.ndarray]
 ) -> None:
@@ -152,14 +157,13 @@ def write_preview(
 
     from mgs.plotting import NO_GRID, crop, drawing, literal
 
-    rgb = np.stack([maps[channel] for channel in "RGB"], axis=-1)
     visible = maps["A"] >= VISIBLE
     window = crop(visible)
     height, width = visible[window].shape
     with drawing(path, 8.4, 3 * (2.3 * height / width + 0.35) + 0.4, NO_GRID, dpi=130) as figure:
         figure.suptitle("What the images taken determine")
         axes = figure.subplots(3, 3).flat
-        axes[0].imshow(srgb_from_linear(rgb)[window], interpolation="nearest")
+        axes[0].imshow(picture(maps)[window], interpolation="nearest")
         axes[0].set_title(literal(title))
         for axis, (channel, (label, name)) in zip(axes[1:], PANELS.items(), strict=True):
             values = np.ma.masked_where(~visible, maps[channel])[window]
@@ -212,7 +216,7 @@ def choose_views(
     return [pool[i] for i in spread]
 
 
-def diagnose_run(
+def diagnose(
     run: str | Path,
     wanted: Sequence[str] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,

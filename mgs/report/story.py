@@ -15,7 +15,7 @@ from mgs.metrics import psnr
 from mgs.plotting import NO_GRID, crop, new_figure
 from mgs.policy import criteria
 from mgs.progress import Progress, listening
-from mgs.report.diagnostics import VISIBLE, view_maps
+from mgs.report.diagnostics import VISIBLE, picture, view_maps
 from mgs.report.figures import NEWEST, draw_cameras
 from mgs.report.video import UNKNOWN, Film
 from mgs.run.folder import Run
@@ -77,7 +77,7 @@ def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], shown: Frame) ->
     from matplotlib.cm import ScalarMappable
 
     truth = srgb_from_linear(shown.masked_rgb())
-    rgb = srgb_from_linear(np.stack([maps[channel] for channel in "RGB"], -1))
+    rgb = picture(maps)
     window = crop(truth.max(axis=2) > 0)
     count, seeds = len(model.taken), run.settings.seeds
     why = f"one of {seeds} to begin with" if count <= seeds else f"chosen by {run.label}"

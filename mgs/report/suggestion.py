@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 
 from mgs.camera import opengl_from_opencv
-from mgs.colour import srgb_from_linear
 from mgs.data.dataset import write_transforms
 from mgs.data.frames import Frame
 from mgs.data.up import upright
 from mgs.files import write_json
 from mgs.policy.criteria import GAIN_UNIT
-from mgs.report.diagnostics import VISIBLE, run_scalars, view_maps
+from mgs.report.diagnostics import VISIBLE, picture, run_scalars, view_maps
 from mgs.run.folder import Run
 from mgs.run.suggest import Suggestion, View, taken_in_order
 
@@ -87,11 +86,10 @@ def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
             maps = view_maps(run.state.gaussians, small, scalars)
             visible = maps["A"] >= VISIBLE
             window = crop(visible)
-            rgb = srgb_from_linear(np.stack([maps[channel] for channel in "RGB"], -1))
             unknown = np.ma.masked_where(~visible, maps["uncertainty"])
             colours = matplotlib.colormaps["cividis"].with_extremes(bad="#e8e8e8")
             top, below = (figure.add_subplot(grid[row, k]) for row in (0, 1))
-            top.imshow(rgb[window])
+            top.imshow(picture(maps)[window])
             top.set_title(f"{k}: {view.name}\ngain {view.information_gain:.3f}")
             shown = below.imshow(unknown[window], cmap=colours, vmin=0, vmax=1)
             below.set_title(f"unknown {100 * view.unknown:.0f} %")

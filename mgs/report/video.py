@@ -22,7 +22,7 @@ from mgs.data.up import upright
 from mgs.errors import InputError
 from mgs.files import atomic_path
 from mgs.plotting import painted
-from mgs.report.diagnostics import VISIBLE, run_scalars, view_maps
+from mgs.report.diagnostics import VISIBLE, picture, run_scalars, view_maps
 from mgs.run.folder import Run
 
 Film = Iterator[np.ndarray]
@@ -88,19 +88,14 @@ def path_frames(run: Run, path: str, beside: str | None, count: int, width: int)
         for frame in run.dataset.frames:
             camera = frame.camera.resized(width + width % 2)
             truth = _resized(srgb_from_linear(frame.masked_rgb()), camera)
-            yield _side_by_side(truth, _picture(view_maps(model, camera, {})))
+            yield _side_by_side(truth, picture(view_maps(model, camera, {})))
         return
     scalars = {"uncertainty": run_scalars(run)["uncertainty"]} if beside else {}
     up = run.up
     for camera in camera_path(run.dataset, model.means, up, path, count, width):
         maps = view_maps(model, camera, scalars)
         right = [_unknown(maps)] if beside else []
-        yield _side_by_side(_picture(maps), *right)
-
-
-def _picture(maps: dict[str, np.ndarray]) -> np.ndarray:
-    """Render of `view_maps`, sRGB in [0,1] [H,W,3]."""
-    return srgb_from_linear(np.stack([maps[channel] for channel in "RGB"], -1))
+        yield _side_by_side(picture(maps), *right)
 
 
 def _unknown(maps: dict[str, np.ndarray]) -> np.ndarray:

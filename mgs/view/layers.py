@@ -13,7 +13,7 @@ from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.gaussians import Gaussians
 from mgs.plotting import painted
-from mgs.report.diagnostics import PANELS, VISIBLE, view_maps
+from mgs.report.diagnostics import PANELS, VISIBLE, picture, view_maps
 from mgs.rotation import rotmat_from_quat
 from mgs.view.access import plain
 from mgs.view.subject import Subject
@@ -47,7 +47,8 @@ def gaussian_colours(subject: Subject, layer: str) -> np.ndarray:
     """Colours of the Gaussians in a layer, sRGB uint8 [N,3]; grey for depth."""
     g = subject.model
     if layer == "colour":
-        return _eight_bits(g.linear_rgb(g.rgb))
+        srgb = srgb_from_linear(g.linear_rgb(g.rgb))
+        return np.round(255 * srgb).astype(np.uint8)
     if layer in subject.scalars:
         return painted(subject.scalars[layer], PANELS[layer][1], *scale(subject, layer))
     return np.full((len(g), 3), 255 if layer == "alpha" else 128, np.uint8)
@@ -68,8 +69,7 @@ def kernel_image(
     seen = maps["A"] >= VISIBLE
     depth = np.where(seen, maps["Z"], FAR).astype(np.float32)
     if layer == "colour":
-        rgb = np.stack([maps[channel] for channel in "RGB"], axis=-1)
-        return _eight_bits(rgb), depth, (0.0, 1.0)
+        return np.round(255 * picture(maps)).astype(np.uint8), depth, (0.0, 1.0)
     if layer == "alpha":
         grey = np.round(255 * np.clip(maps["A"], 0, 1)).astype(np.uint8)
         return np.stack([grey] * 3, axis=-1), depth, (0.0, 1.0)
@@ -92,8 +92,3 @@ def scale(subject: Subject, layer: str) -> tuple[float, float]:
 def legend(layer: str, ends: tuple[float, float], unit: str) -> str:
     """Meaning of the colours of a layer, in one line. unit: name of a length of 1."""
     return LEGENDS[layer].format(low=ends[0], high=ends[1], unit=plain(unit))
-
-
-def _eight_bits(linear: np.ndarray) -> np.ndarray:
-    """Linear RGB as sRGB, uint8."""
-    return np.round(255 * srgb_from_linear(linear)).astype(np.uint8)
