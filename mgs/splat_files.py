@@ -8,11 +8,8 @@ from __future__ import annotations
 import gzip
 import struct
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
@@ -31,7 +28,7 @@ FORMATS = {"ply": ".ply", "compressed-ply": ".compressed.ply", "glb": ".glb", "s
 """Formats that are written, with the endings of their files."""
 
 SPZ_MAGIC = (b"\x1f\x8b", b"NGSP")
-"""First bytes of SPZ files: of versions 1 to 3, which are compressed by gzip, and of 4."""
+"""First bytes of SPZ files: up to version 3, which are compressed by gzip, and of 4."""
 
 SPZ_BITS = 23
 """Bits of the magnitude of an SPZ position, a fixed-point number."""
@@ -157,65 +154,38 @@ def _axes(number: int) -> tuple[int, int, int]:
     return (1 if number & 1 else -1, -1 if number & 2 else 1, 1 if number & 4 else -1)
 
 
-def _spz_bits(path: Path, means: np.ndarray) -> int:
-    """Fractional bits of positions [N,3]. Raises InputError if they are too far for any."""
-    largest = max(float(np.abs(means).max(initial=0)), 1e-6)
-    if not largest < 2**SPZ_BITS:
-        raise InputError(f"{path}: positions up to {largest:.3g} are too far for SPZ; use ply")
-    return min(int(np.floor(SPZ_BITS - np.log2(largest * (1 + 1e-6)))), 24)
-
-
-@contextmanager
-def _decodable(path: Path) -> Iterator[Path]:
-    """Context manager: an SPZ that the codec reads; a copy of a file of version 1, whose positions
-    are half floats, as version 2."""
-    with path.open("rb") as raw, gzip.open(raw) if raw.read(2) == SPZ_MAGIC[0] else raw as file:
-        raw.seek(0)
-        if SPZ_HEADER.unpack(file.read(20))[1] != 1:
-            yield path
-            return
-        file.seek(0)
-        data = bytearray(file.read())
-    n = SPZ_HEADER.unpack_from(data)[2]
-    means = np.frombuffer(data, "<f2", 3 * n, 16).astype(np.float64)
-    bits = _spz_bits(path, means)
-    fixed = np.round(means * 2.0**bits).astype("<i4").view("u1").reshape(-1, 4)[:, :3]
-    data[4], data[13] = 2, bits
-    with NamedTemporaryFile(suffix=".spz") as copy:
-        copy.write(gzip.compress(data[:16] + fixed.tobytes() + data[16 + 6 * n :], 1))
-        copy.flush()
-        yield Path(copy.name)
-
-
 def _spz_marks(path: Path) -> tuple[bool, int]:
-    """Whether an SPZ is antialiased, and the number of its axes. Raises errors of many types."""
-    with path.open("rb") as raw, gzip.open(raw) if raw.read(2) == SPZ_MAGIC[0] else raw as file:
-        raw.seek(0)
-        _, version, n, degree, _, flags, _, end = SPZ_HEADER.unpack(file.read(20))
-        axes = RUB
-        if flags & SPZ_EXTENSIONS:
-            each = (6 if version == 1 else 9) + 7 + (4 if version == 3 else 3)
-            start = 16 + n * (each + 3 * ((degree + 1) ** 2 - 1))
-            file.seek(start if version < 4 else 32)
-            data = file.read(1 << 16 if version < 4 else max(end - 32, 0))
-            while len(data) >= 8:
-                kind, size = struct.unpack_from("<II", data)
-                if kind == SPZ_AXES and data[8] in range(1, 9):
-                    axes = data[8] - 1
-                data = data[8 + size :]
+    """Whether an SPZ is antialiased, and the number of its axes. Raises InputError for version 1,
+    and errors of many types for a damaged file."""
+    data = path.read_bytes()
+    data = gzip.decompress(data) if data.startswith(SPZ_MAGIC[0]) else data
+    _, version, n, degree, _, flags, _, end = SPZ_HEADER.unpack_from(data)
+    if version == 1:
+        raise InputError(
+            f"{path}: is an SPZ of version 1, which mgs does not read; use a later one"
+        )
+    start, axes = 32, RUB
+    if version < 4:
+        start = 16 + n * ((20 if version == 3 else 19) + 3 * ((degree + 1) ** 2 - 1))
+        end = len(data)
+    rest = data[start:end] if flags & SPZ_EXTENSIONS else b""
+    while len(rest) >= 9:
+        kind, size = struct.unpack_from("<II", rest)
+        if kind == SPZ_AXES and rest[8] in range(1, 9):
+            axes = rest[8] - 1
+        rest = rest[8 + size :]
     return bool(flags & SPZ_ANTIALIASED), axes
 
 
 def _read_spz(path: Path) -> Gaussians:
-    """Read an SPZ of version 1 to 4 and turn it to the axes of 3DGS files.
+    """Read an SPZ of version 2 to 4 and turn it to the axes of 3DGS files.
 
     Raises InputError if it is damaged.
     """
     codec = _spz_codec(path)
     with reading(path), parsing(path, "SPZ", "export it again"):
-        with _decodable(path) as decodable:
-            found = codec.read_spz(str(decodable))
         antialiased, axes = _spz_marks(path)
+        found = codec.read_spz(str(path))
         parts = [found["sh0"][:, None, :]]
         if found["shN"] is not None and found["shN"].size:
             parts.append(found["shN"])
@@ -240,11 +210,12 @@ def _write_spz(path: Path, gaussians: Gaussians) -> None:
     """
     codec = _spz_codec(path)
     g = mirrored(gaussians, _axes(RUB))
-    bits = _spz_bits(path, g.means)
-    if 2.0**-bits > np.exp(np.median(g.log_scales)):
+    largest = max(float(np.abs(g.means).max()), 1e-6)
+    bits = min(int(np.floor(SPZ_BITS - np.log2(largest * (1 + 1e-6)))), 24)
+    if bits < 0 or 2.0**-bits > np.exp(np.median(g.log_scales)):
         raise InputError(
-            f"{path}: positions this far from the origin have steps of {2.0**-bits:.3g} in an "
-            "SPZ, coarser than the Gaussians; use ply or glb"
+            f"{path}: positions up to {largest:.3g} have steps of {2.0**-bits:.3g} in an SPZ, "
+            "coarser than the Gaussians; use ply or glb"
         )
     fields = (g.means, g.log_scales, g.quats, g.logit_opacities, g.sh[:, 0])
     arrays = [np.ascontiguousarray(values, np.float32) for values in fields]

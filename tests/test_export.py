@@ -24,7 +24,7 @@ from mgs.data.dataset import load_cameras, load_dataset
 from mgs.errors import InputError, Notice
 from mgs.gaussians import Gaussians
 from mgs.images import read_mask
-from mgs.report.evaluation import compare_models
+from mgs.report.evaluation import compare_models, evaluate
 from mgs.report.exporting import in_srgb, to_y_up
 from mgs.rotation import rotmat_from_quat
 from mgs.run.folder import open_run
@@ -259,29 +259,6 @@ def test_an_spz_that_names_its_axes(tmp_path):
     assert np.abs(load_gaussians(path).means - model.means).max() < 1e-6
 
 
-def test_an_spz_of_version_1(tmp_path):
-    """Positions are half floats."""
-    pytest.importorskip("gsply_cpp")
-    model, n = gaussians(0), 40
-    head = struct.pack("<4sIIBBBB", b"NGSP", 1, n, 0, 12, 0, 0)
-    quats = unit(model.quats) * np.sign(unit(model.quats)[:, :1])
-    fields = [
-        (model.means * (1, -1, -1)).astype("<f2"),
-        np.round(255 * model.opacities),
-        np.round(255 * (0.15 * model.sh[:, 0] + 0.5)),
-        np.round(16 * (model.log_scales + 10)),
-        np.round(127.5 * (quats[:, 1:] * (1, -1, -1) + 1)),
-    ]
-    body = b"".join(
-        (f if f.dtype.itemsize == 2 else f.clip(0, 255).astype("u1")).tobytes() for f in fields
-    )
-    (tmp_path / "x.spz").write_bytes(gzip.compress(head + body))
-    read = load_gaussians(tmp_path / "x.spz")
-    np.testing.assert_allclose(read.means, model.means, atol=1e-3)
-    np.testing.assert_allclose(read.opacities, model.opacities, atol=0.51 / 255)
-    np.testing.assert_allclose(covariances(read), covariances(model), rtol=0.2, atol=2e-3)
-
-
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".glb"])
 def test_what_playcanvas_makes_of_a_model_is_the_same_model(tmp_path, suffix):
     program = shutil.which("splat-transform")
@@ -365,6 +342,7 @@ BAD = {
         "its Gaussians are compressed (KHR_spz)",
     ),
     "cut.spz": (gzip.compress(b"NGSP\3\0\0\0\xff\xff\0\0"), "not a readable SPZ"),
+    "old.spz": (gzip.compress(struct.pack("<4sIIBBBB4x", b"NGSP", 1, 0, 0, 12, 0, 0)), "version 1"),
     "few.spz": (
         gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 10**9, 3, 12, 0, 0) + b"\0" * 99),
         "not a readable SPZ",
@@ -449,3 +427,13 @@ def test_all_views_as_nerfstudio_reads_them(chosen, tmp_path):
         assert np.array_equal(one.mask(), frame.mask())
     command(*given, "--force")
     assert len(load_cameras(tmp_path / "n")) == len(chosen.taken)
+
+
+@pytest.mark.parametrize("kind", ["glb", "spz", "compressed-ply"])
+def test_every_format_is_measured(chosen, tmp_path, kind):
+    pytest.importorskip("gsply_cpp")
+    model = in_srgb(chosen.gaussians)
+    right = evaluate(model, chosen.dataset)["all"]["psnr"]
+    path = written(tmp_path, kind, model)
+    assert evaluate(path, chosen.dataset)["all"]["psnr"] == pytest.approx(right, abs=0.1)
+    assert path.with_suffix(".metrics.json").is_file()

@@ -9,6 +9,7 @@ import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -73,7 +74,7 @@ class Gltf:
             return base64.b64decode(uri.partition("base64,")[2])
         if self.resolve is None:
             raise InputError(f"{self.path}: names the file {uri}; export it as one GLB")
-        return self.resolve(uri)
+        return self.resolve(unquote(uri))
 
     def bytes_of(self, view: int) -> bytes:
         """Bytes of a buffer view."""
