@@ -25,7 +25,7 @@ from mgs.errors import InputError, Notice
 from mgs.gaussians import Gaussians
 from mgs.images import read_mask
 from mgs.report.evaluation import compare_models, evaluate
-from mgs.report.exporting import in_srgb, to_y_up
+from mgs.report.exporting import difference, in_srgb, to_y_up
 from mgs.rotation import rotmat_from_quat
 from mgs.run.folder import open_run
 from mgs.splat import reference, render
@@ -152,6 +152,10 @@ def test_a_model_far_from_the_origin(tmp_path):
         written(tmp_path, "compressed-ply", far)
     assert far.counted_from(np.subtract(place, 1)).origin == (1, 1, 1)
     assert near.counted_from(place) == near
+    faint = replace(far, sh=0.5 * far.sh)
+    assert difference(far, faint) == pytest.approx(
+        difference(near, replace(faint, origin=near.origin))
+    )
 
 
 def test_numbers_that_mean_no_number(tmp_path):

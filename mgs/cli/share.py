@@ -73,6 +73,7 @@ def export(
         shown = gaussians
         if shown.linear and colour_space == "srgb":
             shown = _in_srgb(model, gaussians)
+        shown = replace(shown, origin=gaussians.origin)
         shown = shown.with_degree(max(sh or 0, shown.sh_degree))
         write_gaussians(path, shown, to, to_y_up(up))
         megabytes = path.stat().st_size / 1e6

@@ -91,11 +91,11 @@ def difference(one: Gaussians, other: Gaussians) -> float:
     views from all sides."""
     centre = one.means.mean(0, dtype=np.float64)
     radius = max(float(np.percentile(np.linalg.norm(one.means - centre, axis=1), 99)), 1e-6)
-    K = np.array([[320, 0, 160], [0, 320, 120], [0, 0, 1]])
+    K, back = np.array([[320, 0, 160], [0, 320, 120], [0, 0, 1]]), np.negative(one.origin).tolist()
     pictures = []
     for turn in 2 * np.pi * np.arange(AROUND) / AROUND:
         eye = centre + 3 * radius * np.array([np.cos(turn), np.sin(turn), np.sin(2 * turn)])
-        camera = Camera(K, 320, 240, look_at(eye, centre))
+        camera = Camera(K, 320, 240, look_at(eye, centre)).seen_from(back)
         pictures.append([srgb_from_linear(render_view(g, camera)[0]) for g in (one, other)])
     return psnr(*np.concatenate(pictures, 1))
 
