@@ -81,4 +81,4 @@ OPTIMISERS: dict[str, Optimiser] = {
     "natural": Optimiser(1, natural, uses_information=True),
     "adam": Optimiser(2, adam),
 }
-"""Optimisers by name (`mgs nbv --optimiser`). A program may add its own."""
+"""Optimisers by name (setting `train.optimiser`). A program may add its own."""
