@@ -32,8 +32,11 @@ TOLERANCE = 1e-3
 CLOSE = 1e-2
 """Gap at which `best_set` stops, as a share of the bound."""
 
-SECONDS = 20.0
-"""Time limit of a bound. A chosen constant."""
+NODES = 1000
+"""Most nodes of `best_set`. A chosen constant."""
+
+SECONDS = 60.0
+"""Time limit of a bound, by which its gap may depend on the machine. A chosen constant."""
 
 STEPS, EXCHANGES = 30, 3000
 """Most Newton steps of a bound, and exchanges of weight in each. Chosen constants."""
@@ -90,13 +93,17 @@ def _check_size(k: int, count: int) -> None:
 
 
 def best_set(
-    relaxation: Relaxation, plan: Sequence[int], gap: float = CLOSE, seconds: float = SECONDS
+    relaxation: Relaxation,
+    plan: Sequence[int],
+    gap: float = CLOSE,
+    most: int = NODES,
+    seconds: float = SECONDS,
 ) -> Best:
     """Improve a plan by branch and bound, and bound all sets of as many candidates.
 
-    Stops when the gain is within `gap` of the bound, or after `seconds`. Each node fixes some views
-    as taken and some as left out. The node with the largest bound is next, and branches on the view
-    whose weight is nearest to 1/2. Raises InputError as `upper_bound`.
+    Stops when the gain is within `gap` of the bound, after `most` nodes, or after `seconds`. Each
+    node fixes some views as taken and some as left out. The node with the largest bound is next,
+    and branches on the view whose weight is nearest to 1/2. Raises InputError as `upper_bound`.
     """
     k, until = len(plan), time.monotonic() + seconds
     root = upper_bound(relaxation, k, seconds=seconds)
@@ -104,7 +111,7 @@ def best_set(
     heap = [(-root.value, 0, np.zeros(len(root.weights)), np.ones(len(root.weights)), root.weights)]
     closed, pushed, nodes = 0.0, 0, 0
     while heap and -heap[0][0] > (enough := max(gains.values()) / (1 - gap)):
-        if time.monotonic() > until:
+        if nodes == most or time.monotonic() > until:
             break
         parent, _, lo, hi, x = heapq.heappop(heap)
         nodes += 1
@@ -315,15 +322,15 @@ class Certificate:
 
 
 def certify(
-    relaxation: Relaxation, plan: Sequence[int], criterion: str, seconds: float = SECONDS
+    relaxation: Relaxation, plan: Sequence[int], criterion: str, most: int = NODES
 ) -> Certificate:
     """Certificate of a plan: `best_set` for as many views, and `upper_bound` for one less.
 
-    Raises InputError as `upper_bound`.
+    most: nodes of `best_set`. Raises InputError as `upper_bound`.
     """
     k, gain, count = len(plan), relaxation.gain(plan), relaxation.candidates
-    best = best_set(relaxation, plan, seconds=seconds)
-    fewer = upper_bound(relaxation, k - 1, seconds=seconds).value / gain if k > 1 else None
+    best = best_set(relaxation, plan, most=most)
+    fewer = upper_bound(relaxation, k - 1).value / gain if k > 1 else None
     of_all = gain / relaxation.gain(range(count))
     prices = (best.prices / best.bound).tolist()
     return Certificate(criterion, k, count, gain / best.bound, fewer, of_all, prices)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from mgs.policy.certificate import Certificate
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.page_plots import METRIC_NAMES
 from mgs.report.tables import table_cell, table_columns, table_heading, table_row
@@ -41,6 +42,8 @@ def notes(run: Run) -> list[str]:
             f"Its information gain is by the estimator {run.settings.estimator}: "
             "compare it with that of the same estimator only."
         )
+    if certificate := run.steps[0].get("certificate"):
+        lines.append(Certificate(**certificate).sentence())
     for step in run.steps:
         lines += [f"step {step['step']}: {warning}" for warning in step.get("warnings", [])]
     return lines

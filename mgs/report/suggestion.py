@@ -57,10 +57,20 @@ def numbers(run: Run, found: Suggestion) -> dict[str, Any]:
         "convention": CONVENTION,
         "units": units,
         "flight": {"metres": found.metres, "seconds": found.seconds},
+        "certificate": _certificate(found),
         "dropped": found.dropped,
         "plan": [_record(view) for view in found.plan],
         "ranking": [_record(view) for view in found.ranking],
     }
+
+
+def _certificate(found: Suggestion) -> dict[str, Any] | None:
+    """The certificate with prices by name of the candidate."""
+    if found.certificate is None:
+        return None
+    names = [view.name for view in found.ranking]
+    prices = dict(zip(names, found.certificate.prices, strict=True))
+    return asdict(found.certificate) | {"prices": prices}
 
 
 def _record(view: View) -> dict[str, Any]:
@@ -109,7 +119,9 @@ def _from_above(axis: Any, run: Run, found: Suggestion) -> None:
 
     images = level([frame.camera.position for frame in taken_in_order(run)])
     ranked = level([view.camera.position for view in found.ranking])
-    gains = [view.information_gain for view in found.ranking]
+    gains, label = [view.information_gain for view in found.ranking], f"gain ({GAIN_UNIT})"
+    if found.certificate:
+        gains, label = found.certificate.prices, "price: share of the largest gain"
     axis.scatter(*level(run.prior.points[::7]).T, s=0.5, color="#b0a898", rasterized=True)
     axis.scatter(*images.T, marker="^", s=26, color="black", label="images so far")
     dots = axis.scatter(*ranked.T, c=gains, s=18, cmap="viridis", label="candidates")
@@ -124,4 +136,4 @@ def _from_above(axis: Any, run: Run, found: Suggestion) -> None:
     unit = run.dataset.unit
     axis.set(aspect="equal", xlabel=f"x ({unit})", ylabel=f"y ({unit})")
     axis.set_title(f"from above: a flight of {found.metres:.1f} {unit}")
-    axis.figure.colorbar(dots, ax=axis, shrink=0.6, aspect=20, label=f"gain ({GAIN_UNIT})")
+    axis.figure.colorbar(dots, ax=axis, shrink=0.6, aspect=20, label=label)
