@@ -20,8 +20,6 @@ EXTRAS = {
     "jinja2": "page",
     "viser": "view",
     "tensorboardX": "tensorboard",
-    "distributed": "study",
-    "dask": "study",
 }
 """Modules that only some commands need -> extra of pyproject.toml that installs them."""
 

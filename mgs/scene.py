@@ -7,6 +7,7 @@ model fitted to them, and their Fisher information. No image of another view is 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Any, TypeVar
@@ -171,6 +172,12 @@ class Scene:
             self.memo[key] = make()
         return self.memo[key]
 
+    def with_seed(self, seed: int) -> Scene:
+        """The same scene with another seed of the policies' draws; computed values are kept."""
+        other = copy(self)
+        object.__setattr__(other, "settings", self.settings.model_copy(update={"seed": seed}))
+        return other
+
     def rng(self, state: State, name: str) -> np.random.Generator:
         """Random generator of a policy, new in each step."""
         return generator(self.settings.seed, f"{name}/{state.step + 1}")
@@ -317,6 +324,27 @@ def captured(scene: Scene, frames: tuple[Frame, ...], views: Sequence[int]) -> t
     return tuple(result)
 
 
+def fit_views(
+    scene: Scene,
+    frames: Sequence[Frame],
+    taken: Sequence[int],
+    before: State | None = None,
+    train: TrainSettings | None = None,
+) -> tuple[Fit, np.ndarray | None]:
+    """Fit to the views taken; returns the fit, and the exposure of these views [V,3], if estimated.
+
+    frames: all frames, those taken as they were captured. before: the last state, where the fit
+    starts; by default it starts at the prior. train: settings of the fit, by default the scene's.
+    """
+    shown = tuple(frames[i] for i in taken)
+    gains = scene.measured_exposure(shown) if scene.settings.exposure else None
+    model, settings = scene.start(shown), scene.settings.train
+    if before is not None:
+        old = scene.start(tuple(frames[i] for i in before.taken))
+        model, settings = warm_start(before.gaussians, old, model), scene.settings.train_at(1)
+    return scene.fitted(model, shown, gains, train or settings), gains
+
+
 def learn(
     scene: Scene,
     taken: Sequence[int],
@@ -331,26 +359,20 @@ def learn(
     choices: recorded in the result. Raises DivergedError, and InputError if a frame cannot be read.
     """
     taken = tuple(taken)
+    seeds = before.seeds if before else len(taken)
     if frames is None:
         frames = before.frames if before else scene.frames
     new = taken[len(before.taken) :] if before else taken
     frames = captured(scene, frames, new)
-    shown = tuple(frames[i] for i in taken)
     for i in new:
         scene.image(frames[i])
-    gains = scene.measured_exposure(shown) if scene.settings.exposure else None
-    model, train = scene.start(shown), scene.settings.train
-    if before is not None:
-        old = scene.start(tuple(frames[i] for i in before.taken))
-        model, train = warm_start(before.gaussians, old, model), scene.settings.train_at(1)
-    result = scene.fitted(model, shown, gains, train)
-    seeds = before.seeds if before else len(taken)
-    if result.stop_reason == StopReason.DIVERGED:
-        raise DivergedError(len(taken) - seeds, result.losses)
-    H = information(scene, result.gaussians, shown)
-    state = State(frames, taken, seeds, result.gaussians, H, H, fit=result)
+    fit, exposure = fit_views(scene, frames, taken, before)
+    if fit.stop_reason == StopReason.DIVERGED:
+        raise DivergedError(len(taken) - seeds, fit.losses)
+    H = information(scene, fit.gaussians, [frames[i] for i in taken])
+    state = State(frames, taken, seeds, fit.gaussians, H, H, fit=fit, exposure=exposure)
     surface = surface_information(scene, state, new, before)
-    return replace(state, surface=surface, exposure=gains, choices=tuple(choices))
+    return replace(state, surface=surface, choices=tuple(choices))
 
 
 def information(scene: Scene, model: Gaussians, frames: Sequence[Frame]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Run commands of the program in this process, and read the steps of a run."""
+"""Run commands of the program and studies in this process, and read the steps of a run."""
 
 import json
 from collections.abc import Callable
@@ -10,6 +10,7 @@ import pytest
 from mgs.cli.app import main
 from mgs.report.runs import compare_runs
 from mgs.report.tables import comparison_rows
+from studies.commands import start
 
 
 def exit_code(*arguments) -> int:
@@ -22,6 +23,13 @@ def exit_code(*arguments) -> int:
 def command(*arguments) -> None:
     """Run `mgs ARGUMENTS`; fails unless it exits with 0."""
     assert exit_code(*arguments) == 0
+
+
+def study(name, *arguments, exit_code=0) -> None:
+    """Run `python -m studies.NAME ARGUMENTS`; fails unless it exits with this code."""
+    with pytest.raises(SystemExit) as stop:
+        start(name, [str(argument) for argument in arguments])
+    assert stop.value.code == exit_code
 
 
 def said(capsys) -> tuple[str, str]:

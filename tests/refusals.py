@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from mgs.cli.app import main
+from studies.commands import start
 
 
 def listing(root: Path) -> dict[str, bytes | None]:
@@ -15,17 +16,17 @@ def listing(root: Path) -> dict[str, bytes | None]:
     }
 
 
-def refused(capsys, arguments: list, out: Path | None = None) -> str:
-    """Run `mgs ARGUMENTS`; check that one line is printed, the exit code is 2, and `out` is
-    unchanged; return the line."""
-    before = listing(out) if out else None
+def refused(capsys, arguments: list, out: Path | None = None, study: str = "") -> str:
+    """Run `mgs ARGUMENTS`, or a study of this name; check that one line is printed, the exit code
+    is 2, and `out` is unchanged; return the line."""
+    before, words = listing(out) if out else None, [str(argument) for argument in arguments]
     with pytest.raises(SystemExit) as stop:
-        main([str(argument) for argument in arguments])
+        start(study, words) if study else main(words)
     error = capsys.readouterr().err
     assert stop.value.code == 2, error
     lines = error.splitlines()
     assert len(lines) == 1, error
-    assert lines[0].startswith("mgs: ")
+    assert lines[0].startswith(f"{study or 'mgs'}: ")
     if out:
         assert listing(out) == before, "something was left behind"
     return lines[0]

@@ -1,11 +1,12 @@
-"""`mgs bench`: what is timed and written."""
+"""`python -m studies.bench`: what is timed and written."""
 
 import pytest
 import tiny
+from program import study
+from refusals import refused
 
-from mgs import bench as core
-from mgs.cli.app import main
 from mgs.files import read_json
+from studies import bench as core
 
 
 def test_cold_keeps_no_lists(monkeypatch):
@@ -25,14 +26,14 @@ def test_cold_keeps_no_lists(monkeypatch):
 @pytest.mark.slow
 def test_times_every_operation_and_writes_json(monkeypatch, capsys, tmp_path):
     json = tmp_path / "a b.json"
-    arguments = ["bench", "--gaussians", "1000", "--repeats", "3", "--json", str(json)]
-    monkeypatch.setattr("sys.argv", ["/somewhere/bin/mgs", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code == 0
+    arguments = ["--gaussians", "1000", "--repeats", "3", "--json", str(json)]
+    monkeypatch.setattr("sys.argv", ["/somewhere/studies/bench.py", *arguments])
+    study("bench", *arguments)
     written = read_json(json)
-    assert written["command"] == f"mgs bench --gaussians 1000 --repeats 3 --json '{json}'"
+    line = f"python -m studies.bench --gaussians 1000 --repeats 3 --json '{json}'"
+    assert written["command"] == line
     own = {"forward_cold", "forward_warm", "gradient_warm", "fisher_exact", "fisher_block"}
     assert set(written["seconds"]) == own | {"volprim_forward", "volprim_gradient"}
     assert all(value > 0 for value in [*written["seconds"].values(), *written["ratios"].values()])
     assert "forward warm speedup" in capsys.readouterr().out
+    assert "is there already" in refused(capsys, ["--json", json], tmp_path, "bench")

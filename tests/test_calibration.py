@@ -1,8 +1,6 @@
 """Predicted errors: their terms against the oracle, and the measures of calibration on errors whose
 truth is known."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,8 +11,11 @@ from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.images import write_png
-from mgs.report import calibration, predicted_error
-from mgs.report.calibration import (
+from mgs.run.folder import Run
+from mgs.run.settings import NbvSettings
+from mgs.splat import reference
+from studies import calibration, predicted_error
+from studies.calibration import (
     ause,
     ause_of_constant,
     crps,
@@ -22,9 +23,6 @@ from mgs.report.calibration import (
     judged,
     sparsification,
 )
-from mgs.run.folder import Run
-from mgs.run.settings import NbvSettings
-from mgs.splat import reference
 
 N = 20_000
 
@@ -148,7 +146,7 @@ def test_crps_against_the_integral_that_defines_it():
 @pytest.mark.parametrize(
     ("trained", "changes", "said"),
     [
-        (5, {}, "has 5 images; calibrate leaves out a third of them, and needs 6 or more"),
+        (5, {}, "has 5 images; calibration leaves out a third of them, and needs 6 or more"),
         (7, {"train": {"means": "free"}}, "learns means"),
         (7, {"exposure": True}, "estimates exposure"),
         (8, {}, "was trained on all views there are"),
@@ -158,6 +156,6 @@ def test_runs_that_cannot_be_calibrated(trained, changes, said, tmp_path):
     frames = tuple(Frame(name, make_camera(), 0.0, None, None, None) for name in "abcdefgh")
     given_settings = NbvSettings(dataset="d", prior="p", **changes)
     run = Run(tmp_path, given_settings, Dataset(tmp_path, frames))
-    run.state = SimpleNamespace(taken=range(trained))
+    run.steps = [{"seeds": list(range(trained))}]
     with pytest.raises(InputError, match=said):
         predicted_error._views(run)

@@ -1,4 +1,4 @@
-"""`mgs chart`: times, commands of rows, presets; and a whole chart of a tiny rock."""
+"""Charts: times, commands of rows, presets; and a whole chart of a tiny rock."""
 
 import csv
 import json
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import tiny
 import typer
-from program import command
+from program import study
 from refusals import refused
 
 from mgs.cli.app import app
@@ -20,7 +20,8 @@ from mgs.errors import InputError
 from mgs.fit.settings import ALPHA_WEIGHT, COLOURS_ALONE, TrainSettings
 from mgs.run.nbv import run_nbv, start_run
 from mgs.run.settings import PRESETS, NbvSettings, with_defaults
-from mgs.study import case, chart, photographs, timing
+from studies import case, chart, photographs, timing
+from studies.commands import program
 
 
 def test_times_are_ratios_to_a_reference_that_is_timed_beside_each_call(monkeypatch):
@@ -56,8 +57,11 @@ COMMANDS = typer.main.get_command(app).commands
 
 
 def parsed(line):
-    """Parameters of a command line of mgs."""
+    """Parameters of a command line of mgs, or of a study."""
     words = shlex.split(line)
+    if words[:2] == ["python", "-m"]:
+        name = words[2].removeprefix("studies.")
+        return typer.main.get_command(program(name)).make_context(name, words[3:]).params
     assert words[0] == "mgs"
     return COMMANDS[words[1]].make_context(words[1], words[2:]).params
 
@@ -153,7 +157,7 @@ def test_a_chart_is_measured_once_and_written(small, tmp_path, capsys, monkeypat
 
     monkeypatch.setattr(chart, "run_nbv", run)
     for _ in range(2):
-        command("chart", out, "--dataset", small, "--repeats", 1)
+        study("chart", out, "--dataset", small, "--repeats", 1)
         told = capsys.readouterr().out
         times.append({p: p.stat().st_mtime_ns for p in out.glob("cells/**/result.json")})
     assert "/prior" not in told  # the second time all was there
@@ -165,8 +169,8 @@ def test_a_chart_is_measured_once_and_written(small, tmp_path, capsys, monkeypat
         assert len(rows) == len(record["rows"])
         assert all(parsed(row["command"]) for row in rows)
         assert any(row["front"] for row in record["rows"])
-        line = f"mgs chart {out} --only {kind} --scale quick --repeats 1 --dataset {small}"
-        assert record["command"] == line
+        line = f"{out} --only {kind} --scale quick --repeats 1 --dataset {small}"
+        assert record["command"] == f"python -m studies.chart {line}"
         assert line in (out / f"{kind}.md").read_text()
         assert (out / f"{kind}.png").stat().st_size > 10_000
     assert [row["total_passes"] for row in written["fit"]["rows"]] == [2, 1]
@@ -179,26 +183,23 @@ def test_photographs_are_charted_beside_another_program(dataset, tmp_path, capsy
     tiny.write_dataset(dataset / "test", frames=3)
     monkeypatch.setitem(photographs.PASSES, "quick", (1, 2))
     peer, out = tmp_path / "other.csv", tmp_path / "chart"
-    only = ["chart", out, "--only", "photographs"]
-    charted = [*only, "--dataset", dataset, "--gaussians", "60"]
+    charted = [out, "--dataset", dataset, "--gaussians", "60"]
     second = Path(shutil.copytree(dataset, tmp_path / "second"))
     namesake = shutil.copytree(dataset, tmp_path / "other" / "second")
     for text in ("psnr\n", "psnr\n1,x\n", "step\n1,5\n", "psnr\n0,9\n", "psnr\n1,inf\n"):
         peer.write_text(f"cpu_seconds,{text}")
-        assert "one row or more; correct it" in refused(capsys, [*charted, "--peer", peer], out)
+        line = refused(capsys, [*charted, "--peer", peer], out, "photographs")
+        assert "one row or more; correct it" in line
     peer.write_text("cpu_seconds,dataset,psnr\n0.5,third,20\n")
-    assert "third is not charted" in refused(capsys, [*charted, "--peer", peer], out)
+    line = refused(capsys, [*charted, "--peer", peer], out, "photographs")
+    assert "third is not charted" in line
     peer.write_text("cpu_seconds,step,psnr,dataset\n0.5,9,20,\n2,50,21.5,second\n")
-    several = ["chart", out, "--dataset", dataset, "--dataset", second]
-    for arguments, line in (
-        (only, "give --dataset"),
-        ([*several[:4], "--peer", peer], "--peer: is of photographs alone"),
-        (several, "takes more than one"),
-        ([*several, "--dataset", namesake], "have one name"),
-    ):
-        assert line in refused(capsys, arguments, out)
+    several = [out, "--dataset", second, "--dataset", namesake]
+    assert "have one name" in refused(capsys, several, out, "photographs")
+    no_tests = [out, "--dataset", tiny.write_dataset(tmp_path / "untested")]
+    assert "has no test views" in refused(capsys, no_tests, out, "photographs")
     charted += ["--dataset", second]
-    command(*charted, "--peer", peer)
+    study("photographs", *charted, "--peer", peer)
     record = json.loads((out / "photographs.json").read_text())
     ours, others = record["rows"][:4], record["rows"][4:]
     assert [row["dataset"] for row in ours] == [dataset.name] * 2 + ["second"] * 2

@@ -12,10 +12,9 @@ from mgs.fit.objective import objective
 from mgs.fit.settings import TrainSettings
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_gaussians
-from mgs.report.convergence import CONVERGED_SHARE, remaining_decrease
-from mgs.run.ending import fit_line
 from mgs.run.settings import NbvSettings
 from mgs.splat import as_drjit, groups
+from studies.convergence import CONVERGED_SHARE, remaining_decrease
 
 
 @pytest.fixture(scope="module")
@@ -73,11 +72,3 @@ def test_converged_is_said_at_the_minimum_alone(case):
     assert not away["converged"]
     left = away["phi"] * (1 - away["predicted_decrease"])
     assert left == pytest.approx(at_minimum["phi"], rel=0.1)
-
-
-def test_what_is_printed_says_which():
-    early = {"phi": 1.0, "predicted_decrease": 0.31, "converged": False}
-    line = fit_line(early, "pass-limit")
-    assert "ended as designed (pass-limit)" in line
-    assert "31 %" in line
-    assert "converged" in fit_line(early | {"converged": True}, "settled")

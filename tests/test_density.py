@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mgs.bench import surface_camera, surface_gaussians
 from mgs.errors import InputError
 from mgs.fit import density, fitting
 from mgs.fit.density import MOST_COPIES, Slopes, Statistics, adapt, relocate, split, statistics
@@ -14,6 +13,7 @@ from mgs.fit.objective import objective
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.rotation import rotmat_from_quat
 from mgs.splat import as_drjit, reference, render
+from studies.bench import surface_camera, surface_gaussians
 
 
 @pytest.mark.parametrize("opacity", [0.01, 0.5, 0.99])

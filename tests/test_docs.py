@@ -22,6 +22,7 @@ from mgs.splat import ESTIMATORS, constants
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE
 from mgs.splat_ply import write_ply
 from mgs.synth.scene_file import SceneFile
+from studies.commands import program
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -106,7 +107,8 @@ def test_every_link_and_picture_leads_somewhere(page):
 
 
 def command_lines(page):
-    """Yield (words, whether the line stands in a block) of every `mgs ...` of a page."""
+    """Yield (words, whether the line stands in a block) of every `mgs ...` and `python -m
+    studies.NAME ...` of a page, as NAME ..."""
     for token in MARKDOWN.parse(page.read_text(encoding="utf-8")):
         if token.type == "fence" and token.info in ("", "sh"):
             lines = [(line, True) for line in token.content.splitlines()]
@@ -114,22 +116,24 @@ def command_lines(page):
             code = [child for child in token.children or [] if child.type == "code_inline"]
             lines = [(child.content, False) for child in code]
         for line, whole in lines:
-            if re.match(r"mgs [a-z]", line):
-                yield shlex.split(line, comments=True), whole
+            if match := re.match(r"(mgs |python -m (?=studies\.))(?=[a-z])(?!studies\.NAME)", line):
+                yield shlex.split(line[match.end() :], comments=True), whole
 
 
 def wrong_command(words, whole):
     """Error of a command line, else None. Options may stand in brackets."""
-    command = COMMANDS.get(words[1])
+    name, *rest = words
+    study = name.removeprefix("studies.")
+    command = COMMANDS.get(name) if study == name else typer.main.get_command(program(study))
     if command is None:
-        return f"no command {words[1]}"
-    options = {word.strip("[]") for word in words if word.strip("[").startswith("--")}
+        return f"no command {name}"
+    options = {word.strip("[]") for word in rest if word.strip("[").startswith("--")}
     known = {name for one in command.params for name in (*one.opts, *one.secondary_opts)}
     if not known | {"--help"} >= options:
-        return f"{words[1]} has no {options - known}"
-    if whole and not any(word.startswith("[") for word in words):
+        return f"{name} has no {options - known}"
+    if whole and not any(word.startswith("[") for word in rest):
         try:
-            command.make_context(words[1], words[2:])
+            command.make_context(name, rest)
         except typer.TyperException as error:
             return error.format_message()
     return None

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import synthetic
-from program import command, steps, timeless
+from program import command, said, steps, study, timeless
 
 from mgs.cli import app, demo
 from mgs.cli.app import COMMANDS, main
@@ -16,11 +16,11 @@ from mgs.evaluation import psnr_measure
 from mgs.images import read_exr
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_gaussians
-from mgs.report import predicted_error
 from mgs.run.policies import POLICIES
 from mgs.splat import ListCache
 from mgs.splat_ply import read_ply
 from mgs.synth.rendering import write_contact_sheet
+from studies import predicted_error
 
 pytestmark = pytest.mark.usefixtures("coarse_priors")
 
@@ -110,7 +110,7 @@ def test_ctrl_c_inside_a_call_of_drjit_is_one_line_too(capsys, monkeypatch):
         raise RuntimeError("broken")
 
     # The other commands write nothing before they are done, or start anew.
-    goes_on = ("synth-orbit", "import", "demo", "reproduce", "chart", "stress", "parsimony")
+    goes_on = ("synth-orbit", "import", "demo")
     monkeypatch.setattr(app, "app", stopped)
     for name in COMMANDS:
         with pytest.raises(SystemExit) as stop:
@@ -123,9 +123,16 @@ def test_ctrl_c_inside_a_call_of_drjit_is_one_line_too(capsys, monkeypatch):
         main(["doctor"])
 
 
+def test_a_short_fit_is_not_called_converged(run, capsys):
+    study("convergence", run)
+    line = said(capsys)[0]
+    assert "last fit: ended as designed (" in line
+    assert 0 < float(line.split()[-3]) < 100
+
+
 def test_errors_are_predicted_and_calibrated(run):
     """Shares inside the intervals, on the run's own views, are what they were fitted to be."""
-    command("diagnose", run, "--calibrate")
+    study("calibration", run)
     found = json.loads((run / "diagnostics/uncertainty.json").read_text())
     assert found["views"] == {"folds": 7, "held out": 3}
     rows = {(row["prediction"], row["views"]): row for row in found["rows"]}

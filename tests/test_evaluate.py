@@ -342,13 +342,6 @@ def test_what_has_changed_is_measured_again(dataset, prior, tmp_path, work, what
     assert work() == (0, VIEWS)
 
 
-def test_convergence_needs_the_prior(dataset, prior, tmp_path):
-    run = tiny.write_run(tmp_path / "run", dataset, prior)
-    prior.rename(tmp_path / "elsewhere")
-    with pytest.raises(InputError, match="prior"):
-        evaluate_run(run, pictures=False, convergence=True)
-
-
 def test_srgb_models_are_measured_as_they_blend():
     ours, camera = tiny.initial([]), tiny.orbit()[0]
     blended = evaluation.render_view(ours, camera)[0]

@@ -13,7 +13,7 @@ from mgs.errors import EXTRAS
 
 PROJECT = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]
 
-DISTRIBUTIONS = {"sklearn": "scikit-learn", "cv2": "opencv-python-headless", "dask": "distributed"}
+DISTRIBUTIONS = {"sklearn": "scikit-learn", "cv2": "opencv-python-headless"}
 """Module -> package that brings it, where the names differ."""
 
 CORE = """

@@ -50,9 +50,9 @@ from mgs.report.runs import compare_runs
 from mgs.run.candidates import Site, read_poses, refusals
 from mgs.run.folder import open_run
 from mgs.splat_ply import read_ply, write_ply
-from mgs.study.sweep import Cell, found
 from mgs.synth.scene_file import load_scene_file
 from mgs.view.subject import read_subject
+from studies.sweep import Cell, found
 
 FLOATS = (float("nan"), float("inf"), -1.0, 0.0, 1e-300)
 NUMBERS = [struct.pack(form, n) for form in ("<I", ">I", "<Q") for n in (0, 1, 255, 2**32 - 1)]

@@ -249,7 +249,6 @@ def test_the_loser_is_told_who_works_there(capsys, dataset, prior, tmp_path):
             ["synth-orbit", out],
             ["import", dataset, "--out", out],
             ["render", tmp_path / "a.ply", "--cameras", dataset, "--out", out],
-            ["stress", out],
         ],
         atomic_folder: [["survey", dataset, "--out", out], ["prior", dataset, "--out", out]],
     }

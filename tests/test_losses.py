@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import correlate1d
 
-from mgs.bench import surface_camera, surface_gaussians
 from mgs.colour import srgb_from_linear
 from mgs.fit.fitting import fit
 from mgs.fit.losses import LOSSES, similarity
@@ -14,6 +13,7 @@ from mgs.fit.settings import TrainSettings
 from mgs.memory import padded
 from mgs.metrics import _similarity
 from mgs.splat import render
+from studies.bench import surface_camera, surface_gaussians
 
 HEIGHT, WIDTH = 14, 17
 

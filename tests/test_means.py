@@ -19,7 +19,6 @@ from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
 from mgs.policy.criteria import DIRECTIONAL_STD, MEAN_STD
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_normals
-from mgs.report.convergence import remaining_decrease
 from mgs.report.diagnostics import diagnose
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
@@ -27,6 +26,7 @@ from mgs.run.nbv import resume_nbv, run_nbv, start_run
 from mgs.run.settings import NbvSettings
 from mgs.splat import MEANS, as_drjit, fisher, groups, render
 from mgs.view.subject import SCALARS, read_subject
+from studies.convergence import remaining_decrease
 
 N, SPACING = 300, (4 * np.pi / 300) ** 0.5
 MOVING = ("normal", "free")

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mgs.bench import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
 from mgs.fit.fitting import fit
@@ -13,6 +12,7 @@ from mgs.fit.objective import newton_decrease, objective
 from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians, learned
 from mgs.splat import as_drjit, reference
+from studies.bench import surface_camera, surface_gaussians
 
 N = 60
 LAM = {"colour": 0.02, "scale": 0.05, "rotation": 0.1, "opacity": 0.01, "mean": 30.0}

@@ -14,8 +14,6 @@ UP = "expected auto, or three numbers"
 OPTIONS: dict[str, list[tuple[str, str]]] = {
     "": [
         ("fly", "fly"),
-        ("bench --json .", "is a folder; name a file"),
-        ("chart {out} --dataset {data}", "has no test views"),
         ("dataset check {long}", "File name too long"),
         ("eval {out}", "no such run folder or"),
         ("dataset check {out}", "no such dataset folder"),
@@ -109,16 +107,6 @@ OPTIONS: dict[str, list[tuple[str, str]]] = {
     "prior {rock} --out {out} --mesh {rock}/rock.glb": [
         ("--spacing 1e-300", "samples take about"),
         ("--gaussians 100 --holes 0.2", "holes"),
-    ],
-    "reproduce {out}": [
-        ("--only table2", "unknown; choose some of table1,figures,setups,flights,survey,oracle"),
-        ("--rocks 13", "--rocks 13: setups can have 1 to 12"),
-        ("--workers 2 --scheduler tcp://x:1", "give one of them"),
-        ("--policy uniform", "--policy uniform: is compared anyway"),
-        ("--policy angle --policy angle", "angle: there is one of this name already"),
-        ("--policy block-d --only table1", "is for setups, survey, oracle, of which --only"),
-        ("--mesh none.glb", "none.glb: cannot be read (No such file or directory)"),
-        ("--mesh a.glb --only table1", "is for results over many rocks, and --only leaves them"),
     ],
 }
 """Beginning of a command -> its options, and words of the line."""

@@ -92,7 +92,6 @@ def test_force_replaces_what_the_command_made_and_nothing_else(capsys, dataset, 
 
 ONE_FILE = {
     "report {run} --html {out}/kept.html": "kept.html",
-    "bench --json {out}/kept.json": "kept.json",
     "simplify {run}": "run/gaussians_pruned.ply",
 }
 """Command -> the file that it would write."""

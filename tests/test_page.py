@@ -38,10 +38,7 @@ def runs(tmp_path_factory):
         settings = tiny.start(out, dataset, policy=policy, budget=3, evaluate_every=1)
         settings = settings.model_copy(update={"budget": budget})
         tiny.go(out, settings, dataset)
-    metrics = evaluate_run(root / "d-optimal", pictures=False)
-    # A stand-in: there is no prior to measure it by.
-    fit = {"phi": 1.0, "predicted_decrease": 0.004, "converged": True}
-    write_json(root / "d-optimal/metrics.json", metrics | {"fit": fit})
+    evaluate_run(root / "d-optimal", pictures=False)
     (root / "d-optimal/diagnostics").mkdir()
     (root / "d-optimal/diagnostics/kf_0001.exr").write_bytes(b"")
     return [root / "d-optimal", root / "random"]
@@ -78,7 +75,6 @@ def test_the_page_says_what_the_files_say(page, runs):
     assert parsed.text.count("Unfinished") == 1
     assert "Not measured: `mgs eval" in parsed.text
     steps = read_steps(runs[0])
-    assert "Last fit: converged; at its minimum the objective is predicted" in parsed.text
     plots = {plot["title"]: plot["data"] for plot in data["plots"]}
     gain, both = plots["Information gain of each chosen view (the paper's Fig. 2)"]
     assert gain["y"] == [step["information_gain"] for step in steps[1:]]

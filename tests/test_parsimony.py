@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import synthetic
 import trimesh
-from program import command
+from program import command, study
 
 from mgs.camera import Camera, look_at
 from mgs.data.meshes import Mesh
@@ -16,9 +16,9 @@ from mgs.policy.criteria import PIXEL_NOISE
 from mgs.prior.build import _samples, build_prior, prior_from_mesh
 from mgs.prior.resolution import PIXELS_OF_PHOTOGRAPHS, PIXELS_PER_SAMPLE, resolution
 from mgs.prior.settings import PriorSettings
-from mgs.study import case, parsimony
-from mgs.study.case import Size
-from mgs.study.verdict import judged
+from studies import case, parsimony
+from studies.case import Size
+from studies.verdict import judged
 
 
 def square():
@@ -157,7 +157,7 @@ def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(case, "make_dataset", make_dataset)
     out = tmp_path / "out"
     for _ in range(2):
-        command("parsimony", out)
+        study("parsimony", out)
     assert calls == ["boulder"]
     record = json.loads((out / "parsimony.json").read_text())
     with open(out / "parsimony.csv") as file:

@@ -12,8 +12,8 @@ from mgs.provenance import command_line, versions
 @pytest.mark.parametrize(
     ("typed", "said"),
     [
-        (["/usr/bin/mgs", "chart", "out"], "mgs chart out"),
-        (["/lib/mgs/__main__.py", "chart", "out dir"], "mgs chart 'out dir'"),  # python -m mgs
+        (["/usr/bin/mgs", "nbv", "out"], "mgs nbv out"),
+        (["/lib/mgs/__main__.py", "nbv", "out dir"], "mgs nbv 'out dir'"),  # python -m mgs
         (["tools/ranking.py", "a.json"], "ranking.py a.json"),
     ],
 )

@@ -14,7 +14,6 @@ from program import change_settings, command
 from refusals import refused
 from scipy.stats import multivariate_normal
 
-from mgs.bench import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
 from mgs.fit.evidence import (
@@ -40,6 +39,7 @@ from mgs.run.nbv import run_nbv
 from mgs.run.settings import NbvSettings
 from mgs.splat import render
 from mgs.splat_ply import read_ply
+from studies.bench import surface_camera, surface_gaussians
 
 VIEWS = 8
 SETTINGS = NbvSettings(dataset="data", prior="prior")

@@ -1,4 +1,4 @@
-"""`mgs reproduce` on ellipsoids of 200 Gaussians: cells, tables, and bad input."""
+"""Table I, set-ups and flights on ellipsoids of 200 Gaussians: cells, tables, and bad input."""
 
 import csv
 import json
@@ -9,25 +9,28 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import synthetic
-import tiny
-from program import command, exit_code
+from program import study
 from refusals import occupied, refused
 
 from mgs.data.dataset import TEST_FOLDER
 from mgs.files import write_json
+from mgs.progress import no_progress
 from mgs.run.folder import read_checkpoint
-from mgs.run.loop import fit_views
-from mgs.study import case, flights, free_fit, reproduce, setups
-from mgs.study.case import Case, Rock, Size
-from mgs.study.oracle import foretold
-from mgs.study.reproduce import ReproduceSize, Run, RunSize
-from mgs.study.setups import SetupSize
-from mgs.study.sweep import cell_folder, run_cells
+from mgs.run.policies import Poses
+from mgs.scene import fit_views
 from mgs.survey import flight
 from mgs.survey.flight import SurveySettings, fly
+from studies import case, flights, free_fit, results, setups, table1
+from studies.case import Case, Rock, Size
+from studies.oracle import foretold
+from studies.setups import SetupSize
+from studies.sweep import cell_folder, run_cells
+from studies.table1 import ReproduceSize, Run, RunSize
 
+OWN = f"{Path(__file__).parent.parent / 'studies/policies.py'}:angle"
 ONE = RunSize(Size(48, 36, 8, 3, spp=1), 200, 2)
 FEW = SetupSize(48, 36, 3, 1, 6, fewer=4, gaussians=200)
 TINY = ReproduceSize(ONE, FEW, FEW, setup_rocks=2, oracle_rocks=1)
@@ -47,13 +50,13 @@ def ellipsoids(root, out, scene, seed, size, changes=None, mesh=None):
 @pytest.fixture
 def quick(monkeypatch):
     """The preset `quick` is tiny, nothing is rendered, and few policies are compared."""
-    monkeypatch.setitem(reproduce.SIZES, "quick", TINY)
+    monkeypatch.setitem(table1.SIZES, "quick", TINY)
     monkeypatch.setattr(case, "make_dataset", ellipsoids)
     for name in set(setups.SETUPS) - {"ring", "one seed"}:
         monkeypatch.delitem(setups.SETUPS, name)
     for module, values in {
         setups: {"JUDGE_PASSES": 2, "DRAWS": 2},
-        reproduce: {
+        table1: {
             "POLICIES": ("directional-d", "random"),
             "TABLE_POLICIES": ("d-optimal", "random"),
             "SLOW_POLICIES": (),
@@ -66,7 +69,7 @@ def quick(monkeypatch):
 
 
 def done(capsys, *arguments):
-    command("reproduce", *arguments)
+    study(*arguments)
     return capsys.readouterr().out
 
 
@@ -78,10 +81,10 @@ def rows_of(path):
 def test_setups_are_made_once_and_compare_a_policy_of_ones_own(
     quick, tmp_path, capsys, monkeypatch
 ):
-    out, line = tmp_path / "out", "mgs reproduce --scale quick --only setups --rocks 2"
+    out, line = tmp_path / "out", "python -m studies.setups OUT --scale quick --rocks 2"
     with monkeypatch.context() as patched:
         patched.setattr(setups, "learn", None)  # these policies need no model to choose
-        assert "setups dataset/boulder-11" in done(capsys, out, "--only", "setups", "--rocks", 2)
+        assert "dataset/boulder-11" in done(capsys, "setups", out, "--rocks", 2)
     folder = out / "results"
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert set(before) == {"setups.csv", "setups.json", "setups.md", "setups.png", "leads.csv"}
@@ -94,19 +97,19 @@ def test_setups_are_made_once_and_compare_a_policy_of_ones_own(
     cells = [json.loads(path.read_text()) for path in out.glob("cells/setup/**/result.json")]
     assert len(cells) >= 8
     assert {len(set(cell["found"]["taken"])) for cell in cells} == {6}
-    again = done(capsys, out, "--only", "setups", "--rocks", 2)
+    again = done(capsys, "setups", out, "--rocks", 2)
     assert "setup/" not in again, "a cell was done twice"
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
     mine = tmp_path / "mine.py"
     mine.write_text("def first(candidates):\n    return -1.0 * (candidates[:, 0] > -9)\n")
-    one = (out, "--only", "setups", "--rocks", 1, "--policy", f"{mine}:first")
+    one = ("setups", out, "--rocks", 1, "--policy", f"{mine}:first")
     said = done(capsys, *one)
     assert "mine.py:first" in said
     assert "directional-d" not in said, "the other policies are not run again"
     rows = rows_of(folder / "setups.csv")
-    assert {row["policy"] for row in rows} == {*reproduce.POLICIES, "mine.py:first"}
-    line = "mgs reproduce --scale quick --only setups --rocks 1 --policy mine.py:first"
+    assert {row["policy"] for row in rows} == {*table1.POLICIES, "mine.py:first"}
+    line = "python -m studies.setups OUT --scale quick --rocks 1 --policy mine.py:first"
     assert {row["command"] for row in rows} == {line}
     mine.write_text("def first(candidates):\n    return candidates[:, 0]\n")
     assert "mine.py:first" in done(capsys, *one), "another file is another policy"
@@ -115,13 +118,13 @@ def test_setups_are_made_once_and_compare_a_policy_of_ones_own(
 def test_flights_keep_their_length_and_are_compared_with_even_spacing(
     quick, tmp_path, capsys, monkeypatch
 ):
-    def fit_one_pass(problem, views):
-        train = problem.settings.train.model_copy(update={"passes": 1})
-        return fit_views(problem.with_settings(train=train), views)
+    def fit_one_pass(scene, frames, views):
+        train = scene.settings.train.model_copy(update={"passes": 1})
+        return fit_views(scene, frames, views, train=train)
 
     monkeypatch.setattr(flights, "fit_views", fit_one_pass)
     out = tmp_path / "out"
-    done(capsys, out, "--only", "flights", "--rocks", 1)
+    done(capsys, "flights", out, "--rocks", 1)
     rows = rows_of(out / "results/flights.csv")
     kinds = len(flights.FLIERS) * len(flights.LENGTHS)
     even = [row for row in rows if row["policy"] == flights.EVEN]
@@ -157,7 +160,8 @@ def test_a_survey_without_errors_changes_nothing(quick, tmp_path, capsys, monkey
 
     monkeypatch.setattr(flight, "fly", without_errors)
     out = tmp_path / "out"
-    done(capsys, out, "--only", "survey,setups", "--rocks", 1)
+    done(capsys, "setups", out, "--rocks", 1)
+    done(capsys, "survey", out, "--rocks", 1)
     assert len(surveyed) == 1
     assert (out / "results/survey-leads.csv").is_file()
     rows, without = (rows_of(out / f"results/{name}.csv") for name in ("survey", "setups"))
@@ -174,16 +178,16 @@ def test_rocks_of_ones_own_take_the_place_of_the_others(quick, tmp_path, capsys,
         return ellipsoids(root, out, scene, seed, size)
 
     monkeypatch.setattr(case, "make_dataset", seen)
-    monkeypatch.setattr(reproduce, "POLICIES", ("uniform", "random"))
+    monkeypatch.setattr(table1, "POLICIES", ("uniform", "random"))
     out, meshes = tmp_path / "out", [tmp_path / "one.ply", tmp_path / "two.glb"]
     for mesh in meshes:
         mesh.write_text(mesh.name)
     given = [part for mesh in meshes for part in ("--mesh", mesh)]
-    said = done(capsys, out, "--only", "setups", *given)
+    said = done(capsys, "setups", out, *given)
     assert set(rendered) == {("boulder", "one.ply"), ("boulder", "two.glb")}
-    assert "setups dataset/one-" in said
+    assert "dataset/one-" in said
     assert {row["scene"] for row in rows_of(out / "results/setups.csv")} == {"one", "two"}
-    line = "mgs reproduce --scale quick --only setups --rocks 2 --mesh one.ply --mesh two.glb"
+    line = "python -m studies.setups OUT --scale quick --rocks 2 --mesh one.ply --mesh two.glb"
     assert {row["command"] for row in rows_of(out / "results/setups.csv")} == {line}
     twice = ["--mesh", meshes[0], "--mesh", tmp_path / "out/../one.ply"]
     for options, line in (
@@ -191,9 +195,9 @@ def test_rocks_of_ones_own_take_the_place_of_the_others(quick, tmp_path, capsys,
         ([part for _ in range(21) for part in ("--mesh", meshes[0])], "--mesh: 21 files"),
         (twice, "one.ply: there is one of this name already"),
     ):
-        assert line in refused(capsys, ["reproduce", out, *options], out)
+        assert line in refused(capsys, [out, *options], out, "setups")
     meshes[0].write_text("another rock")
-    again = done(capsys, out, "--only", "setups", *given)
+    again = done(capsys, "setups", out, *given)
     assert "dataset/one-" in again, "another file is another rock"
     assert "/two-" not in again
 
@@ -244,7 +248,7 @@ def test_a_run_and_3dgs_are_timed_alone_and_measured_on_all_views(quick, tmp_pat
     rock, row = Rock("boulder", 1), "3DGS, random points, twice the steps"
     runs = Run(rock, ONE, "farthest", budget=4), Run(rock, ONE, row, seeds=8, budget=0)
     run, free = (one.cells()[-1] for one in runs)
-    results = run_cells(tmp_path, [cell for one in runs for cell in one.cells()], tiny.silent)
+    results = run_cells(tmp_path, [cell for one in runs for cell in one.cells()], no_progress)
     for cell in (run, free):
         found = results[cell.name]
         assert cell.alone
@@ -274,7 +278,7 @@ def linger():
     time.sleep(100)
 
 if __name__ == "__main__":
-    from mgs.study.case import in_new_process
+    from studies.case import in_new_process
 
     in_new_process(linger, Path("cell"))
 """
@@ -311,18 +315,19 @@ def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, m
 
     monkeypatch.setattr(case, "time_policy", timed)
     monkeypatch.setattr(free_fit, "time_3dgs", timed)
+    monkeypatch.setattr(results, "_write_figures", lambda work: [])
     out, table = tmp_path / "out", tmp_path / "out/results/table1.md"
 
     def rows():
         return {row["row"]: row for row in rows_of(out / "results/table1.csv")}
 
-    assert exit_code("reproduce", out, "--only", "table1") == 130
+    study("table1", out, exit_code=130)
     assert "run the same command again to continue" in capsys.readouterr().err
     assert list(rows()) == ["d-optimal", "random, draw 1"]
     assert "| random, mean of 1 | 6 |" in table.read_text()
     left = "random, draw 2; coverage, fewer images; all views; 3DGS; 3DGS, random points"
     assert f"Not done yet: {left}.\n" in table.read_text()
-    done(capsys, out, "--only", "table1")
+    done(capsys, "table1", out)
     assert {name: row["images"] for name, row in rows().items()} == {
         "d-optimal": "6",
         "random, draw 1": "6",
@@ -338,17 +343,17 @@ def test_table_1_has_equal_counts_and_the_papers_rows(quick, tmp_path, capsys, m
     assert theirs in text
     assert "| d-optimal | 6 | 20.20 | " + ours.format("20.20") in text
     assert "| random, mean of 2 | 6 | 20.70 | " + ours.format("20.70") in text
-    assert "`mgs reproduce --scale quick --only table1`" in text
+    assert "`python -m studies.table1 OUT --scale quick`" in text
     assert "Not done yet" not in text
     line = rows()["random, draw 2"]["command"]
     assert line.startswith("mgs nbv cells/dataset/boulder-0/circle-1/8x48x36/dataset --prior ")
     assert line.endswith("--policy random --seeds 4 --budget 2 --seed 1000")
-    done(capsys, out, "--only", "table1", "--batch", 2)
+    done(capsys, "table1", out, "--batch", 2)
     ending = "--policy d-optimal --batch 2 --seeds 4 --budget 2 --seed 0"
     assert rows()["d-optimal"]["command"].endswith(ending)
     batches = [settings.get("batch") for settings in asked]
     assert batches == [None] * 8 + [2] * 5  # 3DGS is no run
-    assert "--only table1 --batch 2`" in table.read_text()
+    assert "studies.table1 OUT --scale quick --batch 2`" in table.read_text()
 
 
 def made_up(value, scenes):
@@ -386,7 +391,7 @@ def test_leads_are_over_scenes_and_corrected_for_all_tests():
 def test_an_oracle_that_sees_the_truth_is_best_in_its_first_choice(quick, tmp_path, monkeypatch):
     monkeypatch.setattr(setups, "JUDGE_PASSES", 10)
     size, rocks = replace(TINY.setups, images=5), TINY.some_rocks(1)
-    found = run_cells(tmp_path, setups.cells_of(size, rocks, ("oracle", "random")), tiny.silent)
+    found = run_cells(tmp_path, setups.cells_of(size, rocks, ("oracle", "random")), no_progress)
     ring = {name: r["test"] for name, r in found.items() if "/ring-" in name and "/oracle-" in name}
     others = [r["test"] for name, r in found.items() if "/ring-" in name and "/random-" in name]
     assert len(others) == setups.DRAWS
@@ -400,24 +405,38 @@ def test_an_oracle_that_sees_the_truth_is_best_in_its_first_choice(quick, tmp_pa
 
 
 def test_scores_equal_to_the_gains_foretell_them():
-    psnr = [20.0, 22.0, 21.0]
+    psnr = np.array([20.0, 22.0, 21.0])
     scores = {"right": psnr, "wrong": [3, 1, 2], "same": [1, 1, 1]}
 
-    def asked(policy):
-        return SimpleNamespace(policy=lambda _: scores[policy], context=lambda *_: None)
-
-    problem = SimpleNamespace(view_information=lambda _: None, with_settings=asked)
-    state = SimpleNamespace(gaussians=None)
-    found = foretold(tuple(scores), problem, state, [0, 1, 2], psnr)
+    rules = [
+        Poses(name, lambda candidates, *_, values=values: values) for name, values in scores.items()
+    ]
+    scene = SimpleNamespace(positions=lambda frames: np.zeros((3, 3)), centre=np.zeros(3))
+    state = SimpleNamespace(frames=[], taken=[0])
+    found = foretold(rules, scene, state, [0, 1, 2], psnr)
     assert found["right"] == {"spearman": 1, "regret": 0}
     assert found["wrong"] == {"spearman": -1, "regret": 2}
     assert found["same"] == {"spearman": 0, "regret": 2}
 
 
-def test_a_folder_of_another_preset_or_of_something_else_is_refused(capsys, tmp_path):
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--rocks", 13], "--rocks 13: setups can have 1 to 12"),
+        (["--workers", 2, "--scheduler", "tcp://x:1"], "give one of them"),
+        (["--policy", "uniform"], "--policy uniform: is compared anyway"),
+        (["--policy", OWN, "--policy", OWN], "angle: there is one of this name already"),
+        (["--mesh", "none.glb"], "none.glb: cannot be read (No such file or directory)"),
+    ],
+)
+def test_options_that_cannot_be_are_one_line(capsys, tmp_path, options, words):
+    assert words in refused(capsys, [tmp_path / "out", *options], tmp_path, "setups")
+
+
+def test_a_folder_of_another_scale_or_of_something_else_is_refused(capsys, tmp_path):
     occupied(tmp_path / "full")
-    assert "is there already" in refused(capsys, ["reproduce", tmp_path / "full"], tmp_path)
+    assert "is there already" in refused(capsys, [tmp_path / "full"], tmp_path, "setups")
     (tmp_path / "paper").mkdir()
-    write_json(tmp_path / "paper/study.json", {"preset": "paper"})
-    line = refused(capsys, ["reproduce", tmp_path / "paper"], tmp_path)
+    write_json(tmp_path / "paper/study.json", {"scale": "paper"})
+    line = refused(capsys, [tmp_path / "paper"], tmp_path, "setups")
     assert "was begun with --scale paper" in line

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mgs.study.output import table, with_interval
-from mgs.study.statistics import MOST_ROCKS, holm, interval, pareto_front, permutation_p
-from mgs.study.verdict import Claim, judged, paired, single, verdict_table
+from studies.output import table, with_interval
+from studies.statistics import MOST_ROCKS, holm, interval, pareto_front, permutation_p
+from studies.verdict import Claim, judged, paired, single, verdict_table
 
 numbers = st.floats(-10, 10, allow_nan=False).map(lambda x: round(x, 3))
 

@@ -1,4 +1,4 @@
-"""`mgs stress`: its experiments on small ellipsoids, the faults, and a small run of the command."""
+"""Stress tests: experiments on small ellipsoids, the faults, and a small run of the command."""
 
 import csv
 import json
@@ -6,17 +6,17 @@ import json
 import numpy as np
 import pytest
 import synthetic
-from program import command
+from program import study
 
 from mgs.data.dataset import load_dataset
 from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.study.output import Panel
-from mgs.study.stress import faults, run
-from mgs.study.stress.fits import CONVERGENCE, convergence, free_means
-from mgs.study.stress.lab import Experiment, open_lab
-from mgs.study.sweep import Cell
-from mgs.study.verdict import Claim, judged
+from studies.output import Panel
+from studies.stress import faults, run
+from studies.stress.fits import CONVERGENCE, convergence, free_means
+from studies.stress.lab import Experiment, open_lab
+from studies.sweep import Cell
+from studies.verdict import Claim, judged
 
 FOLDERS = {"dataset": "dataset", "prior": "prior"}
 
@@ -161,7 +161,7 @@ def test_a_run_writes_its_files_continues_and_keeps_earlier_experiments(
     CALLS.clear()
 
     def verdicts(*arguments):
-        command("stress", tmp_path / "out", *arguments)
+        study("stress", tmp_path / "out", *arguments)
         found = json.loads((tmp_path / "out/verdicts.json").read_text())["experiments"]
         return [(one["name"], one["claims"][0]["verdict"]) for one in found]
 

@@ -6,6 +6,7 @@ count, too.
 
 import ast
 import re
+import tomllib
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -16,7 +17,7 @@ ROOMS = [
     "data", "synth", "survey", "prior", "splat",
     "splat_places", "splat_ply", "splat_gltf", "splat_files", "evaluation",
     "policy", "fit", "scene", "run", "report", "view",
-    "bench", "study", "cli", "__main__",
+    "cli", "__main__",
 ]  # fmt: skip
 """All rooms; each may import from those before it."""
 
@@ -59,9 +60,19 @@ def test_every_room_has_its_place_and_imports_only_from_rooms_below_it():
     assert [(a, b) for a, b in pairs if ROOMS.index(room(b)) > ROOMS.index(room(a))] == []
 
 
+def importers(names: str, folders: list[str]) -> list[Path]:
+    """Files in these folders that import one of the names."""
+    pattern = re.compile(rf"^\s*(import|from) ({names})\b", re.MULTILINE)
+    files = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    return [path for path in files if pattern.search(path.read_text())]
+
+
 def test_nothing_but_tests_imports_tests():
     names = "|".join({path.stem for path in (ROOT / "tests").rglob("[!_]*.py")} | {"tests"})
-    pattern = re.compile(rf"^\s*(import|from) ({names})\b", re.MULTILINE)
-    for folder in ("mgs", "plugins", "tools"):
-        for path in (ROOT / folder).rglob("*.py"):
-            assert pattern.findall(path.read_text()) == [], path
+    assert importers(names, ["mgs", "studies", "plugins", "tools"]) == []
+
+
+def test_the_package_imports_no_study():
+    assert importers("studies", ["mgs", "plugins"]) == []
+    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
+    assert "studies" not in wheel["targets"]["wheel"]["only-include"]

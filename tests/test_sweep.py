@@ -15,8 +15,8 @@ import pytest
 from distributed import LocalCluster
 
 from mgs.errors import InputError
-from mgs.study import sweep
-from mgs.study.sweep import Cell, cell_folder, found, names_of, run_cells
+from studies import sweep
+from studies.sweep import Cell, cell_folder, found, names_of, run_cells
 
 CALLS = []
 
@@ -57,8 +57,8 @@ def test_cells_come_after_those_they_need_and_are_done_once(tmp_path):
 
 def studies():
     """Cells of each study by its name, of every size."""
-    from mgs.study import chart, parsimony, reproduce, reproduce_results
-    from mgs.study.stress import lab, run
+    from studies import chart, parsimony, results, table1
+    from studies.stress import lab, run
 
     for size in chart.SIZES.values():
         data = chart.Data(size)
@@ -67,8 +67,8 @@ def studies():
         yield "parsimony", parsimony.cells_of(size)
     for size in lab.SIZES.values():
         yield "stress", [cell for one in run.EXPERIMENTS.values() for cell in one.cells(size)]
-    for size in reproduce.SIZES.values():
-        for name, result in reproduce_results.RESULTS.items():
+    for size in table1.SIZES.values():
+        for name, result in results.RESULTS.items():
             yield name, list(result.cells(size, result.count(size)))
 
 

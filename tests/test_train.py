@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mgs.bench import surface_camera, surface_gaussians
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
 from mgs.fit.fitting import COLOUR_MIN, fit
@@ -15,6 +14,7 @@ from mgs.fit.settings import RATES, TrainSettings
 from mgs.fit.stopping import LOSS_FLOOR, StopReason, stop_reason
 from mgs.gaussians import LEARNED, Gaussians
 from mgs.splat import ListCache, fisher, render
+from studies.bench import surface_camera, surface_gaussians
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from mgs.study import chart, parsimony, setups
-from mgs.study.output import draw_panels
-from mgs.study.stress.faults import LOST, label_of
+from studies import chart, parsimony, setups
+from studies.output import draw_panels
+from studies.stress.faults import LOST, label_of
 
 RESULTS = Path(__file__).parent.parent / "docs/results"
 

@@ -61,15 +61,10 @@ COMMANDS = {
     "video": ("share.video", "Make a video of a run."),
     "simplify": ("models.simplify", "Make the model of a run smaller."),
     "demo": ("demo.demo", "Run all steps on a small rock."),
-    "bench": ("bench.bench", "Time the splatting kernels."),
-    "reproduce": ("studies.reproduce", "Reproduce the results."),
-    "chart": ("studies.chart", "Draw seconds against PSNR."),
-    "stress": ("studies.stress", "Count where methods fail."),
-    "parsimony": ("studies.parsimony", "Measure how much model a scene needs."),
 }
 """Commands in about the order in which they are used: file and function, and a line of help."""
 
-RESUMABLE = ("synth-orbit", "import", "demo", "reproduce", "chart", "stress", "parsimony")
+RESUMABLE = ("synth-orbit", "import", "demo")
 """Commands that continue where they stopped when they are given again."""
 
 

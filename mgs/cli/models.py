@@ -30,13 +30,6 @@ def evaluate(
     pictures: Annotated[
         bool, option("Write truth, render and difference of each view to RUN/renders.")
     ] = True,
-    convergence: Annotated[
-        bool,
-        option(
-            "Estimate how far the loss of the last fit is above its minimum (Newton decrease).",
-            "--convergence",
-        ),
-    ] = False,
 ) -> None:
     """Measure PSNR and SSIM of models on test views, all views and held-out views; write
     RUN/metrics.json, and renders beside the truth.
@@ -64,7 +57,7 @@ def evaluate(
                     raise InputError(
                         f"--dataset: is for a file, and {subject} has its own dataset; leave it out"
                     )
-                options = {"pictures": pictures, "convergence": convergence, "progress": progress}
+                options = {"pictures": pictures, "progress": progress}
                 rows += _measured_run(subject, len(subjects) == 1, said, options)
             for path in others:
                 if path.is_file() or path == subject:
@@ -83,14 +76,10 @@ def _measured_run(
     the lines for the user."""
     from mgs.report.evaluation import evaluate_run
     from mgs.report.tables import comparison_rows
-    from mgs.run.ending import fit_line
     from mgs.run.folder import open_run
 
     opened = open_run(run)
-    first = len(said)
-    metrics = evaluate_run(opened, say=said.append, **options)
-    if "fit" in metrics:
-        said.insert(first, fit_line(metrics["fit"], opened.state.steps[-1]["stop_reason"]))
+    evaluate_run(opened, say=said.append, **options)
     label = opened.label if alone else f"{opened.label} ({run.resolve().name})"
     return comparison_rows({label: opened})
 
@@ -101,14 +90,6 @@ def diagnose(
         str | None,
         option("Frames to draw, as kf_0003,kf_0010. Default: a few held-out ones."),
     ] = None,
-    calibrate: Annotated[
-        bool,
-        option(
-            "Instead of maps, predict the errors of unseen views and compare them with the true "
-            "ones.",
-            "--calibrate",
-        ),
-    ] = False,
     force: Force = False,
 ) -> None:
     """Draw maps of the Fisher information and the uncertainty of a run's model, for views and for
@@ -118,17 +99,10 @@ def diagnose(
     fisher.scale, fisher.rotation, fisher.opacity, information, uncertainty and unobserved, and a
     PNG that shows them; and information.ply, a point for each Gaussian, coloured by its
     information.
-
-    With --calibrate it writes uncertainty.json and uncertainty.png instead: how well errors are
-    predicted in test views and in held-out frames. The prediction is calibrated by leaving each of
-    the run's own views out of a fit once. NAME.errors.exr has the true error and the predicted
-    standard deviation of some views.
     """
     from mgs.report.diagnostics import diagnose as mapped
     from mgs.run.folder import open_run
 
-    if calibrate and views is not None:
-        raise InputError("--calibrate takes all views that were not seen; leave out --views")
     wanted = None if views is None else [name.strip() for name in views.split(",") if name.strip()]
     if wanted == []:
         raise InputError(
@@ -136,16 +110,11 @@ def diagnose(
         )
     folders = [below(open_run(run).folder, "diagnostics") for run in runs]
     for folder in folders:
-        check_new_file(folder / ("uncertainty.json" if calibrate else "information.ply"), force)
+        check_new_file(folder / "information.ply", force)
     runtime.start()
     for run, folder in zip(runs, folders, strict=True):
         with folder_locked(folder), progress_bar() as bar:
-            if calibrate:
-                from mgs.report.predicted_error import calibrate_run
-
-                written = calibrate_run(run, partial(bar, "calibrating"))
-            else:
-                written = mapped(run, wanted, partial(bar, "mapping"))
+            written = mapped(run, wanted, partial(bar, "mapping"))
         for path in written:
             echo(f"wrote {path}")
 

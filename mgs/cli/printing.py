@@ -101,15 +101,13 @@ def _heading(key: str, new: bool) -> str:
 
 def print_run(out: Path, state: Checkpoint, metrics: dict[str, Any], console: Terminal) -> None:
     """Print the steps of a run as a table, on a terminal only, then the quality of its model."""
-    from mgs.run.ending import RunEnd, fit_line, why_ended
+    from mgs.run.ending import RunEnd, why_ended
 
     if console.is_terminal:  # a log has a line a step
         _print_steps(state.steps, console)
     for text in _quality_lines(metrics, any("exposure" in step for step in state.steps)):
         console.print(text)
     last = state.steps[-1] if state.steps else {}
-    if "fit" in metrics:
-        console.print(fit_line(metrics["fit"], last["stop_reason"]))
     if "ended" in last and (last["ended"]["views"] or last["ended"]["reason"] != RunEnd.BUDGET):
         console.print(f"the run has ended: {why_ended(last['ended'])}", soft_wrap=True)
     console.print(f"wrote {out}", soft_wrap=True)

@@ -41,7 +41,7 @@ def stop_reason(losses: Sequence[float], tolerance: float, limit: int) -> StopRe
     lower) exceed DIVERGED_FACTOR times the first.
     SETTLED: in each of the last two passes, of at least three, the loss fell by less than the
     tolerance, and is at most the tolerance above the lowest before. It does not say how far the
-    minimum is; see `mgs.report.convergence`.
+    minimum is (docs/fit.md).
     """
     passes, start = len(losses) - 1, max(losses[0], LOSS_FLOOR)
     if not math.isfinite(losses[-1]):

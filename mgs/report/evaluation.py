@@ -27,7 +27,6 @@ def evaluate_run(
     run: str | Path | Run,
     *,
     pictures: bool = True,
-    convergence: bool = False,
     progress: Progress = no_progress,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
@@ -35,8 +34,6 @@ def evaluate_run(
     with `pictures`, RUN/renders. Returns the contents of metrics.json.
 
     - run: folder or opened run.
-    - convergence: also estimate how far the loss of the last fit is above its minimum (entry "fit":
-      `mgs.report.convergence.remaining_decrease`).
     - say: called with lines for the user: files written and kept.
 
     Metrics and pictures of the same model, dataset and version of mgs are kept, not made again. In
@@ -67,15 +64,11 @@ def evaluate_run(
                 progress=progress,
             )
             about = {"policy": run.label, "of": subject, "pictures": pictures}
-            fit = _fit(run, progress) if convergence else {}
-            metrics = about | fit | {"informed": _informed(run)} | found
+            metrics = about | {"informed": _informed(run)} | found
             write_json(file, metrics)
             say(f"wrote {file}" + (f" and {folder}" if pictures else ""))
             return metrics
         kept = f"kept {file}, measured before on this very model and dataset"
-        if convergence and "fit" not in metrics:
-            metrics |= _fit(run, progress)
-            write_json(file, metrics)
         paths = {folder / f"{frame.name}.png": frame for frame in frames}
         paths |= {folder / TEST_FOLDER / f"{frame.name}.png": frame for frame in test_frames}
         if not pictures:
@@ -92,14 +85,6 @@ def evaluate_run(
             write_json(file, metrics)
             say(f"{kept}; wrote {folder}")
         return metrics
-
-
-def _fit(run: Run, progress: Progress) -> dict[str, Any]:
-    """Entry "fit" of metrics.json. Raises InputError if the prior is gone or is not the run's."""
-    from mgs.report.convergence import remaining_decrease
-
-    given = run.state.gaussians, run.settings, run.prior, run.taken, run.dataset.cameras
-    return {"fit": remaining_decrease(*given, progress)}
 
 
 def _informed(run: Run) -> dict[str, dict[str, int]]:

@@ -12,13 +12,12 @@ from mgs.policy.certificate import Certificate
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.report.page_plots import METRIC_NAMES
 from mgs.report.tables import table_cell, table_columns, table_heading, table_row
-from mgs.run.ending import RunEnd, fit_line, why_ended
+from mgs.run.ending import RunEnd, why_ended
 from mgs.run.folder import Run
 
 
 def notes(run: Run) -> list[str]:
-    """Sentences about what is unfinished or missing, the end of the run and of its last fit, and
-    the run's warnings."""
+    """Sentences about what is unfinished or missing, the end of the run, and its warnings."""
     taken, lines = len(run.indices), []
     if run.ended is None:
         lines.append(
@@ -34,9 +33,6 @@ def notes(run: Run) -> list[str]:
             f"metrics.json is of {run.metrics['images']} images, the model of {taken}: its numbers "
             f"are left out; `mgs eval {run.folder}` measures again."
         )
-    elif "fit" in run.metrics and "stop_reason" in run.steps[-1]:
-        line = fit_line(run.metrics["fit"], run.steps[-1]["stop_reason"])
-        lines.append(f"{line[0].upper()}{line[1:]}.")
     if run.settings.estimator != "exact":
         lines.append(
             f"Its information gain is by the estimator {run.settings.estimator}: "

@@ -34,13 +34,6 @@ def diverged(out: Path, step: int, kept: int, losses: Sequence[float]) -> str:
     )
 
 
-def fit_line(fit: dict[str, Any], stop_reason: str) -> str:
-    """Describe how the last fit ended, and how far it is from its minimum."""
-    share = f"{100 * fit['predicted_decrease']:.2g} %"
-    how = "converged" if fit["converged"] else f"ended as designed ({stop_reason})"
-    return f"last fit: {how}; at its minimum the objective is predicted to be {share} lower"
-
-
 class RunEnd(StrEnum):
     """Why a run ended: `reason` of `ended`, in the last line of steps.jsonl."""
 

@@ -116,11 +116,6 @@ class _View(_Strict, extra="allow"):
     ssim: float | None
 
 
-class _Fit(_Strict):
-    predicted_decrease: float
-    converged: bool
-
-
 class Metrics(_Strict):
     """metrics.json (`mgs.evaluation.evaluate_model`, `mgs.report.evaluation.evaluate_run`)."""
 
@@ -130,7 +125,6 @@ class Metrics(_Strict):
     views: list[_View]
     test: dict[str, float | None] = {}
     test_views: list[_View] = []
-    fit: _Fit | None = None
     pictures: bool = True
     of: str = ""
 

@@ -6,7 +6,8 @@ Newton decrease, half of g^T (J^T J + lam)^-1 g, predicts the rest; it is exact 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from mgs.camera import Camera
@@ -16,6 +17,7 @@ from mgs.fit.evidence import last_images, objective_of
 from mgs.fit.objective import newton_decrease
 from mgs.gaussians import Gaussians
 from mgs.prior.build import Prior
+from mgs.run.folder import Run, open_run
 from mgs.run.settings import NbvSettings
 from mgs.splat import as_drjit
 
@@ -32,7 +34,6 @@ def remaining_decrease(
     prior: Prior,
     frames: Sequence[Frame],
     cameras: Sequence[Camera],
-    progress: Callable[[int, int], None] = lambda done, most: None,
 ) -> dict[str, Any]:
     """Objective of the last fit of a run, and its predicted further fall.
 
@@ -46,11 +47,32 @@ def remaining_decrease(
     train = settings.train
     if train.density != "fixed" or train.loss != "squared":
         raise InputError(
-            "--convergence: is for a fixed number of Gaussians and squared differences; "
-            "leave it out, or fit with --density fixed --loss squared"
+            "convergence: is for a fixed number of Gaussians and squared differences; "
+            "fit with --density fixed --loss squared"
         )
     goal = objective_of(last_images(settings, prior, frames, cameras), gaussians, settings)
     model = as_drjit(gaussians)
     phi = goal.phi(model)
-    share = newton_decrease(goal, model, CG_ITERATIONS, progress)[-1] / max(phi, 1e-30)
+    share = newton_decrease(goal, model, CG_ITERATIONS)[-1] / max(phi, 1e-30)
     return {"phi": phi, "predicted_decrease": share, "converged": bool(share <= CONVERGED_SHARE)}
+
+
+def fit_line(run: str | Path | Run) -> str:
+    """Describe how the last fit of a run ended, and how far it is from its minimum.
+
+    Raises InputError as `open_run` and `remaining_decrease`.
+    """
+    run = run if isinstance(run, Run) else open_run(run)
+    left = remaining_decrease(
+        run.state.gaussians, run.settings, run.prior, run.taken, run.dataset.cameras
+    )
+    reason = run.state.steps[-1]["stop_reason"]
+    how = "converged" if left["converged"] else f"ended as designed ({reason})"
+    share = f"{100 * left['predicted_decrease']:.2g} %"
+    return f"last fit: {how}; at its minimum the objective is predicted to be {share} lower"
+
+
+if __name__ == "__main__":
+    from studies.commands import start
+
+    start("convergence")

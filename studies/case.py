@@ -1,7 +1,7 @@
 """Cases: a rock at one size with one prior, and what studies do with it.
 
 A case names the cells that render its dataset and build its prior. The functions with the arguments
-(root, out, ...) are tasks of `mgs.study.sweep.Cell`; `dataset` and `prior` are folders below the
+(root, out, ...) are tasks of `studies.sweep.Cell`; `dataset` and `prior` are folders below the
 study's folder, or absolute. All tasks continue after an interruption.
 """
 
@@ -26,7 +26,7 @@ from mgs.prior.settings import PriorSettings
 from mgs.report.evaluation import evaluate_run
 from mgs.run.folder import Run, open_run
 from mgs.run.nbv import resume_nbv, start_run
-from mgs.study.sweep import CELLS, Cell
+from studies.sweep import CELLS, Cell
 
 MESH_SCENE = "boulder"
 """Scene whose ground, light and orbits a mesh gets."""

@@ -22,10 +22,10 @@ from mgs.policy.poses import seed_views
 from mgs.prior.build import Prior, load_prior
 from mgs.prior.initial import initial_gaussians, initial_normals, pixel_on
 from mgs.splat import ListCache, fisher, groups
-from mgs.study.case import Case, Rock, Size, judge
-from mgs.study.output import Panel
-from mgs.study.sweep import Cell
-from mgs.study.verdict import Claim
+from studies.case import Case, Rock, Size, judge
+from studies.output import Panel
+from studies.sweep import Cell
+from studies.verdict import Claim
 
 Array = NDArray[np.floating]
 

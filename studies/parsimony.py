@@ -1,4 +1,4 @@
-"""`mgs parsimony`: how much model a scene needs.
+"""How much model a scene needs.
 
 Charts quality and cost against the number of Gaussians, the kinds of parameters that are learned,
 and the SH degree, and compares the automatic choice: N of `mgs prior --gaussians auto`, kinds and
@@ -19,21 +19,18 @@ import numpy as np
 from mgs.data.dataset import load_dataset
 from mgs.fit.evidence import last_images, lean_fit
 from mgs.fit.pruning import prune
-from mgs.fit.settings import RATES, TrainSettings
+from mgs.fit.settings import RATES, ModelSettings, TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.policy.poses import seed_views
 from mgs.prior.build import load_prior
-from mgs.run.loop import fit_views
-from mgs.run.operations import operations_of
-from mgs.run.problem import Problem
 from mgs.run.settings import NbvSettings
-from mgs.run.state import Fitted
+from mgs.scene import Scene, State, fit_views
 from mgs.splat import groups
-from mgs.study.case import Case, Rock, Size, judge
-from mgs.study.output import Content, Panel, draw_panels, table, write_table
-from mgs.study.sweep import Cell, Report, run_cells
-from mgs.study.verdict import Claim, Row, judged, single, verdict_table
+from studies.case import Case, Rock, Size, judge
+from studies.output import Content, Panel, draw_panels, table, write_table
+from studies.sweep import Cell, Report, run_cells
+from studies.verdict import Claim, Row, judged, single, verdict_table
 
 AUTO = "auto"
 """Automatic number of Gaussians."""
@@ -151,25 +148,21 @@ def fit_and_judge(
     pruned at each of `noises`."""
     rates = {kind: rate if kind in LEARNED[learned] else 0.0 for kind, rate in RATES.items()}
     train = TrainSettings(rates=rates)
-    settings = NbvSettings(
-        dataset=root / dataset, prior=root / prior, seeds=seeds, sh=degree, train=train
-    )
-    data = load_dataset(settings.dataset)
-    problem = Problem(data, settings, operations_of(data, load_prior(settings.prior), settings))
+    settings = ModelSettings(sh=degree, train=train)
+    scene = Scene(load_dataset(root / dataset), load_prior(root / prior), settings)
     spent = list[float]()
-    order = views_in_order(problem.positions, problem.centre, views, seeds)
-    problem.seeds = order[:seeds]
+    order = views_in_order(scene.positions(scene.frames), scene.centre, views, seeds)
     for i in order:
-        problem.image(i)  # reads it, which is not timed
+        scene.image(scene.frames[i])  # reads it, which is not timed
     before, passes = None, 0
     for count in range(seeds, views + 1):
         began = time.perf_counter()
-        found = fit_views(problem, order[:count], before)
+        fit, _ = fit_views(scene, scene.frames, order[:count], before)
         spent.append(time.perf_counter() - began)
-        passes, model = passes + found.passes, found.gaussians
+        passes, model = passes + fit.passes, fit.gaussians
         nothing = np.zeros((0, 0))  # no view is chosen by information
-        before = Fitted(model, nothing, nothing, order[:count])
-    cameras = [problem.cameras[i] for i in order]
+        before = State(scene.frames, tuple(order[:count]), seeds, model, nothing, nothing)
+    cameras = [scene.frames[i].camera for i in order]
     kinds = groups(degree)
     each = sum(kinds[kind].stop - kinds[kind].start for kind in LEARNED[learned])
     pruned = []
@@ -308,3 +301,9 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     ]
     title = "The automatic choice of parameters (star) beside fixed ones"
     draw_panels(path, panels, rows, title)
+
+
+if __name__ == "__main__":
+    from studies.commands import start
+
+    start("parsimony")

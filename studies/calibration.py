@@ -142,3 +142,9 @@ def crps(errors: Array, sigma: Array) -> float:
     z = errors / sigma
     density = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi)
     return float((sigma * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi))).mean())
+
+
+if __name__ == "__main__":
+    from studies.commands import start
+
+    start("calibration")

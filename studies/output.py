@@ -17,8 +17,8 @@ from mgs.provenance import versions
 from mgs.report.figures import POLICY_STYLE
 from mgs.report.tables import markdown
 from mgs.runtime import processor
-from mgs.study.statistics import interval
-from mgs.study.verdict import Row
+from studies.statistics import interval
+from studies.verdict import Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

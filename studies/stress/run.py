@@ -9,12 +9,12 @@ from typing import Any
 from mgs.files import atomic_path, write_csv, write_json
 from mgs.provenance import versions
 from mgs.runtime import processor
-from mgs.study.output import draw_panels
-from mgs.study.stress.faults import ALARMS, DATA_FAULTS, PRIOR_EXPERIMENT
-from mgs.study.stress.fits import CONVERGENCE, FREE_MEANS
-from mgs.study.stress.lab import Experiment, StressSize
-from mgs.study.sweep import Report, found, run_cells
-from mgs.study.verdict import Row, judged, verdict_table
+from studies.output import draw_panels
+from studies.stress.faults import ALARMS, DATA_FAULTS, PRIOR_EXPERIMENT
+from studies.stress.fits import CONVERGENCE, FREE_MEANS
+from studies.stress.lab import Experiment, StressSize
+from studies.sweep import Report, found, run_cells
+from studies.verdict import Row, judged, verdict_table
 
 EXPERIMENTS: dict[str, Experiment] = {
     "free-means": FREE_MEANS,

@@ -16,18 +16,19 @@ from typing import Any
 import numpy as np
 
 from mgs.policy import tour
-from mgs.policy.poses import smallest_angle
-from mgs.run.loop import fit_views
+from mgs.policy.poses import travel_cost
+from mgs.run.flight import flight_of, reachable
 from mgs.run.planning import planned_flight, rated
-from mgs.run.problem import Problem
-from mgs.run.settings import FlightLimits
-from mgs.run.state import Fitted
-from mgs.study.case import Rock
-from mgs.study.output import Content, Panel, draw_panels, table
-from mgs.study.setups import SETUPS, Found, SetupSize, case_of, shared_problem
-from mgs.study.statistics import interval
-from mgs.study.sweep import Cell
-from mgs.study.verdict import Row
+from mgs.run.policies import DIRECTIONAL_D
+from mgs.run.settings import FlightLimits, Mission
+from mgs.scene import Scene, State, fit_views
+from studies.case import Rock
+from studies.output import Content, Panel, draw_panels, table
+from studies.policies import angle
+from studies.setups import SETUPS, Found, SetupSize, before_any_fit, case_of, shared_scene
+from studies.statistics import interval
+from studies.sweep import Cell
+from studies.verdict import Row
 
 POOLS = {"dome": SETUPS["one seed"], "mixed distances": SETUPS["mixed distances"]}
 """Candidates; the flight starts with one seed in both."""
@@ -39,50 +40,58 @@ EVEN, EVEN_IMAGES = "even spacing", (2, 3, 4, 5, 6, 8, 11, 15, 20, 27, 36)
 """Baseline, and its numbers of images."""
 
 OURS = "planned tour"
-Flier = Callable[[Problem], list[int]]
-"""A function of a problem with a limit that returns the views of a flight in flying order."""
+Flier = Callable[[Scene, State, Mission], list[int]]
+"""(scene, state after the seed, mission with a limit) -> the views of a flight in flying order."""
 
 
-def one_by_one(problem: Problem) -> list[int]:
+def one_by_one(scene: Scene, state: State, mission: Mission) -> list[int]:
     """Views of the largest score / travel cost in reach, one after another."""
-    taken, unused = problem.seeds, np.zeros(0)  # these policies use poses and surface alone
-    while left := problem.reachable(taken):
-        context = problem.context(Fitted(problem.start, unused, unused, taken), left)
-        taken = [*taken, rated(problem, context, problem.travel_cost(context))[0][0]]
-    return taken
+    while views := reachable(scene, state, mission):
+        cost = None
+        if mission.travel is not None:
+            positions = scene.positions(state.frames)
+            cost = travel_cost(positions[views], positions[state.taken[-1]], mission.travel)
+        view, _ = rated(scene, state, DIRECTIONAL_D, views, cost)[0]
+        state = replace(state, taken=(*state.taken, view))
+    return list(state.taken)
 
 
-def cut(problem: Problem) -> list[int]:
+def cut(scene: Scene, state: State, mission: Mission) -> list[int]:
     """Views in the order of a choice without a limit, as many as a short tour can take."""
-    flight, order = problem.flight, one_by_one(problem.with_settings(flight=FlightLimits()))
-    flown = [short_tour(problem, order[:count]) for count in range(1, len(order) + 1)]
+    flight = flight_of(scene, state, mission)
+    order = one_by_one(scene, state, mission.model_copy(update={"flight": FlightLimits()}))
+    flown = [short_tour(flight.legs, order[:count]) for count in range(1, len(order) + 1)]
     return max((way for way in flown if flight.share(flight.metres(way), len(way)) <= 1), key=len)
 
 
-def short_tour(problem: Problem, views: Sequence[int]) -> list[int]:
+def planned(scene: Scene, state: State, mission: Mission) -> list[int]:
+    """Views of the tour that the policy plans."""
+    return [*state.taken, *planned_flight(scene, state, DIRECTIONAL_D, mission)]
+
+
+def short_tour(legs: np.ndarray, views: Sequence[int]) -> list[int]:
     """Order the views along a short tour from the first one and back."""
     home, *stops = views
-    return [home, *tour.flying_order(problem.flight.legs, home, stops, home)]
+    return [home, *tour.flying_order(legs, home, stops, home)]
 
 
-def evenly_spaced(problem: Problem, count: int) -> list[int]:
-    """Short tour through `count` views, each the farthest in direction from those before."""
-    chosen = list(problem.seeds)
+def evenly_spaced(scene: Scene, state: State, count: int) -> list[int]:
+    """`count` views, each the farthest in direction from those before."""
+    chosen, positions = list(state.taken), scene.positions(state.frames)
     while len(chosen) < count:
-        left = [i for i in range(len(problem.frames)) if i not in chosen]
-        views = problem.positions[left], problem.positions[chosen]
-        apart = smallest_angle(*views, problem.centre, np.random.default_rng(0))
-        chosen.append(left[int(apart.argmax())])
-    return short_tour(problem, chosen)
+        others = [i for i in range(len(state.frames)) if i not in chosen]
+        apart = angle(positions[others], positions[chosen], scene.centre)
+        chosen.append(others[int(apart.argmax())])
+    return chosen
 
 
 FLIERS: Mapping[str, tuple[Flier, dict[str, Any]]] = {
-    OURS: (lambda problem: [*problem.seeds, *planned_flight(problem, problem.seeds)], {}),
+    OURS: (planned, {}),
     "score / (1 + metres)": (one_by_one, {"travel": 1.0}),
     "five nearest": (one_by_one, {"nearest": 5}),
     "no limit, cut": (cut, {}),
 }
-"""Fliers by name, all with `directional-d`, and their settings of `mgs nbv`."""
+"""Fliers by name, all with `directional-d`, and fields of their `Mission`."""
 
 
 def cells_of(size: SetupSize, rocks: Iterable[Rock]) -> list[Cell]:
@@ -108,27 +117,29 @@ def fly_and_judge(root: Path, out: Path, dataset: str, prior: str, frames: int) 
     Returns "flights": "policy", "length" (None for even spacing), "images", "metres", "psnr" and
     "psnr_mask" over the test views, dB, and "taken".
     """
-    folders = root / dataset, root / prior, root / dataset
-    problem, tests, _, _ = shared_problem(*folders, None, 1, frames - 1)
-    problem = problem.with_settings(policy="directional-d")
-    everywhere = [*problem.seeds, *problem.reachable(problem.seeds)]
-    whole = problem.flight.metres(short_tour(problem, everywhere))
+    scene, tests, _, _ = shared_scene(root / dataset, root / prior, root / dataset, None)
+    state, mission = before_any_fit(scene, 1), Mission(seeds=1, budget=frames - 1)
+    anywhere = flight_of(scene, state, mission)
+    everywhere = [*state.taken, *reachable(scene, state, mission)]
+    whole = anywhere.metres(short_tour(anywhere.legs, everywhere))
 
     @cache
     def judged(views: tuple[int, ...]) -> dict[str, float]:
-        on = tests(fit_views(problem, list(views)).gaussians)
+        on = tests(fit_views(scene, scene.frames, views)[0].gaussians)
         return {key: float(on[key].mean()) for key in ("psnr", "psnr_mask")}
 
     def flight(policy: str, length: float | None, taken: list[int]) -> Row:
         row: Row = {"policy": policy, "length": length, "images": len(taken)}
-        row |= {"metres": problem.flight.metres(taken), **judged(tuple(sorted(taken)))}
+        row |= {"metres": anywhere.metres(taken), **judged(tuple(sorted(taken)))}
         return row | {"taken": [int(i) for i in taken]}
 
-    flights = [flight(EVEN, None, evenly_spaced(problem, n)) for n in EVEN_IMAGES if n <= frames]
+    even = (evenly_spaced(scene, state, n) for n in EVEN_IMAGES if n <= frames)
+    flights = [flight(EVEN, None, short_tour(anywhere.legs, views)) for views in even]
     for policy, (fly, settings) in FLIERS.items():
         for length in LENGTHS:
-            limited = problem.with_settings(flight=FlightLimits(length=length * whole), **settings)
-            flights.append(flight(policy, length, fly(limited)))
+            limits = {"flight": FlightLimits(length=length * whole), **settings}
+            limited = mission.model_copy(update=limits)
+            flights.append(flight(policy, length, fly(scene, state, limited)))
     return {"whole": whole, "flights": flights}
 
 
@@ -209,3 +220,9 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
         for pool in POOLS
     ]
     draw_panels(path, panels, shown, "Metres of a flight over even spacing's with the same PSNR")
+
+
+if __name__ == "__main__":
+    from studies.commands import start
+
+    start("flights")

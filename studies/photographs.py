@@ -15,10 +15,10 @@ from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import reading
 from mgs.run.nbv import resume_nbv, start_fit
-from mgs.study.case import judge
-from mgs.study.output import Content, Panel, draw_panels, table, write_table
-from mgs.study.sweep import Cell, Report, run_cells
-from mgs.study.verdict import Row
+from studies.case import judge
+from studies.output import Content, Panel, draw_panels, table, write_table
+from studies.sweep import Cell, Report, run_cells
+from studies.verdict import Row
 
 NAME = "photographs"
 
@@ -50,6 +50,15 @@ def measure(root: Path, out: Path, dataset: str, gaussians: Any, passes: int) ->
     shutil.rmtree(out / "run")
     found = {key: metrics[key] for key in ("psnr", "ssim", "psnr_mask") if key in metrics}
     return seconds | found | {"gaussians": len(model)}
+
+
+def parse_count(text: str) -> int | str:
+    """Number of Gaussians of an option, or auto. Raises InputError for anything else."""
+    if text == "auto":
+        return text
+    if not text.isdecimal() or int(text) < 1:
+        raise InputError(f"--gaussians {text!r}: expected a positive whole number, or auto")
+    return int(text)
 
 
 def read_peer(file: Path, datasets: Sequence[str]) -> list[Row]:
@@ -118,7 +127,7 @@ def chart_photographs(
         about = {"dataset": dataset.absolute().name, "program": program, "passes": passes}
         rows.append(about | result | {"command": shlex.join([*words, "--out", "RUN"])})
     rows += [row for file in peers for row in read_peer(file, names)]
-    words = ["mgs", "chart", str(out), "--only", NAME, "--scale", preset]
+    words = ["python", "-m", "studies.photographs", str(out), "--scale", preset]
     words += [word for dataset in datasets for word in ("--dataset", str(dataset))]
     words += [word for count in gaussians for word in ("--gaussians", str(count))]
     words += [word for file in peers for word in ("--peer", str(file))]
@@ -138,3 +147,9 @@ def chart_photographs(
     ]
     draw_panels(out / f"{NAME}.png", panels, rows)
     return rows
+
+
+if __name__ == "__main__":
+    from studies.commands import start
+
+    start("photographs")

@@ -27,11 +27,11 @@ from mgs.run import detectors
 from mgs.run.detectors import DETECTORS
 from mgs.seeds import generator
 from mgs.splat import render
-from mgs.study.output import Panel
-from mgs.study.stress.fits import FREE_PASSES
-from mgs.study.stress.lab import Experiment, Lab, StressSize, open_lab, rock_cell, turns
-from mgs.study.sweep import Cell
-from mgs.study.verdict import Claim, Row, single
+from studies.output import Panel
+from studies.stress.fits import FREE_PASSES
+from studies.stress.lab import Experiment, Lab, StressSize, open_lab, rock_cell, turns
+from studies.sweep import Cell
+from studies.verdict import Claim, Row, single
 
 FAILURE = 1.0
 """Loss of PSNR, dB, above which a run has failed."""

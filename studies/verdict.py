@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mgs.report.tables import markdown
-from mgs.study.statistics import interval
+from studies.statistics import interval
 
 Row = dict[str, Any]
 

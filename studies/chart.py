@@ -1,4 +1,4 @@
-"""`mgs chart`: speed against accuracy of fits and of whole runs.
+"""Speed against accuracy of fits and of whole runs.
 
 A point is one `mgs nbv`: its time, and its quality on the test views. A *fit* takes all its images
 at once, evenly spaced in azimuth; a *run* starts from the seeds and chooses the other images one by
@@ -22,13 +22,13 @@ from mgs.fit.settings import COLOURS_ALONE, PASSES, WARM_PASSES
 from mgs.plotting import drawing
 from mgs.run.nbv import run_nbv
 from mgs.run.settings import PRESETS
-from mgs.run.state import State
-from mgs.study.case import Case, Rock, Size, judge, test_views_of
-from mgs.study.output import Content, group_styles, logarithmic, table, write_table
-from mgs.study.statistics import pareto_front
-from mgs.study.sweep import Cell, Report, Results, run_cells
-from mgs.study.timing import span, timed, with_seconds
-from mgs.study.verdict import Claim, Row, judged, verdict_table
+from mgs.run.state import Checkpoint
+from studies.case import Case, Rock, Size, judge, test_views_of
+from studies.output import Content, group_styles, logarithmic, table, write_table
+from studies.statistics import pareto_front
+from studies.sweep import Cell, Report, Results, run_cells
+from studies.timing import span, timed, with_seconds
+from studies.verdict import Claim, Row, judged, verdict_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -228,7 +228,7 @@ def measure(
     passes of all fits together."""
     given = settings | {"train": settings["train"] | COLOURS_ALONE}
 
-    def run() -> State:
+    def run() -> Checkpoint:
         shutil.rmtree(out / "run", ignore_errors=True)
         return run_nbv(root / dataset, out / "run", prior=root / prior, **given).state
 
@@ -305,7 +305,7 @@ def run_chart(
     found = run_cells(out, cells, report)
     unit = float(np.median([one["reference"] for one in found.values() if "reference" in one]))
     for kind in kinds:
-        words = ["mgs", "chart", str(out), "--only", kind, "--scale", preset]
+        words = ["python", "-m", "studies.chart", str(out), "--only", kind, "--scale", preset]
         words += ["--repeats", str(repeats), *(["--dataset", str(dataset)] if dataset else [])]
         rows = data.rows(kind, out, found, unit)
         claims = [judged(PRESET_CLAIM, rows)] if kind == "run" else []
@@ -363,3 +363,9 @@ def _draw_kind(axes: Axes, rows: Sequence[Row], looks: Mapping[str, dict[str, An
     axes.margins(0.08)
     axes.set(xlabel=f"seconds, {most} images", ylabel="PSNR on the test views (dB)")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, fontsize=9)
+
+
+if __name__ == "__main__":
+    from studies.commands import start
+
+    start("chart")

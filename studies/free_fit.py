@@ -25,7 +25,7 @@ from mgs.prior.build import load_prior
 from mgs.prior.initial import round_gaussians
 from mgs.prior.scattered import scattered
 from mgs.prior.settings import PriorSettings
-from mgs.study.case import in_new_process, peak_megabytes, test_views_of
+from studies.case import in_new_process, peak_megabytes, test_views_of
 
 PASSES = 150
 """Passes over all images: 15,000 steps for the 100 images of the paper."""

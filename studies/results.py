@@ -1,4 +1,4 @@
-"""Results of `mgs reproduce`: their cells, and the tables and figures made from them.
+"""Table I, set-ups, survey, oracle and flights: their cells, and the tables and figures of them.
 
 A result is a row of RESULTS; its cells are datasets, priors and runs. Cells that several results
 need are done once.
@@ -14,19 +14,18 @@ import numpy as np
 
 from mgs.errors import InputError
 from mgs.files import write_csv
-from mgs.policy import from_file as policy_file
-from mgs.policy.registry import policy_named
 from mgs.report.evaluation import evaluate_run
 from mgs.report.writing import write_report
+from mgs.run import policy_file
 from mgs.run.inputs import file_digest
-from mgs.study import flights, setups
-from mgs.study.case import Rock
-from mgs.study.output import table, write_table
-from mgs.study.reproduce import FRESH, ReproduceSize, Run, figure_runs, table_runs
-from mgs.study.setups import ORACLE, POLICIES, SURVEYED, Found, cells_of
-from mgs.study.statistics import MOST_ROCKS
-from mgs.study.sweep import Cell, Report, cell_folder, found, names_of, run_cells
-from mgs.study.verdict import Row
+from studies import flights, setups
+from studies.case import Rock
+from studies.output import table, write_table
+from studies.setups import ORACLE, POLICIES, SURVEYED, Found, cells_of
+from studies.statistics import MOST_ROCKS
+from studies.sweep import Cell, Report, cell_folder, found, run_cells
+from studies.table1 import FRESH, ReproduceSize, Run, figure_runs, table_runs
+from studies.verdict import Row
 
 Rows = list[Row]
 
@@ -107,17 +106,18 @@ class Work:
 
 
 def write_table1(work: Work) -> list[Path]:
-    """table1.csv, .json and .md of the runs that are done."""
+    """table1.csv, .json and .md of the runs that are done; where all are, the figures too."""
     rows = table_rows(work.results, work.size)
     done = {row["row"] for row in rows}
     left = [label for label in table_runs(work.size) if label not in done]
-    return write_table(work.out, "table1", rows, table_text(rows, left), work.command, left=left)
+    text = table_text(rows, left)
+    written = write_table(work.out, "table1", rows, text, work.command, left=left)
+    return written if left else [*written, *_write_figures(work)]
 
 
-def write_figures(work: Work) -> list[Path]:
+def _write_figures(work: Work) -> list[Path]:
     """Report on some runs of Table I, as `mgs report` draws it."""
-    needed = figure_runs(work.size)
-    runs = [cell_folder(work.root, run.name) / "run" for run in needed]
+    runs = [cell_folder(work.root, run.name) / "run" for run in figure_runs(work.size)]
     for run in runs:
         evaluate_run(run)  # draws; the metrics are there already
     return write_report(work.out / "figures", runs)
@@ -183,18 +183,15 @@ def _flight_cells(size: ReproduceSize, count: int) -> list[Cell]:
 
 @dataclass(frozen=True)
 class Result:
-    """A result that --only can name.
+    """A study of this module.
 
     cells(size, rocks): the cells that it needs. write(work): writes it and returns the files.
     rocks: attribute of the size with its default number of rocks; None: it has the one of Table I.
-    optional: only done if asked for. policies: it compares those of --policy, too.
     """
 
     cells: Callable[[ReproduceSize, int], list[Cell]]
     write: Callable[[Work], list[Path]]
     rocks: str | None = None
-    optional: bool = False
-    policies: bool = False
 
     def count(self, size: ReproduceSize) -> int:
         """Default number of rocks."""
@@ -203,27 +200,17 @@ class Result:
 
 RESULTS = {
     "table1": Result(lambda size, _: _runs_cells(table_runs(size).values()), write_table1),
-    "figures": Result(lambda size, _: _runs_cells(figure_runs(size)), write_figures),
-    "setups": Result(_setup_cells, write_setups, "setup_rocks", policies=True),
-    "flights": Result(_flight_cells, write_flights, "setup_rocks", optional=True),
-    "survey": Result(_survey_cells, write_survey, "setup_rocks", optional=True, policies=True),
-    "oracle": Result(_oracle_cells, write_setups, "oracle_rocks", optional=True, policies=True),
+    "setups": Result(_setup_cells, write_setups, "setup_rocks"),
+    "flights": Result(_flight_cells, write_flights, "setup_rocks"),
+    "survey": Result(_survey_cells, write_survey, "setup_rocks"),
+    "oracle": Result(_oracle_cells, write_setups, "oracle_rocks"),
 }
-"""Every result by name, in the order in which they are made."""
-
-
-def results_of(only: str | None) -> list[str]:
-    """Names of the results of an option --only; all that are not optional if None."""
-    if only is None:
-        return [name for name, result in RESULTS.items() if not result.optional]
-    return names_of(only, RESULTS)
 
 
 def rocks_of(name: str, size: ReproduceSize, asked: int | None) -> int:
     """Number of rocks of a result, asked for or default. Raises InputError if out of range."""
-    result = RESULTS[name]
-    if asked is None or result.rocks is None:
-        return result.count(size)
+    if asked is None:
+        return RESULTS[name].count(size)
     most = len(size.meshes or FRESH)
     if not 1 <= asked <= most:
         raise InputError(f"--rocks {asked}: {name} can have 1 to {most}")
@@ -234,56 +221,32 @@ NAMESAKE = "there is one of this name already; leave it out, or rename its file"
 
 
 def with_options(
-    size: ReproduceSize,
-    names: Sequence[str],
-    policies: Sequence[str],
-    meshes: Sequence[Path],
-    batch: int,
+    size: ReproduceSize, policies: Sequence[str], meshes: Sequence[Path], batch: int
 ) -> ReproduceSize:
-    """Size with the options --policy, --mesh and --batch. names: the results to make.
+    """Size with the options --policy, --mesh and --batch.
 
-    Raises InputError if an option is for none of these results, a policy is unknown or already
-    compared, two policies or meshes have the same name, or a mesh cannot be read or is one too
-    many.
+    Raises InputError if a policy is unknown or already compared, two policies or meshes have the
+    same name, or a mesh cannot be read or is one too many.
     """
-    comparing = [name for name, result in RESULTS.items() if result.policies]
-    of_table = [name for name, result in RESULTS.items() if result.rocks is None]
     labels = list(POLICIES)
     for policy in policies:
-        _check_used(f"--policy {policy}", names, comparing)
         if policy in POLICIES:
             raise InputError(f"--policy {policy}: is compared anyway; leave it out")
         if policy_file.label(policy) in labels:
             raise InputError(f"--policy {policy}: {NAMESAKE}")
         labels.append(policy_file.label(policy))
-        policy_named(policy)
+        policy_file.policy_of(policy)
     size = replace(size, own_policies=tuple(policy_file.absolute(policy) for policy in policies))
     if batch > 1:
-        _check_used(f"--batch {batch}", names, of_table)
         size = replace(size, table=replace(size.table, batch=batch))
-    return _with_meshes(size, names, meshes) if meshes else size
+    return _with_meshes(size, meshes) if meshes else size
 
 
-def _check_used(option: str, names: Sequence[str], results: Sequence[str]) -> None:
-    """Raise InputError if an option is for none of the results to make."""
-    if not set(results) & set(names):
-        raise InputError(
-            f"{option}: is for {', '.join(results)}, of which --only names none; "
-            "leave out the option, or name one of these"
-        )
-
-
-def _with_meshes(
-    size: ReproduceSize, names: Sequence[str], meshes: Sequence[Path]
-) -> ReproduceSize:
+def _with_meshes(size: ReproduceSize, meshes: Sequence[Path]) -> ReproduceSize:
     if len(meshes) > MOST_ROCKS:
         raise InputError(
             f"--mesh: {len(meshes)} files; differences are tested over {MOST_ROCKS} rocks at most, "
             "leave some out"
-        )
-    if all(RESULTS[name].rocks is None for name in names):
-        raise InputError(
-            f"--mesh {meshes[0]}: is for results over many rocks, and --only leaves them out"
         )
     rocks: list[Rock] = []
     for k, mesh in enumerate(meshes):
@@ -297,7 +260,7 @@ def _with_meshes(
 def make(
     out: Path,
     name: str,
-    preset: str,
+    scale: str,
     size: ReproduceSize,
     count: int,
     report: Report,
@@ -307,22 +270,18 @@ def make(
     """Do the cells of a result over so many rocks and write it into OUT/results; returns the files.
     Table I is written anew before each cell, from the runs that are done."""
     result = RESULTS[name]
-    command = f"mgs reproduce --scale {preset} --only {name}"
+    command = f"python -m studies.{name} OUT --scale {scale}"
     command += f" --rocks {count}" if result.count(size) > 1 else ""
-    if result.policies:
-        command += "".join(f" --policy {_from_here(policy)}" for policy in size.own_policies)
-    if result.rocks:
-        command += "".join(f" --mesh {rock.mesh.name}" for rock in size.meshes if rock.mesh)
-    elif size.table.batch > 1:
-        command += f" --batch {size.table.batch}"
-
+    command += "".join(f" --policy {_from_here(policy)}" for policy in size.own_policies)
+    command += "".join(f" --mesh {rock.mesh.name}" for rock in size.meshes if rock.mesh)
+    command += f" --batch {size.table.batch}" if size.table.batch > 1 else ""
     cells = result.cells(size, count)
     timed = [cell for cell in cells if cell.alone]
 
     def tell(cell: str, done: int, total: int) -> None:
         if name == "table1" and (so_far := _known(out, timed)):
             write_table1(Work(out, cells, so_far, size, count, command))
-        report(f"{name} {cell}", done, total)
+        report(cell, done, total)
 
     results = run_cells(out, cells, tell, workers=workers, scheduler=scheduler)
     return result.write(Work(out, cells, results, size, count, command))

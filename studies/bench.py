@@ -28,7 +28,7 @@ WARM_UP = 2
 
 
 def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
-    """Sample n flat Gaussians on the surface of the default rock, the scene of `mgs bench`.
+    """Sample n flat Gaussians on the surface of the default rock, the scene of the timings.
 
     Their standard deviations are 0.8, 0.8 and 0.2 spacings (the square root of area / n). Their
     opacity is 0.73 (logit 1), their colours are random.
@@ -176,7 +176,7 @@ def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str
 def bench_splat(
     n: int, width: int, height: int, repeats: int, report: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Measure what `mgs bench` prints: n Gaussians in an image of width x height pixels.
+    """Measure what the program prints: n Gaussians in an image of width x height pixels.
 
     report(what) is called before each measurement. Returns "scene"; "seconds" of each operation;
     "ratios", time of Mitsuba's integrator over ours (..._speedup) and of the Fisher information
@@ -203,3 +203,9 @@ def bench_splat(
         "ratios": ratios,
         "peak_memory_megabytes": memory,
     }
+
+
+if __name__ == "__main__":
+    from studies.commands import start
+
+    start("bench")

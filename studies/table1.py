@@ -1,15 +1,15 @@
-"""Sizes of `mgs reproduce`, and the runs of the paper's Table I."""
+"""Sizes of the studies of `studies.results`, and the runs of the paper's Table I."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-from mgs.policy import from_file as policy_file
+from mgs.run import policy_file
 from mgs.run.inputs import policy_record
-from mgs.study.case import Case, Rock, Size
-from mgs.study.setups import DRAWS, POLICIES, RING, SetupSize
-from mgs.study.sweep import Cell
+from studies.case import Case, Rock, Size
+from studies.setups import DRAWS, POLICIES, RING, SetupSize
+from studies.sweep import Cell
 
 SEEDS = 4
 """Seed views of a run, as in the paper."""
@@ -34,7 +34,7 @@ ALL_3DGS: dict[str, dict[str, Any]] = {
     "3DGS, random points": {"random": True},
     "3DGS, random points, twice the steps": {"random": True, "passes": 2},
 }
-"""Rows of Table I for 3DGS, which sees all views: settings of `mgs.study.free_fit.time_3dgs`."""
+"""Rows of Table I for 3DGS, which sees all views: settings of `studies.free_fit.time_3dgs`."""
 
 FIGURE_POLICIES = ("paper", "d-optimal", "coverage", "uniform")
 """Runs of Table I that the figures show."""
@@ -134,7 +134,7 @@ class Run:
     def cells(self) -> list[Cell]:
         """Cells of the run; the last is the run itself."""
         is_3dgs = self.policy in ALL_3DGS
-        task = "mgs.study.free_fit:time_3dgs" if is_3dgs else "mgs.study.case:time_policy"
+        task = "studies.free_fit:time_3dgs" if is_3dgs else "studies.case:time_policy"
         return self.case.with_task(self.name, task, alone=True, settings=self.settings())
 
     @property
@@ -195,3 +195,9 @@ def table_runs(size: ReproduceSize) -> dict[str, Run]:
 def figure_runs(size: ReproduceSize) -> list[Run]:
     """Runs of Table I that the figures show."""
     return [table_runs(size)[policy] for policy in FIGURE_POLICIES]
+
+
+if __name__ == "__main__":
+    from studies.commands import start
+
+    start("table1")

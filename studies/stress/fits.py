@@ -10,9 +10,9 @@ import numpy as np
 
 from mgs.metrics import agreement
 from mgs.policy.criteria import Score, d_optimal, fisherrf, t_optimal
-from mgs.study.output import Panel
-from mgs.study.stress.lab import Array, Experiment, cells_per_rock, open_lab, turns
-from mgs.study.verdict import Claim, Effects, Row, paired, runs_of, single
+from studies.output import Panel
+from studies.stress.lab import Array, Experiment, cells_per_rock, open_lab, turns
+from studies.verdict import Claim, Effects, Row, paired, runs_of, single
 
 FREE_PASSES = 40
 """Passes of fits with free means: four times the default, since a collapse takes time."""

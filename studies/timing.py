@@ -15,7 +15,7 @@ import numpy as np
 
 from mgs import runtime
 from mgs.memory import padded
-from mgs.study.verdict import Row
+from studies.verdict import Row
 
 REFERENCE_GAUSSIANS, REFERENCE_SIZE, REFERENCE_CALLS = 10_000, (320, 240), 10
 """Gaussians, image size and number of renders with gradients of the reference."""
@@ -32,8 +32,8 @@ def _reference() -> Callable[[], Any]:
     runtime.start()
     import mitsuba as mi
 
-    from mgs.bench import gradient, surface_camera, surface_gaussians
     from mgs.splat import ListCache, as_drjit
+    from studies.bench import gradient, surface_camera, surface_gaussians
 
     gaussians, cache = surface_gaussians(REFERENCE_GAUSSIANS), ListCache()
     camera, device = surface_camera(gaussians, *REFERENCE_SIZE), as_drjit(gaussians)

@@ -1,5 +1,4 @@
-"""Predicted errors of a run in views that it has not seen, and how true the predictions are: `mgs
-diagnose RUN --calibrate`.
+"""Predicted errors of a run in views that it has not seen, and how true the predictions are.
 
 The posterior of the parameters, N(0, sigma^2 / (H + lambda)), does not say what no parameters of
 this model can draw. So the predicted variance of a pixel and channel has three terms:
@@ -32,12 +31,12 @@ from mgs.gaussians import Gaussians, learned, sh_from_rgb
 from mgs.images import write_exr
 from mgs.memory import padded
 from mgs.provenance import versions
-from mgs.report.calibration import NORMAL, Calibration, fit_calibration, judged
-from mgs.report.figures import uncertainty_figure
 from mgs.run.folder import Run, open_run
 from mgs.run.settings import NbvSettings
 from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit, fisher, groups, jvp, render
+from studies.calibration import NORMAL, Calibration, fit_calibration, judged
+from studies.uncertainty_figure import uncertainty_figure
 
 Array = NDArray[np.floating]
 
@@ -192,7 +191,7 @@ def calibrate_run(
     - uncertainty.json: "rows" holds for each prediction and each set of views the result of
       `judged`. Sets: "folds", the run's own views, to which the weights were fitted; "test", the
       test views; "held out", frames never trained on.
-    - uncertainty.png (`mgs.report.figures.uncertainty_figure`).
+    - uncertainty.png (`studies.uncertainty_figure`).
     - NAME.errors.exr of a few views: true error and predicted sigma of each channel, linear RGB.
 
     progress: called as progress(views done, all). Raises InputError as `open_run`, and for a run
@@ -269,12 +268,12 @@ def _views(run: Run) -> tuple[list[Frame], dict[str, tuple[Frame, ...]]]:
     """The training frames, and the sets of other views, by name; none of these is empty."""
     where, settings, frames = run.folder, run.settings, run.taken
     if settings.train.means != "frozen":
-        raise InputError(f"{where}: learns means; --calibrate needs a run with --means frozen")
+        raise InputError(f"{where}: learns means; calibration needs a run with --means frozen")
     if settings.exposure:
-        raise InputError(f"{where}: estimates exposure; --calibrate needs a run without --exposure")
+        raise InputError(f"{where}: estimates exposure; calibration needs a run without --exposure")
     if len(frames) < 2 * FOLDS:
         raise InputError(
-            f"{where}: has {len(frames)} images; --calibrate leaves out a third of them, "
+            f"{where}: has {len(frames)} images; calibration leaves out a third of them, "
             f"and needs {2 * FOLDS} or more"
         )
     names, tests = {frame.name for frame in frames}, run.dataset.test_views()
@@ -284,6 +283,6 @@ def _views(run: Run) -> tuple[list[Frame], dict[str, tuple[Frame, ...]]]:
     if not unseen:
         raise InputError(
             f"{where}: was trained on all views there are; "
-            "--calibrate needs some that it has not seen"
+            "calibration needs some that it has not seen"
         )
     return frames, unseen

@@ -20,24 +20,20 @@ import numpy as np
 from mgs.data.dataset import load_dataset
 from mgs.data.frames import Frame
 from mgs.evaluation import psnr_over
-from mgs.policy import from_file as policy_file
 from mgs.policy.poses import path_length
-from mgs.policy.registry import needs_model
 from mgs.prior.build import load_prior
 from mgs.run.inputs import policy_record
-from mgs.run.loop import choose, finished, fit_views, learn, select_views
-from mgs.run.operations import operations_of
-from mgs.run.planning import surface_information, with_view
-from mgs.run.problem import Problem
-from mgs.run.settings import NbvSettings, with_defaults
-from mgs.run.state import Fitted
+from mgs.run.loop import choose, finished, select_views
+from mgs.run.policy_file import label, policy_of
+from mgs.run.settings import Mission
+from mgs.scene import Scene, State, fit_views, learn, surface_information, with_view
 from mgs.splat import ListCache
-from mgs.study.case import Case, Rock, Size, test_views_of
-from mgs.study.oracle import foretold, oracle
-from mgs.study.output import Panel, draw_matrix, table, with_interval
-from mgs.study.statistics import holm, interval, permutation_p
-from mgs.study.sweep import Cell
-from mgs.study.verdict import Row
+from studies.case import Case, Rock, Size, test_views_of
+from studies.oracle import Oracle
+from studies.output import Panel, draw_matrix, table, with_interval
+from studies.statistics import holm, interval, permutation_p
+from studies.sweep import Cell
+from studies.verdict import Row
 
 Found = Mapping[str, Mapping[str, Any]]
 """Results of cells by name."""
@@ -59,7 +55,7 @@ FORETOLD = {
     "spearman": "rank correlation of the score with the gain",
     "regret": "regret of one choice (dB)",
 }
-"""Keys of `mgs.study.oracle.foretold`."""
+"""Keys of `studies.oracle.foretold`."""
 
 MEAN = "mean"
 """Name of the mean over the set-ups, beside their names."""
@@ -155,9 +151,9 @@ def cells_of(
                 for draw in range(DRAWS if policy == RANDOM else 1):
                     settings = common | {"policy": policy, "seed": rock.index + 1000 * draw}
                     version = "".join(f"-{d[:8]}" for d in policy_record(policy).values())
-                    label = policy_file.label(policy)
+                    shown = label(policy)
                     where = f"{name.replace(' ', '-')}-{size.width}x{size.height}"
-                    of = f"setup/{rock.name}/{where}/{label}{version}-{draw}"
+                    of = f"setup/{rock.name}/{where}/{shown}{version}-{draw}"
                     made = case.with_task(
                         of,
                         f"{__name__}:choose_and_judge",
@@ -166,7 +162,7 @@ def cells_of(
                         settings=settings,
                     )
                     needs = (ring.cells()[0].name, *(cell.name for cell in data))
-                    about = {"rock": rock.name, "scene": rock.scene, "setup": name, "policy": label}
+                    about = {"rock": rock.name, "scene": rock.scene, "setup": name, "policy": shown}
                     last = replace(made[-1], needs=needs, about=about)
                     for cell in (*ring.cells()[:1], *data, last):
                         cells[cell.name] = cell
@@ -187,35 +183,39 @@ def choose_and_judge(
     Returns MEASURES, "taken" (indices of the frames in the order taken) and "path" (metres through
     the views taken). The oracle's has "foretold": means of `foretold` over its choices.
     """
-    policy = settings["policy"]
-    shared, tests, pool, on_ring = shared_problem(
-        root / dataset, root / prior, root / ring, every, settings["seeds"], settings["budget"]
+    name, seed = settings["policy"], settings["seed"]
+    shared, tests, pool, on_ring = shared_scene(root / dataset, root / prior, root / ring, every)
+    scene = shared.with_seed(seed)
+    mission = Mission(**{k: v for k, v in settings.items() if k not in ("policy", "seed")})
+    policy = (
+        policy_of(name)
+        if name != ORACLE
+        else Oracle(test_views_of(shared.dataset), [policy_of(one) for one in SCORED])
     )
-    chosen_by = RANDOM if policy == ORACLE else policy
-    problem = shared.with_settings(**settings | {"policy": chosen_by})
-    tried: list[dict[str, dict[str, float]]] = []
-    if policy == ORACLE or needs_model(policy):
-        chooser = None
-        if policy == ORACLE:
-            views = test_views_of(shared.dataset)
-            chooser = oracle(views, lambda *of: tried.append(foretold(SCORED, *of)))
-        states = select_views(problem, _after_seeds(shared), chooser)
-        taken = [state for state in states if isinstance(state, Fitted)][-1].taken
+    start = _after_seeds if policy.needs_fit else before_any_fit
+    state = start(shared, mission.seeds)
+    if policy.needs_fit:
+        for item in select_views(scene, policy, mission, state):
+            state = item if isinstance(item, State) else state
     else:
-        taken = _from_poses(problem)
-    train = problem.settings.train.model_copy(update={"passes": JUDGE_PASSES})
-    model = fit_views(problem.with_settings(train=train), taken).gaussians
-    left = [i for i in range(len(shared.frames)) if i not in taken]
-    on_tests, on_pool = tests(model), pool(model, left)
+        unused = np.zeros_like(state.H)  # information about a model that there is not
+        while not finished(scene, state, mission):
+            view, _ = choose(scene, state, policy, mission)
+            state = with_view(scene, state, view, unused)
+    train = scene.settings.train.model_copy(update={"passes": JUDGE_PASSES})
+    taken = list(state.taken)
+    model = fit_views(scene, scene.frames, taken, train=train)[0].gaussians
+    others = [i for i in range(len(scene.frames)) if i not in taken]
+    on_tests, on_pool = tests(model), pool(model, others)
     mine = dataset == ring  # the poses of the ring, of which some may be taken
     return {
         "test": float(on_tests["psnr"].mean()),
         "test_mask": float(on_tests["psnr_mask"].mean()),
         "pool": float(on_pool["psnr"].mean()),
         "ring": float((on_pool if mine else on_ring(model))["psnr"].mean()),
-        "path": path_length(problem.positions[taken]),
+        "path": path_length(scene.positions([scene.frames[i] for i in taken])),
         "taken": taken,
-    } | ({"foretold": _means(tried)} if tried else {})
+    } | ({"foretold": _means(policy.tried)} if isinstance(policy, Oracle) else {})
 
 
 def _means(tried: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
@@ -226,37 +226,22 @@ def _means(tried: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict
     }
 
 
-def _from_poses(problem: Problem) -> list[int]:
-    """Views taken by a policy that needs no model."""
-    surface = surface_information(problem, problem.seeds)
-    unused = np.zeros_like(surface)  # information about a model that there is not
-    state = Fitted(problem.start, unused, surface, problem.seeds)
-    while not finished(problem, state):
-        frame, _ = choose(problem, state, lambda _: unused)
-        state = with_view(problem, state, frame, unused)
-    return state.taken
-
-
 Measure = Callable[..., dict[str, np.ndarray]]
 """(model, indices of frames; default: all) -> as `mgs.evaluation.psnr_over`."""
 
 
 @lru_cache(maxsize=1)
-def shared_problem(
-    dataset: Path, prior: Path, ring: Path, every: int | None, seeds: int, budget: int
-) -> tuple[Problem, Measure, Measure, Measure]:
-    """Problem of a set-up on one rock, and PSNR over test views, candidates and the ring.
+def shared_scene(
+    dataset: Path, prior: Path, ring: Path, every: int | None
+) -> tuple[Scene, Measure, Measure, Measure]:
+    """Scene of a set-up on one rock, and PSNR over test views, candidates and the ring.
 
     All policies share them, with the visibility of the surface."""
     data, cache = load_dataset(dataset), ListCache()
     if every is not None:
         half = len(data) // 2
-        kept = (f for i, f in enumerate(data.frames) if i < half or (i - half) % every == 0)
-        data = replace(data, frames=tuple(kept))
-    given = {"dataset": dataset, "prior": prior, "policy": RANDOM, "seeds": seeds, "budget": budget}
-    settings = NbvSettings(**with_defaults(given))
-    problem = Problem(data, settings, operations_of(data, load_prior(prior), settings))
-    _ = problem.start, problem.visibility  # once, for all copies `with_settings`
+        some = (f for i, f in enumerate(data.frames) if i < half or (i - half) % every == 0)
+        data = replace(data, frames=tuple(some))
     _after_seeds.cache_clear()
 
     def over(frames: Sequence[Frame]) -> Measure:
@@ -265,13 +250,22 @@ def shared_problem(
 
     views = test_views_of(data).frames, data.frames, load_dataset(ring).frames
     tests, pool, on_ring = map(over, views)
-    return problem, tests, pool, on_ring
+    return Scene(data, load_prior(prior)), tests, pool, on_ring
 
 
 @lru_cache(maxsize=1)
-def _after_seeds(problem: Problem) -> Fitted:
+def _after_seeds(scene: Scene, seeds: int) -> State:
     """State after the fit to the seeds, the same for every policy."""
-    return learn(problem, problem.seeds)
+    return learn(scene, scene.seeds(seeds))
+
+
+def before_any_fit(scene: Scene, seeds: int) -> State:
+    """State after the seeds, with the Gaussians before training and no information about them."""
+    views, nothing = tuple(scene.seeds(seeds)), np.zeros(0)
+    start = scene.start(tuple(scene.frames[i] for i in views))
+    state = State(scene.frames, views, len(views), start, nothing, nothing)
+    surface = surface_information(scene, state, views)
+    return replace(state, H=np.zeros_like(surface), surface=surface)
 
 
 def rows_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
@@ -417,3 +411,9 @@ def _shares(
         return f"{sum(of.values()) / total:.0%}" if of and total > 0 else "–"
 
     return matrix("share of the oracle's gain", share, [p for p in policies if p != RANDOM])
+
+
+if __name__ == "__main__":
+    from studies.commands import start
+
+    start("setups")
