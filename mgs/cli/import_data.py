@@ -96,6 +96,7 @@ def import_data(
     Partial alpha is kept in rock/, images of the rock alone. Points that came with the cameras are
     kept in sparse.ply for `mgs prior`. The same command continues an interrupted import.
     """
+    from mgs.data.agreement import agreement
     from mgs.data.bags import is_bag
     from mgs.data.importers import import_source
     from mgs.data.meshes import GLTF
@@ -129,9 +130,20 @@ def import_data(
             )
     if mesh is not None and mesh.suffix.lower() in GLTF:
         console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
+    poses = agreement(result.frames)
     for note in [*found.notes, *_advice(found, result)]:
         notes.print(f"mgs: {note}", soft_wrap=True)
-    _print_summary(console, found, tests, result, f"up {_numbers(upward)}, {reason}")
+    if poses and poses.problem:
+        notes.print(
+            f"mgs: the poses {poses.problem} (points matched in neighbouring pictures are "
+            f"{poses.error:.1f} pixels from where the poses put them)",
+            soft_wrap=True,
+        )
+    world = f"up {_numbers(upward)}, {reason}"
+    fits = "poses not compared with the pictures, which share too few points"
+    if poses:
+        fits = f"poses fit the pictures to {poses.error:.2f} pixels ({poses.matches:,} matches)"
+    _print_summary(console, found, tests, result, f"{fits}; {world}")
     console.print(f"{out} is finished already" if finished else f"wrote {out}", soft_wrap=True)
 
 
@@ -162,7 +174,7 @@ def _advice(found: Source, result: Dataset) -> Iterator[str]:
 
 
 def _print_summary(
-    console: Terminal, found: Source, tests: Source | None, result: Dataset, up: str
+    console: Terminal, found: Source, tests: Source | None, result: Dataset, more: str
 ) -> None:
     """Print what was imported of what was listed, and in which world."""
     frames, apart = result.frames, len(tests.shots) if tests else 0
@@ -182,7 +194,7 @@ def _print_summary(
         *([f"left out {without}"] if without else []),
         *(f"{count} {what}" for what, count in counts.items() if count),
         *([f"{len(found.sparse.points):,} points"] if found.sparse else []),
-        up,
+        more,
         f"lengths in {lengths}",
         f"origin {_numbers(found.origin)}",
     ]

@@ -1,0 +1,76 @@
+"""Poses that do not fit the pictures are noticed, and the mistake is named."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from program import command, said
+
+from mgs.camera import Camera, look_at
+from mgs.data.agreement import agreement
+from mgs.data.dataset import write_transforms
+from mgs.data.frames import Frame
+from mgs.images import write_png
+
+FLIP = np.diag([1.0, -1, -1, 1])
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    """Views of a plane with a texture of noise."""
+    root = tmp_path_factory.mktemp("plane")
+    noise = np.random.default_rng(0).random((800, 800)).astype(np.float32)
+    texture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 1, cv2.NORM_MINMAX)
+    K, made = np.array([[260.0, 0, 160], [0, 260, 120], [0, 0, 1]]), []
+    for k in range(5):
+        camera = Camera(K, 320, 240, look_at([np.cos(0.15 * k), np.sin(0.15 * k), 1.2], [0, 0, 0]))
+        rays = camera.unproject(np.ones((240, 320))) - camera.position
+        at = camera.position - rays * (camera.position[2] / rays[..., 2:])
+        u, v = (np.float32(200 * at[..., axis] + 400) for axis in (0, 1))
+        grey = cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        path = root / f"images/kf_{k}.png"
+        write_png(path, np.repeat(grey[..., None], 3, -1), linear=False)
+        made.append(Frame(path.stem, camera, float(k), path))
+    return made
+
+
+def wrong(frames, change):
+    """The frames with another world_to_camera."""
+    made = []
+    for frame in frames:
+        camera, pose = frame.camera, change(frame.camera.world_to_camera)
+        made.append(replace(frame, camera=Camera(camera.K, camera.width, camera.height, pose)))
+    return made
+
+
+def test_right_poses_fit(frames):
+    found = agreement(frames)
+    assert found.error < 0.3
+    assert found.matches > 160
+    assert found.problem == ""
+
+
+MISTAKES = {
+    "camera axes of OpenCV in place": lambda W: FLIP @ W,
+    "are the inverse: world-to-camera": np.linalg.inv,
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_wrong_convention_is_named(frames, name):
+    found = agreement(wrong(frames, MISTAKES[name]))
+    assert found.error > 1
+    assert name in found.problem
+
+
+def test_poses_of_other_pictures_are_noticed_and_said(frames, tmp_path, capsys):
+    order = [3, 0, 4, 1, 2]
+    shuffled = [
+        replace(frame, camera=frames[k].camera) for frame, k in zip(frames, order, strict=True)
+    ]
+    root = frames[0].image_path.parent.parent
+    write_transforms(root, shuffled)
+    command("import", root, "--out", tmp_path / "out")
+    assert "the poses do not belong to these pictures" in said(capsys)[1]
+    assert agreement(frames[:1]) is None
