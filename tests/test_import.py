@@ -286,7 +286,7 @@ def test_what_is_missing_is_skipped_and_said(dataset, tmp_path, capsys):
     assert len(load_dataset(tmp_path / "copy")) == 5
     assert "5 frames of 8 images; left out 3 whose file is missing" in out
     assert f"{dataset.root}/sparse_pc.ply,donotexist" in err.replace(" ", "")
-    assert "points" not in out
+    assert "0 points" not in out
     assert not (tmp_path / "copy/sparse.ply").exists()
 
 
