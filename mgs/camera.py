@@ -9,7 +9,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,6 +42,9 @@ class Camera:
       it, pixels (`cropped`). Splats are projected as for the whole film, so that tiles fit together
       bit for bit.
 
+    K and world_to_camera may be Dr.Jit tensors. `mgs.render` then differentiates the image by them;
+    `traced` holds both, and the fields their values.
+
     Raises InputError if K or the pose is not finite, K has skew or a focal length that is not
     positive, an entry exceeds FURTHEST, the width or height is not a whole number of at least 1,
     the image exceeds MAX_PIXELS or MAX_SIDE, or the pose is not rigid.
@@ -52,8 +56,12 @@ class Camera:
     world_to_camera: NDArray[np.float64]
     film: Camera | None = None
     corner: tuple[int, int] = (0, 0)
+    traced: tuple[Any, Any] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
+        given = self.K, self.world_to_camera
+        if any(type(array).__module__.startswith("drjit") for array in given):
+            object.__setattr__(self, "traced", given)
         K = np.asarray(self.K, np.float64) + 0.0  # makes 0.0 of -0.0: `key` compares bytes
         pose = np.asarray(self.world_to_camera, np.float64) + 0.0
         try:
@@ -167,6 +175,10 @@ class Camera:
         """Same camera in a world whose coordinates count from `origin` [3], metres."""
         if not any(origin):
             return self
+        if self.traced:
+            raise InputError(
+                "camera: Dr.Jit values need Gaussians whose origin is 0; move the means there"
+            )
         pose = self.world_to_camera.copy()
         pose[:3, 3] += pose[:3, :3] @ origin
         return Camera(

@@ -19,8 +19,8 @@ The image is linear, as all of Mitsuba's. The film adds alpha (`pixel_format` rg
 is the value at its centre; shapes, emitters, the sampler and the film's reconstruction filter have
 no effect.
 
-Reverse and forward mode reach each parameter with enabled gradients. The sensor is not
-differentiated.
+Reverse and forward mode reach each parameter with enabled gradients, and the sensor's `to_world`,
+`x_fov` and principal point.
 """
 
 from __future__ import annotations
@@ -99,6 +99,13 @@ class MgsSplat(mi.CppADIntegrator):
         if evaluate:
             dr.eval(developed)
         return developed
+
+    def sample(self, *_: Any, **__: Any) -> Any:
+        """Refuse: whole images are drawn, not rays, so `aov` and `moment` cannot nest it."""
+        raise InputError(
+            "mgs_splat: draws whole images, not rays; render it alone, not within another "
+            "integrator (its property `depth` adds depth)"
+        )
 
     def render_backward(
         self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0

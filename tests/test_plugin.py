@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from splat.scenes import gradients_of, with_gradients
+from splat.scenes import gradients_of, relative_error, with_gradients
 from test_render_command import gaussians as any_gaussians
 
 import mgs.splat.plugins  # noqa: F401  registers mgs_splat
@@ -17,7 +17,7 @@ from mgs.camera import Camera
 from mgs.colour import linear_from_srgb
 from mgs.errors import InputError
 from mgs.gaussians import ARRAYS, Gaussians
-from mgs.splat import camera_from_sensor, jvp, render
+from mgs.splat import camera_from_sensor, jvp, moved, render
 from mgs.splat_ply import read_ply, write_ply
 
 WIDTH, HEIGHT, FOV = 70, 46, 38.0
@@ -275,17 +275,69 @@ def test_forward_mode_is_that_of_the_api(ply, space):
     assert_near(found[..., 4], expected.depth)
 
 
+@pytest.mark.parametrize("film", [{}, CROP])
+def test_the_sensor_is_differentiated(ply, film):
+    """By to_world and x_fov, as by `moved`: Mitsuba's cameras have x to the left and y up."""
+    scene = load(ply, sensor_dict(film, **PPO))
+    own = camera(scene)
+    whole, window = own.film or own, (*own.corner, own.width, own.height)
+    degrees = 2 * np.degrees(np.arctan(np.tan(np.radians(FOV / 2)) * np.exp(-1e-6)))
+    per_log_focal = float((degrees - FOV) / 1e-6)
+    for i in range(7):
+        params, t = mi.traverse(scene), mi.Float(0)
+        dr.enable_grad(t)
+        x = [mi.Float64(0)] * 7
+        x[i] = mi.Float64(t)
+        motion = [mi.Float(part) for part in x]
+        before, fov = params["sensor.to_world"], params["sensor.x_fov"]
+        axis, rate = np.eye(3)[i % 3] * (-1, -1, 1), 180 / np.pi
+        change = mi.Transform4f().rotate(axis, rate * motion[i]) if i < 3 else mi.Transform4f()
+        if 3 <= i < 6:
+            change = mi.Transform4f().translate(mi.Vector3f(*(float(a) * motion[i] for a in axis)))
+        params["sensor.to_world"] = before @ change
+        if i == 6:
+            params["sensor.x_fov"] = fov + per_log_focal * motion[6]
+        params.update()
+        image = mi.render(scene, params)
+        dr.forward(t)
+        found = np.asarray(dr.grad(image))
+        params["sensor.to_world"], params["sensor.x_fov"] = before, fov
+        params.update()
+
+        s = mi.Float(0)
+        dr.enable_grad(s)
+        x = [mi.Float64(0)] * 7
+        x[i] = mi.Float64(s)
+        there = moved(whole, dr.concat(x[:6]), x[6])
+        drawn = render(read_ply(ply), there.cropped(*window)).rgb
+        dr.forward(s)
+        assert relative_error(found, dr.grad(drawn)) < 3e-4, i
+
+
+@pytest.mark.parametrize("around", [{"type": "aov", "aovs": "z:depth"}, {"type": "moment"}])
+def test_another_integrator_cannot_nest_it(ply, around):
+    nested = around | {"image": {"type": "mgs_splat", "filename": str(ply)}}
+    scene = mi.load_dict({"type": "scene", "integrator": nested, "sensor": sensor_dict()})
+    with pytest.raises(RuntimeError) as error:
+        mi.render(scene, spp=1)
+    assert isinstance(error.value.__cause__, InputError)
+
+
 def test_registered_at_import(ply, tmp_path):
     """Before a variant is set, and for each variant, from any folder."""
     lines = [
         "import mitsuba as mi, mgs.splat.plugins",
         "mi.set_variant('scalar_rgb')",
+        "try: mi.load_dict({'type': 'mgs_splat'})",
+        "except RuntimeError as error: print('no scalar_rgb' in str(error))",
         f"mi.set_variant({mi.variant()!r})",
         f"print(mi.load_dict({{'type': 'mgs_splat', 'filename': {str(ply)!r}}}))",
     ]
     command = [sys.executable, "-c", "\n".join(lines)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert done.stdout.strip() == "MgsSplat[60 Gaussians, SH degree 1]", done.stderr
+    assert done.stdout.split("\n")[:2] == ["True", "MgsSplat[60 Gaussians, SH degree 1]"], (
+        done.stderr
+    )
 
 
 def test_the_documented_example(tmp_path, monkeypatch):

@@ -107,6 +107,10 @@ def fisher(
     not support them; and with means for too many pairs (`MAX_SUMS`).
     """
     compute = row_named(ESTIMATORS, estimator, "estimator")
+    if dr.grad_enabled(camera.traced):
+        raise InputError(
+            "fisher: information has no derivative by the camera; take differences of moved cameras"
+        )
     gaussians.check_shapes()
     n, size = len(gaussians), list(groups(gaussians.sh_degree, means).values())[-1].stop
     if not 0 <= alpha_weight <= ALPHA_WEIGHT_MAX:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -19,8 +20,9 @@ def camera_from_sensor(sensor: Any) -> Camera:
 
     `x_fov` is the horizontal field of view of the whole film, whatever the sensor's fov axis. The
     principal point is 0.5 minus the sensor's offset, as a share of the film. Near clip, far clip
-    and shutter are ignored (near plane: `mgs.splat.constants.NEAR`). Raises InputError for any
-    other sensor, and for a pose that is not rigid.
+    and shutter are ignored (near plane: `mgs.splat.constants.NEAR`). The camera keeps the gradients
+    of to_world, x_fov and the principal point, if enabled. Raises InputError for any other sensor,
+    and for a pose that is not rigid.
     """
     params = mi.traverse(sensor)
     if "x_fov" not in params or sensor.needs_aperture_sample():
@@ -29,6 +31,9 @@ def camera_from_sensor(sensor: Any) -> Camera:
         )
     width, height = params["film.size"]
     left, top = params["film.crop_offset"]
+    names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
+    fov, ppo_x, ppo_y = (params[name] for name in names)
+    traced = dr.grad_enabled(params["to_world"].matrix, fov, ppo_x, ppo_y)
     focal = 0.5 * width / np.tan(0.5 * np.radians(_number(params["x_fov"])))
     cx = (0.5 - _number(params["principal_point_offset_x"])) * width
     cy = (0.5 - _number(params["principal_point_offset_y"])) * height
@@ -43,11 +48,28 @@ def camera_from_sensor(sensor: Any) -> Camera:
     except np.linalg.LinAlgError:
         raise InputError("sensor: to_world is singular; its rotation must be orthonormal") from None
     K = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]])
+    if traced:
+        K, world_to_camera = _traced(params["to_world"], fov, ppo_x, ppo_y, width, height)
     film, window = Camera(K, width, height, world_to_camera), map(int, params["film.crop_size"])
     columns, rows = window
     if (columns, rows) == (film.width, film.height):
         return film
     return film.cropped(int(left), int(top), columns, rows)
+
+
+def _traced(to_world: Any, fov: Any, ppo_x: Any, ppo_y: Any, width: int, height: int) -> Any:
+    """K [3,3] and world_to_camera [4,4] of a sensor as TensorXf64, with gradients."""
+    matrix, flip = to_world.matrix, np.diag(_MITSUBA_FROM_OPENCV).tolist()
+    rows = [mi.Float64(flip[j] * matrix[i, j]) for i in range(4) for j in range(4)]
+    inverse = dr.rcp(mi.Matrix4d(*rows))
+    focal = 0.5 * width / dr.tan(dr.deg2rad(0.5 * mi.Float64(fov)))
+    cx, cy = (0.5 - mi.Float64(ppo_x)) * width, (0.5 - mi.Float64(ppo_y)) * height
+    K = [focal, 0, cx, 0, focal, cy, 0, 0, 1]
+    pose = [inverse[i, j] for i in range(4) for j in range(4)]
+    return tuple(
+        mi.TensorXf64(dr.concat([mi.Float64(x) for x in entries]), (size, size))
+        for entries, size in ((K, 3), (pose, 4))
+    )
 
 
 def _number(value: Any) -> float:

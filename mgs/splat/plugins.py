@@ -13,13 +13,17 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from mgs.errors import InputError
 from mgs.resources import resource_folder
 
 
 def register(*_: Any) -> None:
-    """Run every file in `plugins/` as module `mgs_plugins.<file>`, if the variant is
-    differentiable and RGB. Raises InputError if the folder is missing."""
-    if mi.variant() is None or not (dr.is_diff_v(mi.Float) and mi.is_rgb):
+    """Run every file in `plugins/` as module `mgs_plugins.<file>`. Raises InputError if the folder
+    is missing. In a variant that is not differentiable RGB, their names refuse to be loaded."""
+    if mi.variant() is None:
+        return
+    if not (dr.is_diff_v(mi.Float) and mi.is_rgb):
+        mi.register_integrator("mgs_splat", _refuse)
         return
     for path in sorted(resource_folder("plugins").glob("*.py")):
         spec = importlib.util.spec_from_file_location(f"mgs_plugins.{path.stem}", path)
@@ -28,6 +32,12 @@ def register(*_: Any) -> None:
         module = importlib.util.module_from_spec(spec)
         sys.modules[spec.name] = module
         spec.loader.exec_module(module)
+
+
+def _refuse(_: Any) -> Any:
+    raise InputError(
+        f"mgs_splat: has no {mi.variant()}; set a differentiable RGB variant, such as llvm_ad_rgb"
+    )
 
 
 mi.detail.add_variant_callback(register)

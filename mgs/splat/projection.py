@@ -22,6 +22,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mgs.camera import Camera
 from mgs.gaussians import SH_MAX, Gaussians
@@ -77,14 +78,21 @@ class Splats:
 
 def camera_array(camera: Camera) -> Any:
     """The camera as a Dr.Jit array of 23 Float64. Unlike Python numbers, these are not compiled
-    into a kernel. Of a crop window it is that of its film.
+    into a kernel. Of a crop window it is that of its film. It has the gradients of a `traced`
+    camera.
 
     Layout: rotation (9, row by row) and translation (3) of `world_to_camera`; fx, fy, cx, cy,
     pixels; lower and upper bound of x/z, then of y/z (4, FRUSTUM_MARGIN); camera centre (3),
     metres.
     """
     camera = camera.film or camera
-    fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
+    if camera.traced is None:
+        K, pose, centre = camera.K, camera.world_to_camera, list(camera.position)
+    else:
+        K, pose = (_entries(tensor) for tensor in camera.traced)
+        # The centre is -R^T t.
+        centre = [-sum(pose[row, i] * pose[row, 3] for row in range(3)) for i in range(3)]
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / fx
     margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / fy
     clamp = [
@@ -93,10 +101,51 @@ def camera_array(camera: Camera) -> Any:
         -cy / fy - margin_y,
         (camera.height - cy) / fy + margin_y,
     ]
-    pose = camera.world_to_camera
-    numbers = [*pose[:3, :3].ravel(), *pose[:3, 3], fx, fy, cx, cy, *clamp, *camera.position]
+    numbers = [*pose[:3, :3].ravel(), *pose[:3, 3], fx, fy, cx, cy, *clamp, *centre]
+    if camera.traced is not None:
+        return dr.concat([mi.Float64(number) for number in numbers])
     # A list: Dr.Jit frees NumPy arrays between kernels, on a thread that waits for Python's lock.
     return mi.Float64([float(number) for number in numbers])
+
+
+def _entries(tensor: Any) -> np.ndarray:
+    """Entries of a square TensorXf, Float64 [1] each, with their gradients, as an array of objects
+    of its shape."""
+    flat = mi.Float64(tensor.array if dr.is_tensor_v(tensor) else np.ravel(tensor))
+    entries = [dr.gather(mi.Float64, flat, mi.UInt32(i)) for i in range(len(flat))]
+    size = round(len(flat) ** 0.5)
+    square = np.empty((size, size), object)
+    for i, entry in enumerate(entries):
+        square[divmod(i, size)] = entry
+    return square
+
+
+def moved(camera: Camera, motion: Any, zoom: Any = 0.0) -> Camera:
+    """Camera that is turned and shifted in its own axes, to differentiate images by its pose.
+
+    motion: Dr.Jit Float or Float64 [6]: rotation vector, radians, then translation, metres, in the
+    axes of the camera (x right, y down, z forward); points turn and shift the other way. zoom:
+    logarithm of the factor on both focal lengths. Derivatives are exact also where motion is 0.
+    """
+    number = [dr.gather(mi.Float64, mi.Float64(motion), mi.UInt32(i)) for i in range(6)]
+    w, shift = mi.Vector3d(*number[:3]), mi.Vector3d(*number[3:])
+    # Rodrigues: R = 1 + sin(a)/a [w] + (1 - cos(a))/a^2 [w]^2 with a = |w|; near 0 the series.
+    square = dr.squared_norm(w)
+    near, angle = square < 1e-6, dr.sqrt(dr.select(square < 1e-6, 1, square))
+    sine = dr.select(near, 1 - square / 6, dr.sin(angle) / angle)
+    cosine = dr.select(near, 0.5 - square / 24, (1 - dr.cos(angle)) / (angle * angle))
+    cross = mi.Matrix3d(0, -w.z, w.y, w.z, 0, -w.x, -w.y, w.x, 0)
+    # The inverse of the camera's motion moves the points: R^T (x - shift).
+    turn = mi.Matrix3d(1) - sine * cross + cosine * (cross @ cross)
+    old = camera.world_to_camera
+    t = turn @ (mi.Vector3d(old[:3, 3].tolist()) - shift)
+    R = turn @ mi.Matrix3d(old[:3, :3].tolist())
+    rows = [x for i in range(3) for x in (R[i, 0], R[i, 1], R[i, 2], t[i])]
+    pose = dr.concat([mi.Float64(x) for x in (*rows, 0.0, 0.0, 0.0, 1.0)])
+    factor = dr.exp(mi.Float64(zoom))
+    K = [factor * x if i in (0, 4) else mi.Float64(x) for i, x in enumerate(camera.K.ravel())]
+    size = camera.width, camera.height
+    return Camera(mi.TensorXf64(dr.concat(K), (3, 3)), *size, mi.TensorXf64(pose, (4, 4)))
 
 
 def _numbers(array: Any, first: int, end: int) -> list[Any]:

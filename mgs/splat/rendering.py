@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -244,7 +244,7 @@ def splats_and_lists(
     Gaussian; and if the view has too many pairs.
     """
     device = camera_array(camera.seen_from(gaussians.origin))
-    splats = (project if dr.grad_enabled(gaussians) else projected)(gaussians, device)
+    splats = (project if dr.grad_enabled(gaussians, device) else projected)(gaussians, device)
     try:
         return splats, *(cache or ListCache()).get(camera, dr.detach(splats))
     except InputError:
@@ -268,15 +268,18 @@ def render(
     Returns rgb [H,W,3] (linear; sRGB if `gaussians.linear` is false), alpha [H,W] and depth [H,W]
     (expected z-depth, metres), TensorXf.
 
-    Differentiable by Dr.Jit in reverse mode (`dr.backward`) and forward mode (`dr.forward`, `jvp`).
-    Not differentiated: the camera, the thresholds (ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN) and the
-    depth order. It records its own kernels, so it cannot be called inside another `dr.freeze`.
+    Differentiable by Dr.Jit in reverse mode (`dr.backward`) and forward mode (`dr.forward`, `jvp`),
+    also by a camera that has Dr.Jit values (`Camera`, `moved`). Not differentiated: the thresholds
+    (ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN) and the depth order.
 
-    Raises InputError if a parameter is not finite or a colour beyond SH_MAX, naming parameter and
-    first Gaussian; if a number of the background is (a Dr.Jit colour is not checked); and for a
-    view with too many pairs (`mgs.splat.blocks.MAX_PAIRS`).
+    Raises InputError inside another `dr.freeze`, since it records kernels of its own; if a
+    parameter is not finite or a colour beyond SH_MAX, naming parameter and first Gaussian; if a
+    number of the background is (a Dr.Jit colour is not checked); and for a view with too many pairs
+    (`mgs.splat.blocks.MAX_PAIRS`).
     """
     runtime.start()
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise InputError("render: records kernels of its own; call it outside of `dr.freeze`")
     colour = as_colour(background)
     if len(gaussians) == 0:
         gaussians.check_shapes()
@@ -296,7 +299,8 @@ def jvp(
     """Derivative of the image along `tangents` of the Gaussians: J v in one pass (forward mode),
     with J the Jacobian of `render`.
 
-    - gaussians, camera, background, cache: as in `render`; their gradients are ignored.
+    - gaussians, camera, background, cache: as in `render`; their gradients are ignored. For the
+      derivative by a pose see `moved`.
     - tangents: d parameter / dt for some t, by name ("means", "log_scales", "quats",
       "logit_opacities", "sh"), NumPy or Dr.Jit of the parameter's shape. Others are constant.
 
@@ -310,7 +314,7 @@ def jvp(
         for name, tangent in given.items():
             dr.enable_grad(getattr(copy, name))
             dr.set_grad(getattr(copy, name), tangent)
-        image = render(copy, camera, dr.detach(as_colour(background)), cache)
+        image = render(copy, replace(camera), dr.detach(as_colour(background)), cache)
         # AllowNoGrad: there may be no tangents.
         dr.forward_to(image, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
         return dr.grad(image)

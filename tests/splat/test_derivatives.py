@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from mgs.errors import InputError
 from mgs.gaussians import ARRAYS
-from mgs.splat import Image, as_drjit, jvp, reference, render
+from mgs.splat import Image, as_drjit, fisher, jvp, moved, reference, render
 
 from .scenes import (
     calm,
@@ -270,3 +270,56 @@ def test_bad_tangents_are_one_line(tangents, message):
     with pytest.raises(InputError, match=message) as error:
         jvp(gaussians, tangents, camera)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "start", [np.zeros(7), np.array([0.02, -0.01, 0.03, 0.05, -0.02, 0.01, 0.1])]
+)
+@pytest.mark.parametrize("degree", [0, 3])
+def test_images_are_differentiated_by_the_pose_and_the_focal_length(degree, start):
+    """Forward and reverse, by six numbers of the pose and the logarithm of the focal length."""
+    camera = make_camera()
+    weights = image_weights(camera)
+
+    def at(numbers):
+        return moved(camera, dr.concat([mi.Float64(x) for x in numbers[:6]]), numbers[6])
+
+    make = lambda seed: make_clamped(seed, degree, 10, degree == 3)  # noqa: E731
+    gaussians = calm(make, at(start), 30, least=3e-4)
+
+    for i, unit in enumerate(2e-7 * np.eye(7)):
+        ends = [reference.render(gaussians, at(start + step), BACKGROUND) for step in (unit, -unit)]
+        expected = {name: (ends[0][name] - ends[1][name]) / 4e-7 for name in OUTPUTS}
+        for mode in ("forward", "backward"):
+            change, numbers = mi.Float(0), [mi.Float64(x) for x in start]
+            dr.enable_grad(change)
+            numbers[i] += change
+            image = render(gaussians, at(numbers), BACKGROUND)
+            if mode == "forward":
+                dr.forward(change)
+                for name in OUTPUTS:
+                    found = dr.grad(getattr(image, name))
+                    assert relative_error(found, expected[name]) < TANGENT, (i, name)
+            else:
+                drawn = (getattr(image, n) * mi.TensorXf(np.float32(weights[n])) for n in OUTPUTS)
+                dr.backward(sum(dr.sum(one, axis=None) for one in drawn))
+                total = sum((expected[name] * weights[name]).sum() for name in OUTPUTS)
+                size = sum(np.abs(expected[name] * weights[name]).sum() for name in OUTPUTS)
+                assert abs(float(dr.grad(change)[0]) - total) < 1e-5 * size
+
+
+def test_where_a_camera_has_no_derivative_a_line_says_so():
+    gaussians, camera = case(0)
+    motion = mi.Float64([0.0] * 6)
+    dr.enable_grad(motion)
+    with pytest.raises(InputError, match="by the camera"):
+        fisher(gaussians, moved(camera, motion))
+    assert np.array_equal(
+        fisher(gaussians, moved(camera, dr.detach(motion))), fisher(gaussians, camera)
+    )
+    with pytest.raises(InputError, match="origin"):
+        moved(camera, motion).seen_from((1, 0, 0))
+    frozen = dr.freeze(lambda x: render(gaussians, camera).rgb * x)
+    with pytest.raises(RuntimeError) as error:
+        frozen(mi.Float(1))
+    assert "outside of `dr.freeze`" in str(error.value.__cause__)
