@@ -13,12 +13,12 @@ import numpy as np
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset
 from mgs.data.frames import Frame
 from mgs.errors import InputError
-from mgs.evaluation import Progress, evaluate_model, no_progress, render_view, write_comparison
+from mgs.evaluation import Progress, evaluate_model, no_progress
 from mgs.files import working_in, write_json
 from mgs.gaussians import ARRAYS, Gaussians
 from mgs.memory import KEPT_BYTES, release
 from mgs.provenance import versions
-from mgs.run.folder import Run, holds_run, open_run, read_config, read_metrics
+from mgs.run.folder import Run, holds_run, open_run, read_config
 from mgs.run.inputs import array_digest, camera_digest, frame_digests
 from mgs.splat_files import load_gaussians
 
@@ -36,8 +36,8 @@ def evaluate_run(
     - run: folder or opened run.
     - say: called with lines for the user: files written and kept.
 
-    Metrics and pictures of the same model, dataset and version of mgs are kept, not made again. In
-    an on-demand dataset only frames that the run has taken have an image, so none is held out.
+    Metrics and pictures of the same model, dataset and version of mgs are kept, if all are there.
+    In an on-demand dataset only frames that the run has taken have an image, so none is held out.
     Raises InputError as `open_run`, if the test views cannot be read, and if another process works
     on the run.
     """
@@ -48,42 +48,31 @@ def evaluate_run(
     release(KEPT_BYTES)
     file, folder = run.folder / "metrics.json", run.folder / "renders"
     with working_in(run.folder):
-        gaussians, dataset = run.state.gaussians, run.dataset
-        trained = [frame.name for frame in run.taken]
-        frames, tests = dataset.with_images(trained), dataset.test_views()
+        trained, tests = [frame.name for frame in run.taken], run.dataset.test_views()
+        frames = run.dataset.with_images(trained)
         test_frames = () if tests is None else tests.frames
-        subject = _subject(gaussians, [*frames, *test_frames], trained)
-        metrics = _measured_before(file, subject)
-        if metrics is None:
-            found = evaluate_model(
-                as_drjit(gaussians),
-                frames,
-                trained,
-                test_frames=test_frames,
-                pictures=folder if pictures else None,
-                progress=progress,
-            )
-            about = {"policy": run.label, "of": subject, "pictures": pictures}
-            metrics = about | {"informed": _informed(run)} | found
-            write_json(file, metrics)
-            say(f"wrote {file}" + (f" and {folder}" if pictures else ""))
+        subject = _subject(run.gaussians, [*frames, *test_frames], trained)
+        drawn = [folder / f"{frame.name}.png" for frame in frames]
+        drawn += [folder / TEST_FOLDER / f"{frame.name}.png" for frame in test_frames]
+        metrics = _measured_before(run, subject)
+        whole = bool(metrics.get("pictures")) and all(path.is_file() for path in drawn)
+        if metrics and (whole or not pictures):
+            also = f", and {folder}" if pictures else ""
+            say(f"kept {file}, measured before on this very model and dataset{also}")
             return metrics
-        kept = f"kept {file}, measured before on this very model and dataset"
-        paths = {folder / f"{frame.name}.png": frame for frame in frames}
-        paths |= {folder / TEST_FOLDER / f"{frame.name}.png": frame for frame in test_frames}
-        if not pictures:
-            say(kept)
-        elif metrics.get("pictures") and all(path.is_file() for path in paths):
-            say(f"{kept}, and {folder}")
-        else:
-            views = [*metrics["views"], *metrics.get("test_views", [])]
-            for done, ((path, frame), view) in enumerate(zip(paths.items(), views, strict=True)):
-                progress(done, len(paths))
-                rgb = render_view(gaussians, frame.camera)[0]
-                write_comparison(path, frame.masked_rgb(), rgb, view["psnr"])
-            metrics = metrics | {"pictures": True}
-            write_json(file, metrics)
-            say(f"{kept}; wrote {folder}")
+        metrics = {"policy": run.label, "of": subject, "pictures": pictures}
+        metrics |= {"informed": _informed(run)}
+        metrics |= evaluate_model(
+            as_drjit(run.gaussians),
+            frames,
+            trained,
+            test_frames=test_frames,
+            pictures=folder if pictures else None,
+            progress=progress,
+        )
+        write_json(file, metrics)
+        run.metrics = metrics
+        say(f"wrote {file}" + (f" and {folder}" if pictures else ""))
         return metrics
 
 
@@ -113,13 +102,13 @@ def _subject(gaussians: Gaussians, frames: Sequence[Frame], trained: list[str]) 
     return array_digest([np.frombuffer(text.encode(), np.uint8)])
 
 
-def _measured_before(file: Path, subject: str) -> dict[str, Any] | None:
-    """Contents of metrics.json if it exists and is of this subject."""
+def _measured_before(run: Run, subject: str) -> dict[str, Any]:
+    """Contents of metrics.json if it exists and is of this subject, else nothing."""
     try:
-        metrics = read_metrics(file.parent)
+        metrics = run.metrics or {}
     except InputError:
-        return None
-    return metrics if metrics is not None and metrics.get("of") == subject else None
+        return {}
+    return metrics if metrics.get("of") == subject else {}
 
 
 def compare_models(models: Sequence[Gaussians], run: Run) -> tuple[str, list[float] | None]:
