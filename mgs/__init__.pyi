@@ -24,11 +24,11 @@ from .report.evaluation import evaluate as evaluate
 from .report.evaluation import evaluate_run as evaluate_run
 from .report.page import write_page as write_page
 from .report.writing import write_report as write_report
-from .run.flight import reachable as reachable
 from .run.folder import Run as Run
 from .run.folder import open_run as open_run
 from .run.loop import choose as choose
 from .run.loop import select_views as select_views
+from .run.nbv import nbv as nbv
 from .run.nbv import resume_nbv as resume_nbv
 from .run.nbv import run_nbv as run_nbv
 from .run.nbv import scene_of as scene_of

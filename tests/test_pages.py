@@ -11,8 +11,7 @@ import pytest
 import synthetic
 
 import mgs
-from mgs.policy import criteria
-from mgs.policy import poses as pose_policies
+from mgs.run.policies import POLICIES
 from mgs.splat import ESTIMATORS
 from mgs.synth import rendering
 
@@ -57,10 +56,7 @@ def quick(monkeypatch, coarse_arena, coarse_priors, short_fits):
 @pytest.fixture
 def tables_restored():
     """Remove the rows and the module that a page adds."""
-    tables = [
-        (table, dict(table))
-        for table in (criteria.CRITERIA, pose_policies.POSE_POLICIES, ESTIMATORS)
-    ]
+    tables = [(table, dict(table)) for table in (POLICIES, ESTIMATORS)]
     yield
     for table, rows in tables:
         table.clear()

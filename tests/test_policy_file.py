@@ -26,8 +26,8 @@ def poses(candidates, taken):
 def information(F, H, lam):
     return float(np.log1p(F / (H + lam)).mean(dtype=np.float64))
 
-def surface(surface_F, surface_H, prior_lam):
-    seen = lambda H: (H[:, :3] > prior_lam[:3]).any(axis=1)
+def surface(surface_F, surface_H, surface_lam):
+    seen = lambda H: (H[:, :3] > surface_lam[:3]).any(axis=1)
     return float((seen(surface_H + surface_F) & ~seen(surface_H)).sum())
 
 def draw(rng, candidates):
@@ -40,10 +40,11 @@ class Height:
     def __call__(self, position: np.ndarray) -> float:
         return float(position[2] - self.ground)
 
-def everything(context, seen, seen_taken, points, candidate, centre):
-    assert seen.shape == (len(context.candidate_frames), len(points))
-    assert seen_taken.shape == (len(context.taken_frames), len(points))
-    assert len(context.dome().positions) == len(context.dome().seen)
+def everything(scene, state, views, seen, seen_taken, points, candidate, centre):
+    assert seen.shape == (len(views), len(points))
+    assert seen_taken.shape == (len(state.taken), len(points))
+    dome = scene.surface(state).dome()
+    assert len(dome.positions) == len(dome.seen)
     return Height(centre[2])(candidate)
 
 def wrong(F, photos):
@@ -83,7 +84,7 @@ def test_arguments_are_passed_by_parameter_name(loaded, file, tmp_path, function
     assert [step["score"] for step in ours.steps] == [step["score"] for step in theirs.steps]
 
 
-def test_a_function_can_use_the_whole_context_and_classes(loaded, file, tmp_path):
+def test_a_function_can_use_scene_and_state_and_classes(loaded, file, tmp_path):
     state = run(tmp_path / "run", loaded, policy=f"{file}:everything")
     assert [step["score"] for step in state.steps[1:]] == pytest.approx([1.5] * 3)
 
@@ -103,7 +104,7 @@ def test_draws_do_not_depend_on_the_folder_of_the_file(loaded, file, tmp_path):
     [
         ("mine.py:nothing", r"has no function nothing"),
         ("mine.py:number", r"has no function number"),
-        ("mine.py:wrong", r"unknown parameter photos; choose from F, "),
+        ("mine.py:wrong", r"unknown parameter photos; choose from rng, F, "),
         ("missing.py:poses", r"no such file .*missing\.py; correct the path"),
         ("bad.py:poses", r"line 2 of .*bad\.py failed: SyntaxError"),
         ("worse.py:poses", r"line 3 of .*worse\.py failed: ModuleNotFoundError: No module named"),
@@ -122,7 +123,7 @@ def test_a_policy_that_cannot_be_loaded_is_one_line(dataset, file, tmp_path, nam
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        ("broken", r"line 38 of .*mine\.py failed: ZeroDivisionError: division by zero"),
+        ("broken", r"line 39 of .*mine\.py failed: ZeroDivisionError: division by zero"),
         ("few", r"returned scores of shape \(1,\) for 9 candidates"),
         ("words", r"returned no numbers \(.*'a'\); return one for each candidate"),
     ],

@@ -185,7 +185,7 @@ def prior(up=(0, 0, 1)) -> Prior:
     n = _normals() @ upright(up)
     mesh = Mesh(n[:3], np.array([[0, 1, 2]]), np.zeros(1, bool))
     numbers = {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS, "backed": 0, "up": list(up)}
-    return Prior(mesh, n, n, 0.5, 0.2, numbers)
+    return Prior(mesh, n, n, 0.5, 0.2, numbers, up=tuple(up))
 
 
 def scene(dataset: Dataset, settings: NbvSettings, **parts) -> TinyScene:

@@ -25,7 +25,8 @@ from mgs.scene import Choice, Scene, State, captured, learn, with_view
 def select_views(
     scene: Scene, policy: Policy, mission: Mission = Mission(), state: State | None = None
 ) -> Iterator[State | Choice]:
-    """Run the loop from the seeds, or from a state; yield the state after every fit.
+    """Run the loop from the seeds, or from a state; yield the state after every fit, and after a
+    pose was given up.
 
     The loop ends when the budget is spent, when no pose is in reach, or by `stop_uncertainty` or
     `stop_gain`. After `stop_gain` the last item is the choice that was refused. Raises InputError
@@ -42,7 +43,7 @@ def select_views(
             return
         frames = captured(scene, state.frames, planned.taken[len(state.taken) :])
         if any(frames[i].given_up for i in planned.taken):
-            state = replace(state, frames=frames)  # choose again without it
+            yield (state := replace(state, frames=frames))  # choose again without it
             continue
         state = learn(scene, planned.taken, state, frames, choices)
         yield state

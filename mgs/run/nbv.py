@@ -16,7 +16,7 @@ from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.visibility import has_masks
 from mgs.errors import InputError, row_named
 from mgs.files import THERE, Ours, atomic_folder, reading
-from mgs.fit.settings import as_3dgs
+from mgs.fit.settings import ModelSettings, as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE
 from mgs.memory import VIEW_BYTES
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
@@ -82,6 +82,34 @@ def run_nbv(
     """
     run = start_run(dataset, out, progress=progress, **settings)
     return resume_nbv(run, on_step, progress, run.policy, settings.get("live"))
+
+
+def nbv(
+    scene: Scene,
+    policy: str | Callable[..., Any] = "directional-i",
+    *,
+    out: str | Path,
+    on_step: Callable[[Checkpoint], None] = lambda state: None,
+    progress: Progress = no_progress,
+    **mission: Any,
+) -> Run:
+    """Choose views of a scene one by one, in a run folder `out`; return the finished run.
+
+    policy: a name, an object, or a function. mission: fields of `Mission`. `run_nbv` with the
+    scene's dataset, prior and settings; the prior is copied into the run. Raises InputError as
+    `start_run` and `resume_nbv`.
+    """
+    model = {name: getattr(scene.settings, name) for name in ModelSettings.model_fields}
+    return run_nbv(
+        scene.dataset,
+        out,
+        prior=scene.prior,
+        policy=policy,
+        on_step=on_step,
+        progress=progress,
+        **model,
+        **mission,
+    )
 
 
 def start_run(

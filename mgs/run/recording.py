@@ -122,7 +122,10 @@ def _go_on(
                 checkpoint = recorder.marked(state, checkpoint, item)
                 write_checkpoint(out, checkpoint)
                 continue
-            state, checkpoint = item, recorder.recorded(item, checkpoint)
+            before, state = state, item
+            if before is not None and before.taken == state.taken:  # a pose was given up
+                continue
+            checkpoint = recorder.recorded(state, checkpoint)
             write_checkpoint(out, checkpoint)
             on_step(checkpoint)
             if "ended" in checkpoint.steps[-1]:
@@ -132,10 +135,10 @@ def _go_on(
         raise InputError(diverged(out, error.step, steps, error.losses)) from None
     assert state is not None
     assert checkpoint is not None
-    before, checkpoint = checkpoint, recorder.marked(state, checkpoint)
-    if checkpoint.steps != before.steps:  # the last candidates were given up
-        write_checkpoint(out, checkpoint)
-    return checkpoint
+    ended = recorder.marked(state, checkpoint)
+    if ended.steps != checkpoint.steps:  # the last candidates were given up
+        write_checkpoint(out, ended)
+    return ended
 
 
 def check_model(out: Path, scene: Scene, settings: NbvSettings, state: State) -> None:
