@@ -113,6 +113,7 @@ class BlockLists:
 
 def footprints(splats: Splats) -> Footprints:
     """Footprints of splats. Each ends where alpha = ALPHA_MIN."""
+    # alpha >= ALPHA_MIN where xi^2 + eta^2 <= log2 o - log2 ALPHA_MIN = q.
     level = splats.log2_opacity + LOG2_INV_ALPHA_MIN
     drawn = splats.visible & (level > 0)
     shape = splats.mean_x, splats.mean_y, splats.depth, splats.shear, splats.white_x, splats.white_y
@@ -168,6 +169,7 @@ def build(splats: Splats, camera: Camera, older: BlockLists | None = None) -> Bl
         order, place = older.order, older.place
     else:
         order, place = _orders(splats, first, blocks_x, blocks_y)
+    # Pairs are sorted by block counted tile by tile; lists are stored by block row by row.
     numbers = _tile_number(dr.arange(mi.UInt32, blocks_x * blocks_y), blocks_x)
     owner, number, slot_start, slot_end = _pairs(foot, order, place, first, blocks_x, blocks_y)
     splat, pair, start, end = _by_block(owner, number, _tile_numbers(blocks_x, blocks_y))
@@ -227,6 +229,7 @@ stable for up to 512 values (with 64 KB of shared memory), and not above."""
 
 def _permutation(keys: Any, count: int) -> Any:
     """Indices that sort UInt32 keys below `count` stably, by a radix sort of even digits."""
+    # Digits of equal length, at most `most` bits: one counting sort for each, lowest first.
     bits, most = max(count - 1, 1).bit_length(), DIGIT_BITS["cpu" if on_cpu() else "gpu"]
     digit = -(-bits // -(-bits // most))
     if digit == bits:
@@ -297,6 +300,7 @@ def _pairs(
         dr.gather(mi.Float, part, order)
         for part in (foot.mean_x, foot.mean_y, foot.shear, foot.white_x, foot.white_y, foot.level)
     )
+    # |eta| <= sqrt(q), so |dy| <= sqrt(q) / e: first and last row of blocks, by pixel centres.
     half = dr.sqrt(dr.maximum(q, 0)) * dr.rcp(e)
     row = mi.Float(first_block[1])
     low = dr.clip(dr.ceil((v - half + 0.5) / BLOCK_Y) - 1 - row, 0, blocks_y)
@@ -308,6 +312,7 @@ def _pairs(
     nearest = dr.gather(mi.UInt32, place, order)
     dr.eval(shapes, rows, nearest)
 
+    # One entry for each (splat, row of blocks): its splat, and its offset from the first row.
     first_row = dr.prefix_sum(rows)
     rank = _run_numbers(first_row, rows, _total(rows, blocks_y, "rows of blocks"))
     owner, block, columns = mi.UInt32(), mi.UInt32(), mi.UInt32()
@@ -319,10 +324,12 @@ def _pairs(
     count = _total(columns, blocks_x, "blocks")
     if count == 0:
         return mi.UInt32(), mi.UInt32(), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n)
+    # One entry for each pair; the blocks of a row are consecutive.
     first = dr.prefix_sum(columns)
     row, slots = _run_numbers(first, columns, count), [dr.empty(mi.UInt32, n) for _ in range(2)]
     block_of_pair = dr.gather(mi.UInt32, block - first, row) + dr.arange(mi.UInt32, count)
     number = _tile_number(block_of_pair, blocks_x)
+    # Slots of a splat: from the first pair of its first row to the last of its last.
     start = dr.gather(mi.UInt32, first, first_row, rows > 0)
     end = dr.gather(mi.UInt32, first + columns, first_row + rows - 1, rows > 0)
     for array, value in zip(slots, (start, end), strict=True):
@@ -356,6 +363,7 @@ def _run_numbers(start: Any, length: Any, count: int) -> Any:
     """
     if count == 0:
         return mi.UInt32()
+    # Mark the first number of each run with the run's index; a running maximum fills the rest.
     begun = dr.zeros(mi.UInt32, count)
     dr.scatter(
         begun, dr.arange(mi.UInt32, len(start)), start, length > 0, mode=dr.ReduceMode.NoConflicts
@@ -380,9 +388,11 @@ def _blocks_of_row(
     """
     u, v, k, p = dr.gather(mi.Vector4f, shapes, 2 * splat)
     e, q, first_row, _ = dr.gather(mi.Vector4f, shapes, 2 * splat + 1)
+    # Band of the row's pixel centres, cut to the ellipse: y from low to high.
     by, half = mi.UInt32(first_row) + offset, dr.sqrt(q) * dr.rcp(e)
     top = mi.Float((by + first_block[1]) * BLOCK_Y) + 0.5 - v
     low, high = dr.maximum(top, -half), dr.minimum(top + (BLOCK_Y - 1), half)
+    # x = k y + sqrt(q - e^2 y^2) / p is largest at y = k p sqrt(q) / (e sqrt(e^2 + k^2 p^2)).
     slant = k * p
     summit = slant * half * dr.rsqrt(e * e + slant * slant)
 
@@ -391,6 +401,7 @@ def _blocks_of_row(
         return u + k * y + side * dr.sqrt(dr.maximum(dr.fma(-e * y, e * y, q), 0)) / p
 
     column = mi.Float(first_block[0])
+    # Blocks with a pixel centre between the left and the right rim.
     first = dr.clip(dr.ceil((rim(-1) + 0.5) / BLOCK_X) - 1 - column, 0, blocks_x)
     last = dr.clip(dr.floor((rim(1) - 0.5) / BLOCK_X) + 1 - column, 0, blocks_x)
     columns = mi.UInt32(dr.select(low <= high, dr.maximum(last - first, 0), 0))
@@ -418,6 +429,7 @@ def _by_block(owner: Any, number: Any, numbers: int) -> tuple[Any, Any, Any, Any
     dr.eval(splat)
     number = dr.gather(mi.UInt32, number, slot, used)
     dr.eval(number)
+    # A list starts where the block differs from the pair before, and ends where from the next.
     previous = dr.gather(mi.UInt32, number, dr.maximum(at, 1) - 1)
     following = dr.gather(mi.UInt32, number, dr.minimum(at + 1, last))
     is_first = used & ((at == 0) | (previous != number))

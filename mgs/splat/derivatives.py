@@ -100,24 +100,32 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
     log_scales = mi.Vector3d(rows_as_vectors(gaussians.log_scales, mi.Vector3f))
     _, unit, _ = axes2d(mean, quats, camera)
     scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
+    # b_i = W t_i: images of the unit axes in whitened pixels per metre.
     k, p, e, share = whitening([a * s for a, s in zip(unit, scales, strict=True)])
     b = [mi.Vector2d(p * (t.x - k * t.y), e * t.y) for t in unit]
     axes = list(zip(b, scales, strict=True))
 
     def product(s: Any, i: int, j: int) -> Any:
+        # f (b_i.x)(b_j.x) with f = 4 ln2^2 s: coefficients of 1, xi^2, xi eta, eta^2.
         x, y, f, constant = b[i], b[j], 4 * LN2 * LN2 * s, mi.Float64(0)
         if gaussians.antialiased:
+            # Antialiased: f / r sum over l of (s_l b_l x b_i)(s_l b_l x b_j) - 2 ln2 s b_i.b_j.
             areas = ((v * (c.x * x.y - c.y * x.x), v * (c.x * y.y - c.y * y.x)) for c, v in axes)
             own = f * sum(one * other for one, other in areas) / share
+            # At the bound of the compensation its derivative is 0.
             bounded = share <= COMPENSATION_MIN**2
             constant = dr.select(bounded, 0, own - 2 * LN2 * s * dr.dot(x, y))
         return mi.Vector4d(constant, f * x.x * y.x, f * (x.x * y.y + x.y * y.x), f * x.y * y.y)
 
+    # A log-scale changes s_i^2 at the pair (i, i); a clamped one changes nothing.
     free = [(s > LOG_SCALE_RANGE[0]) & (s < LOG_SCALE_RANGE[1]) for s in log_scales]
     by_scale = [dr.select(free[i], product(scales[i] * scales[i], i, i), 0) for i in range(3)]
+    # A turn about axis k mixes axes i and j, by the difference of their variances.
     turn = []
     for i, j in ((1, 2), (2, 0), (0, 1)):
         turn.append(product((scales[i] - scales[j]) * (scales[i] + scales[j]), i, j))
+    # dq turns by (2/n) Im(conj(q/n) dq): the derivative by w is -(x X + y Y + z Z), and so on, all
+    # times 2 / n^2; 0 for the zero quaternion, which stays the identity.
     w, x, y, z = quats * dr.select(is_rotation(quats), 2 / dr.squared_norm(quats), 0)
     X, Y, Z = turn
     by_quat = [
@@ -126,6 +134,7 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
         z * X + w * Y - x * Z,
         -y * X + x * Y + w * Z,
     ]
+    # d ln o / d logit = 1 - o.
     transparency = 1 / (1 + dr.exp(mi.Float64(gaussians.logit_opacities.array)))
     basis = sh_basis(mean, camera, gaussians.sh.shape[1])
     positive = [dr.select(c > 0, mi.Float(1), 0) for c in (splats.red, splats.green, splats.blue)]
@@ -143,6 +152,7 @@ def by_means(gaussians: Gaussians, camera: Any) -> list[ByMean]:
     """
     columns = []
     fixed = gaussians.map(dr.detach)
+    # One forward pass of the projection for each of x, y, z.
     for axis in np.eye(3, dtype=np.float32):
         with dr.resume_grad():
             means = dr.copy(fixed.means)
@@ -180,6 +190,7 @@ def weighted_sum(p: Polynomial, moments: Polynomial) -> Any:
 
 def product_sum(p: Polynomial, q: Polynomial, moments: Polynomial) -> Any:
     """Sum over pixels of the product of two polynomials, from the moments."""
+    # Coefficients of the product by power, then each times its moment.
     product: dict[Powers, Any] = {}
     for i, a in enumerate(POWERS):
         for b in POWERS[i:]:
@@ -203,6 +214,7 @@ def means_product(a: ByMean, b: ByMean, sums: Moments) -> Any:
     """Sum over pixels and channels of the product of the derivatives by two means."""
     total = product_sum(a.log_alpha, b.log_alpha, sums.squared)
     for g, h, mixed in zip(a.colour, b.colour, sums.mixed, strict=False):
+        # sum over pixels of (s_c q_a + w g)(s_c q_b + w h), without the first term, above.
         total += (
             h * weighted_sum(a.log_alpha, mixed)
             + g * weighted_sum(b.log_alpha, mixed)

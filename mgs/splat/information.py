@@ -175,6 +175,7 @@ def _sums(
     means, normals, alpha_weight: as in `exact`."""
     device = camera_array(camera.seen_from(gaussians.origin))
     splats, lists, packed = splats_and_lists(gaussians, camera, cache)
+    # The derivative by a mean has a part by colour above degree 0: w g_c, hence w s_c sums.
     moving = means != "frozen"
     cross = block or (moving and gaussians.sh_degree > 0)  # then colour depends on the mean
     count = kernels.fisher_sums(cross, moving)
@@ -186,11 +187,14 @@ def _sums(
             "take fewer or smaller Gaussians, or a smaller image"
         )
     if block:
+        # Off-diagonal entries cancel, so pixels of blocks are computed in double
+        # (`kernels.fisher`).
         exact = project64(gaussians, device)
         dr.eval(exact)
         packed = pack(exact, lists.place)
     weight = dr.opaque(mi.Float, alpha_weight) if alpha_weight else None
     placed = kernels.fisher(lists, packed, dr.detach(as_colour(background)), cross, moving, weight)
+    # Sums by name: w^2; |s|^2 xi^a eta^b; for each channel w s_c xi^a eta^b.
     w2, *sums = sums_by_splat(lists, placed, count)
     squared, mixed = kernels.fisher_moments(cross, moving)
     channels = [sums[len(squared) + c * len(mixed) :] for c in range(3)] if cross else []
@@ -232,9 +236,12 @@ def _diagonal(
 ) -> Any:
     """Columns of `exact` (`_interleaved`)."""
     g = geometry(gaussians, camera, splats)
+    # Colour: Y_k^2 sum w^2, 0 where the channel is clamped at 0.
     columns = [sums.w2 * basis * basis * positive for basis in g.basis for positive in g.positive]
+    # Log-scales, quaternion: sum of |s|^2 (m_k + M_k^T phi)^2. Opacity: (1 - o)^2 sum |s|^2.
     columns += [dr.maximum(product_sum(m, m, sums.squared), 0) for m in g.shape]
     columns.append(g.logit * g.logit * sums.squared[0, 0])
+    # Means: sum over channels of (s_c q + w g_c)^2.
     columns += [dr.maximum(means_product(mean, mean, sums), 0) for mean in by_mean]
     return _interleaved(dict(enumerate(columns)), len(columns), len(gaussians))
 
@@ -257,24 +264,30 @@ def block(
     colour = [(basis, c) for basis in g.basis for c in range(3)]
     k = len(colour)
     upper: dict[tuple[int, int], Any] = {}
+    # Colour x colour: Y_k Y_l sum w^2 of one channel; channels do not mix.
     for i, (basis_i, c) in enumerate(colour):
         scaled = basis_i * g.positive[c]
         for j, (basis_j, d) in enumerate(colour[: i + 1]):
             if c == d:
                 upper[j, i] = sums.w2 * scaled * basis_j
+        # Colour x footprint: Y_k sum of w s_c (m_j + M_j^T phi). Colour x opacity: Y_k (1 - o) sum
+        # w s_c.
         for j, m in enumerate(g.shape):
             upper[i, k + j] = scaled * weighted_sum(m, sums.mixed[c])
         upper[i, k + 7] = scaled * sums.mixed[c][0, 0] * g.logit
+        # Colour x mean: Y_k sum of w (s_c q + w g_c).
         for j, mean in enumerate(by_mean):
             total = weighted_sum(mean.log_alpha, sums.mixed[c])
             if mean.colour:
                 total += sums.w2 * mean.colour[c]
             upper[i, k + 8 + j] = scaled * total
+    # Footprint and opacity among themselves: sums of |s|^2 times products of polynomials.
     for i, m in enumerate(g.shape):
         for j in range(i, 7):
             upper[k + i, k + j] = product_sum(m, g.shape[j], sums.squared)
         upper[k + i, k + 7] = g.logit * weighted_sum(m, sums.squared)
     upper[k + 7, k + 7] = g.logit * g.logit * sums.squared[0, 0]
+    # Means with footprint and opacity, then among themselves.
     for j, mean in enumerate(by_mean):
         for i, m in enumerate(g.shape):
             upper[k + i, k + 8 + j] = mean_product(mean, m, sums)
@@ -282,6 +295,7 @@ def block(
         for i, other in enumerate(by_mean[: j + 1]):
             upper[k + 8 + i, k + 8 + j] = means_product(other, mean, sums)
     size = k + 8 + len(by_mean)
+    # Symmetric: the lower triangle is the upper one.
     both = {i * size + j: value for (i, j), value in upper.items()}
     both |= {j * size + i: value for (i, j), value in upper.items()}
     rows = np.asarray(_interleaved(both, size * size, len(gaussians)))
@@ -301,6 +315,7 @@ def _gradient(
         learned = {name: dr.copy(dr.detach(getattr(gaussians, name))) for name in LEARNED}
         dr.enable_grad(list(learned.values()))
         model = replace(gaussians, means=dr.detach(gaussians.means), **learned)
+        # Gradient of <rgb, z>, with z constant: J^T z.
         rgb = render(model, camera, background, cache).rgb
         dr.backward_from(dr.sum(rgb * image_gradient(dr.detach(rgb)), axis=None))
         gradients = [np.asarray(dr.grad(value)) for value in learned.values()]
@@ -367,6 +382,7 @@ def _interleaved(columns: dict[int, Any], size: int, n: int) -> Any:
     packets = -(-size // 4)
     flat, row = dr.empty(mi.Float, n * packets * 4), dr.arange(mi.UInt32, n) * packets
     for packet in range(packets):
+        # Denormals, which threads flush differently, become 0.
         values = [mi.Float(columns.get(4 * packet + i, 0)) for i in range(4)]
         normal = mi.Vector4f(*(dr.select(dr.abs(value) < SMALLEST, 0, value) for value in values))
         dr.scatter(flat, normal, row + packet, mode=dr.ReduceMode.NoConflicts)

@@ -47,11 +47,13 @@ def _pixel_sums(
 ) -> Any:
     """[T, sum w n, ...] of each pixel of a lane, with a sum for each of a splat's numbers n. T: as
     in `blend`."""
+    # State of a pixel: its transmittance T, then the sums of w n, front to back.
     count = len(numbers(unpack(packed, mi.UInt32(0))))
     pixels = [[t, *(dr.zeros(type(packed), len(lane.first)) for _ in range(count))] for t in T]
 
     def draw(of_splat: list[Any], raw: Any, _xi: Any, _eta: Any, pixel: list[Any]) -> list[Any]:
         T, *sums = pixel
+        # T <- T (1 - alpha) and sum <- sum + w n, with w = alpha T.
         _, w, after, _ = blend(raw, T)
         return [after, *(dr.fma(n, w, s) for n, s in zip(of_splat, sums, strict=True))]
 
@@ -69,10 +71,12 @@ def forward(lists: BlockLists, packed: Any, whole: bool) -> tuple[Any, ...]:
     quotient by alpha, that difference has too few digits in faint pixels.
     """
     lane, T = lanes(lists)
+    # Depth and alpha as sums of w z and w: a quotient of both keeps its digits.
     if whole:
         numbers = lambda splat: [*splat.colour, mi.Float(1), splat.depth]  # noqa: E731
         pixels = _pixel_sums(lists, packed, lane, T, numbers)
         return _store_pixels(lists, lane, [sums for _, *sums in pixels])
+    # T of a finished pixel is negative (`blend`), so alpha = 1 - |T|.
     pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
     return _store_pixels(lists, lane, [[*rgb, 1 - dr.abs(t)] for t, *rgb in pixels])
 
@@ -101,6 +105,10 @@ def log_alpha_tangent(tangents: Splats, splats: Splats) -> dict[tuple[int, int],
     docs/notation.md.
     """
     k, p, e = splats.shear, splats.white_x, splats.white_y
+    # ln alpha = ln 2 (log2 o - xi^2 - eta^2) with xi = p (dx - k dy), eta = e dy, so its tangent is
+    # ln 2 (d log2 o - 2 xi dxi - 2 eta deta). A centre that moves by (u', v') gives dxi = -p (u' -
+    # k v'), deta = -e v'; k' gives dxi = -p dy k' = -(p/e) eta k'; p' gives dxi = (p'/p) xi, and e'
+    # deta = (e'/e) eta.
     one = LN2 * tangents.log2_opacity
     xi = 2 * LN2 * p * (tangents.mean_x - k * tangents.mean_y)
     eta = 2 * LN2 * e * tangents.mean_y
@@ -134,6 +142,7 @@ def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, ...]
     so it is not stored. Where alpha is clamped at ALPHA_MAX or the splat is not drawn, alpha' is 0.
     """
     lane, T = lanes(lists)
+    # State of a pixel: T, the tangent of its alpha so far (-dT), then those of r, g, b and depth.
     pixels = [[t, *(dr.zeros(mi.Float, len(lane.first)) for _ in range(5))] for t in T]
 
     def start(pair: Any, splat: Splats) -> tuple[list[Any], list[Any], list[Any]]:
@@ -147,12 +156,15 @@ def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, ...]
         (one, by_xi, by_eta, xi_xi, xi_eta, eta_eta), numbers, tangents = of_splat
         transmittance, d_alpha_so_far, *sums = pixel
         alpha, w, after, room = blend(raw, transmittance)
+        # d ln alpha = one + by_eta eta + eta_eta eta^2 + (by_xi + xi_eta eta) xi + xi_xi xi^2.
         constant = dr.fma(dr.fma(eta_eta, eta, by_eta), eta, one)
         linear = dr.fma(xi_eta, eta, by_xi)
         d_log_alpha = dr.fma(dr.fma(xi_xi, xi, linear), xi, constant)
+        # d alpha = alpha d ln alpha, 0 where alpha is clamped; then dw = T d alpha + alpha dT.
         alpha = dr.select(room, alpha, 0)
         d_alpha = dr.select(raw <= ALPHA_MAX, alpha * d_log_alpha, 0)
         dw = dr.fma(d_alpha, transmittance, -alpha * d_alpha_so_far)
+        # d(sum of w n) grows by n dw + w dn.
         sums = [
             dr.fma(n, dw, dr.fma(w, dn, s))
             for n, dn, s in zip(numbers, tangents, sums, strict=True)
@@ -198,6 +210,7 @@ def _slopes(
     """
     pairs = zip(colours, behind, strict=True)
     if type(alpha) is mi.Float64:
+        # w / after = alpha T / (T (1 - alpha)) = alpha / (1 - alpha).
         odds = dr.select(free, mi.Float(w) / mi.Float(after), 0)
         slopes = [odds * mi.Float(dr.fma(c, after, -s)) for c, s in pairs]
     else:
@@ -229,6 +242,8 @@ def adjoint(
     the pixel: s times 1, xi^2, xi eta, eta^2 (4), and, if means have gradients, s times xi, eta
     (2).
     """
+    # State of a pixel: T, and the loss behind the current splat, <dL, S>: it starts as <dL, C> and
+    # falls by <dL, c> w with each splat. One number replaces the colours behind.
     lane, T = lanes(lists)
     dL, pixels = [], []
     for pixel in range(len(T)):
@@ -251,6 +266,7 @@ def adjoint(
                 raw = computed_after(raw, [*sums[:4], m0, m1, m2] if x else sums if j else [])
                 transmittance, behind = pixels[j * lane.columns + x]
                 dr_, dg, db, *others = dL[j * lane.columns + x]
+                # c = <dL, c>: what a unit of this splat's weight adds to the loss.
                 alpha, w, after, room = blend(raw, transmittance)
                 c = dr.fma(b, db, others[0]) if others else b * db  # others: alpha, depth
                 if len(others) == 2:
@@ -260,10 +276,14 @@ def adjoint(
                 behind = dr.fma(-c, w, behind)
                 new.append([after, behind])
                 alive |= room
+                # s = dL / d ln alpha = alpha (<dL, c> T - <dL, S> / (1 - alpha)).
                 (slope,) = _slopes([c], [behind], alpha, w, after, room & (raw <= ALPHA_MAX))
+                # dL / dc = sum of w dL, by channel.
                 sums[:3] = [dr.fma(w, d, s) for d, s in zip((dr_, dg, db), sums[:3], strict=True)]
+                # Moments of the row: sums of s, s xi, s xi^2.
                 first = slope * xi
                 m0, m1, m2 = m0 + slope, m1 + first, dr.fma(first, xi, m2)
+            # eta is constant along a row: s xi eta and s eta^2 follow from the row's moments.
             eta_m0 = row.eta * m0
             moments = (m0, m2, m1 * row.eta, eta_m0 * row.eta, m1, eta_m0)
             sums[4:] = [a + b for a, b in zip(sums[4:], moments, strict=True)]
@@ -279,6 +299,8 @@ def splat_gradient(sums: list[Any], splats: Splats) -> Splats:
 
     mean_x and mean_y are None if their sums are missing. Letters p, k, e: docs/notation.md.
     """
+    # Transpose of `log_alpha_tangent`: each field's gradient is its coefficient there times the
+    # sum.
     red, green, blue, depth, one, xi_xi, xi_eta, eta_eta, *first = sums
     k, p, e = splats.shear, splats.white_x, splats.white_y
     mean_x = mean_y = None
@@ -306,6 +328,8 @@ def fisher_moments(cross: bool, means: bool) -> tuple[list[tuple[int, int]], lis
     cross: products with colours are needed. means: derivatives by the means are needed, which alone
     contain xi and eta to the first power.
     """
+    # Without means, d ln alpha has orders 0 and 2, so its squares have 0, 2 and 4; products with a
+    # colour have 0 and 2. Means add order 1, and so 1 and 3 to the squares.
     squared, mixed = [0, 4, 2], [0, 2] if cross else []
     if means:
         squared += [1, 3]
@@ -354,14 +378,17 @@ def fisher(
     Off-diagonal entries of blocks are sums that cancel, so for blocks give splats packed in double
     (`project64`). Pixels are then computed in double; only sums within a block are single.
     """
+    # First pass: the finished colour C of each pixel, from which the second subtracts.
     real = type(packed)
     lane, T = lanes(lists)
     T = [real(t) for t in T]
     pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
     behind, last = _finished(pixels, background, real), [None] * len(T)
+    # T_end sqrt(alpha_weight): the fourth channel, alpha, as a colour that all splats share.
     if alpha_weight is not None:
         last = [mi.Float(dr.abs(t)) * dr.sqrt(alpha_weight) for t, *_ in pixels]
     dr.eval(behind, last)
+    # Second pass: per pair, the sums over the pixels of its block, row by row.
     squared, mixed = fisher_moments(cross, means)
     count = fisher_sums(cross, means)
 
@@ -369,6 +396,8 @@ def fisher(
         new, alive = [], mi.Bool(False)
         sums = [mi.Float(0)] * count
         for j, row in enumerate(rows):
+            # m[a] = sum over the row of |s|^2 xi^a, a = 0 to 4; cross_m[c][a] = sum of w s_c xi^a,
+            # a = 0 to 2. Powers of eta, constant along the row, are multiplied in at its end.
             m = [mi.Float(0)] * 5
             cross_m = [[mi.Float(0)] * 3 for _ in range(3)]
             for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
@@ -377,23 +406,29 @@ def fisher(
                 raw = computed_after(raw, in_row if x else sums if j else [])
                 transmittance, *behind = pixels[pixel]
                 alpha, w, after, room = blend(raw, transmittance)
+                # S <- S - c w: the colour composited behind this splat.
                 behind = [dr.fma(-c, w, s) for c, s in zip(splat.colour, behind, strict=True)]
                 new.append([after, *behind])
                 alive |= room
                 free = room & (raw <= ALPHA_MAX)
+                # s_c = alpha (c T - S / (1 - alpha)), and s_alpha if alpha is observed.
                 slopes = _slopes(splat.colour, behind, alpha, w, after, free, last[pixel])
                 w, xi = mi.Float(w), mi.Float(xi)
+                # Colours: sum of w^2.
                 sums[0] = dr.fma(w, w, sums[0])
+                # Footprint and opacity: |s|^2 times 1, xi, xi^2, xi^3, xi^4.
                 square = sum(s * s for s in slopes)
                 xi2 = xi * xi
                 m[0], m[1] = m[0] + square, dr.fma(square, xi, m[1])
                 m[2] = dr.fma(square, xi2, m[2])
                 power = square * xi2
                 m[3], m[4] = dr.fma(power, xi, m[3]), dr.fma(power, xi2, m[4])
+                # Colour times footprint: w s_c times 1, xi, xi^2.
                 for c, s in enumerate(slopes[:3] if cross else []):
                     ws = w * s
                     a = cross_m[c]
                     cross_m[c] = [a[0] + ws, dr.fma(ws, xi, a[1]), dr.fma(ws, xi2, a[2])]
+            # Moments of the pair: += xi^a eta^b of the row, for each power (a, b).
             eta = mi.Float(row.eta)
             eta2 = eta * eta
             moments = [_monomial(m, power, eta, eta2) for power in squared]
@@ -428,6 +463,7 @@ def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
             behind = [dr.fma(-c, w, s) for c, s in zip(splat.colour, behind, strict=True)]
             new.append([after, *behind])
             alive |= room
+            # alpha D_c in each channel, also where alpha is clamped (mask `room` alone).
             total += sum(s * s for s in _slopes(splat.colour, behind, alpha, w, after, room))
         return new, alive, [total]
 

@@ -163,6 +163,7 @@ def inverse_sqrt(x: Any) -> Any:
 def rotation_columns(quats: Any) -> list[Any]:
     """Columns of the rotation matrices of quaternions wxyz, three Vector3d. Any norm; zero is the
     identity."""
+    # Unit quaternion, then the columns of its rotation matrix.
     quats = dr.select(is_rotation(quats), quats, mi.Vector4d(1, 0, 0, 0))
     w, x, y, z = quats * inverse_sqrt(dr.squared_norm(quats))
     return [
@@ -183,6 +184,7 @@ def sh_basis(means: Any, camera: Any, coefficients: int) -> list[Any]:
 
     means: Vector3d, world, metres. camera: `camera_array`.
     """
+    # Unit direction from the camera's centre (numbers 20 to 22) to each mean.
     offset = means - mi.Vector3d(*_numbers(camera, 20, 23))
     directions = offset * inverse_sqrt(dr.maximum(dr.squared_norm(offset), 1e-24))
     return dr.sh_eval(directions, round(coefficients**0.5) - 1)
@@ -211,10 +213,13 @@ def axes2d(mean: Any, quats: Any, camera: Any) -> tuple[Any, list[Any], Any]:
     R = [mi.Vector3d(*_numbers(camera, 3 * i, 3 * i + 3)) for i in range(3)]
     t = mi.Vector3d(*_numbers(camera, 9, 12))
     fx, fy, cx, cy, x0, x1, y0, y1 = _numbers(camera, 12, 20)
+    # Camera coordinates R m + t; x and y then become x/z and y/z.
     x, y, z = (dr.dot(row, mean) + t[i] for i, row in enumerate(R))
     visible = z > NEAR
     z = dr.select(visible, z, 1)
     x, y, inv_z = x / z, y / z, 1 / z
+    # Rows of T = J R with J = [fx/z, 0, -fx x/z^2; 0, fy/z, -fy y/z^2], the Jacobian of the
+    # projection; in it x/z and y/z are clamped to the film and its margin. Image of axis r: T r.
     T0 = (R[0] - dr.clip(x, x0, x1) * R[2]) * (fx * inv_z)
     T1 = (R[1] - dr.clip(y, y0, y1) * R[2]) * (fy * inv_z)
     unit = [mi.Vector2d(dr.dot(T0, c), dr.dot(T1, c)) for c in rotation_columns(quats)]
@@ -229,10 +234,13 @@ def whitening(axes: list[Any]) -> tuple[Any, Any, Any, Any]:
     The determinant is a sum of squared 2x2 minors of the axes (Cauchy-Binet formula). All terms are
     positive, so nothing cancels, however thin the footprint.
     """
+    # Sigma = [a b; b c] = sum of axis axis^T + EPS2D I, of which only b, c and trace are needed.
     c = sum(a.y * a.y for a in axes) + EPS2D
     b = sum(a.x * a.y for a in axes)
     trace = sum(dr.squared_norm(a) for a in axes)
     minors = [axes[i].x * axes[j].y - axes[i].y * axes[j].x for i, j in ((0, 1), (0, 2), (1, 2))]
+    # det(A A^T) = sum of squared minors = own; det Sigma = own + EPS2D trace + EPS2D^2. k = b / c,
+    # p^2 = c / (2 ln 2 det Sigma), e^2 = 1 / (2 ln 2 c).
     own = sum(m * m for m in minors)
     det = own + EPS2D * trace + EPS2D * EPS2D
     return b / c, dr.sqrt(0.5 * LOG2E * c / det), dr.sqrt(0.5 * LOG2E / c), own / det
@@ -255,15 +263,20 @@ def project64(gaussians: Gaussians, camera: Any) -> Splats:
     log_scales = mi.Vector3d(rows_as_vectors(gaussians.log_scales, mi.Vector3f))
     logit = mi.Float64(gaussians.logit_opacities.array)
     (x, y, depth), unit, visible = axes2d(mean, quats, camera)
+    # Semi-axes in the image, pixels: s_i times the image of axis i.
     scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
     axes = [a * s for a, s in zip(unit, scales, strict=True)]
     shear, white_x, white_y, share = whitening(axes)
+    # log2 of 1 / (1 + e^-l), as min(l, 0) - ln(1 + e^-|l|), which neither overflows nor cancels.
     log2_opacity = LOG2E * (dr.minimum(logit, 0) - dr.log(1 + dr.exp(-dr.abs(logit))))
     if gaussians.antialiased:
+        # log2 of the compensation sqrt(det S / det(S + EPS2D I)).
         log2_opacity += 0.5 * LOG2E * dr.log(dr.maximum(share, COMPENSATION_MIN**2))
+    # The caller names what is not finite (`ListCache.get`).
     finite = dr.all(dr.isfinite(mean)) & dr.all(dr.isfinite(quats))
     finite &= dr.all(dr.isfinite(log_scales)) & dr.isfinite(logit)
     colour, index = mi.Color3d(0.5), dr.arange(mi.UInt32, len(gaussians))
+    # rgb = max(0, 0.5 + sum over k of Y_k(direction) sh_k).
     coefficients = gaussians.sh.shape[1]
     for i, basis in enumerate(sh_basis(mean, camera, coefficients)):
         sh = dr.gather(

@@ -93,6 +93,7 @@ def project(gaussians: Gaussians, camera: Camera) -> Projected:
     z = np.where(visible, z, 1.0)
     margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / fx
     margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / fy
+    # J with x/z and y/z clamped to the film and its margin.
     tx = np.clip(x / z, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
     ty = np.clip(y / z, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
     zero = np.zeros_like(z)
@@ -101,6 +102,7 @@ def project(gaussians: Gaussians, camera: Camera) -> Projected:
     T = J @ R
     scales = np.exp(np.clip(np.asarray(gaussians.log_scales, np.float64), *LOG_SCALE_RANGE))
     A = T @ (rotmat_from_quat(gaussians.quats) * scales[:, None, :])
+    # A = T R_q diag(s), so A A^T is the 2D covariance before the low-pass.
     cov2d = A @ A.transpose(0, 2, 1) + EPS2D * np.eye(2)
     directions = means - camera.position
     directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
@@ -162,6 +164,7 @@ def render(
     alpha is 0)."""
     projected = project(gaussians, camera)
     order, alpha, T, _ = composite(projected, camera)
+    # C = sum of w c + T_end background.
     weights = alpha * T
     total = weights.sum(1)
     rgb = weights @ projected.colours[order] + (1 - total)[:, None] * np.array(background, float)
@@ -218,6 +221,7 @@ def _projection_jacobian(
     [N,7+m,3] and the logarithm of the compensations [N,7+m]."""
     moves = [("log_scales", row) for row in np.eye(3)] + [("quats", row) for row in np.eye(4)]
     moves += [("means", direction) for direction in directions.transpose(1, 0, 2)]
+    # Central differences of everything a pixel depends on, for each column.
     derivatives = []
     for name, direction in moves:
         up, down = (
@@ -263,11 +267,13 @@ def jacobian(
     directions = np.asarray(gaussians.means, np.float64) - eye
     directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
     basis = sh_basis(directions, gaussians.sh_degree)
+    # Alpha as a fourth colour sqrt(alpha_weight) of all Gaussians, in front of 0.
     extra = int(alpha_weight > 0)
     colours = np.concatenate([projected.colours, np.full((n, extra), np.sqrt(alpha_weight))], 1)
     contribution = weights[:, :, None] * colours[order]
     surround = np.append(background, np.zeros(extra))
     image = contribution.sum(1) + (1 - weights.sum(1))[:, None] * surround
+    # S: the pixel minus all down to and including this splat.
     behind = image[:, None, :] - np.cumsum(contribution, 1)
     pixels = _pixels(camera)
     moves = mean_directions(n, means, normals)
@@ -276,17 +282,23 @@ def jacobian(
     J = np.zeros((len(pixels), 3 + extra, n, 3 * K + 1 + d_cov2d.shape[1]))
     for i, j in enumerate(order):
         drawn = np.flatnonzero(alpha[:, i])  # on other pixels the splat changes nothing
+        # Colours: w Y_k, 0 where clamped at 0.
         for c in np.flatnonzero(projected.colours[j] > 0):
             J[drawn, c, j, c : 3 * K : 3] = weights[drawn, i, None] * basis[j]
+        # D = c T - S / (1 - alpha).
         D = colours[j] * T[drawn, i, None] - behind[drawn, i] / (1 - alpha[drawn, i, None])
         dalpha = np.where(clipped[drawn, i], 0.0, alpha[drawn, i])
+        # ln alpha = ln o - d^T Sigma^-1 d / 2 with d = pixel - mean: with e = Sigma^-1 d its
+        # derivative is e.d(mean) + e^T d(Sigma) e / 2, plus that of ln compensation.
         e = (pixels[drawn] - projected.means2d[j]) @ np.linalg.inv(projected.cov2d[j])
         dlog = [
             e @ d_mean + ((e @ d_cov) * e).sum(1) / 2 + d
             for d_mean, d_cov, d in zip(d_means2d[j], d_cov2d[j], d_log[j], strict=True)
         ]
+        # d ln alpha / d logit = 1 - o.
         dlog.insert(7, np.full(len(e), transparency[j]))
         J[drawn, :, j, 3 * K :] = D[:, :, None] * (dalpha[:, None] * np.stack(dlog, 1))[:, None, :]
+        # Means also change the colour, through its direction: w dc.
         J[drawn, :3, j, 3 * K + 8 :] += weights[drawn, i, None, None] * d_colours[j, 7:].T
     return J
 
@@ -318,6 +330,7 @@ def removal_cost(
     remaining = (1 - (alpha * T).sum(1))[:, None]
     image = contribution.sum(1) + remaining * np.array(background, float)
     behind = image[:, None, :] - np.cumsum(contribution, 1)
+    # alpha D = w c - alpha S / (1 - alpha).
     change = contribution - (alpha / (1 - alpha))[:, :, None] * behind
     cost = np.zeros(len(gaussians))
     cost[order] = (change**2).sum((0, 2))

@@ -52,6 +52,7 @@ def pack(s: Splats, place: Any) -> Any:
     (depth, 0, 0, 0). Depth comes last, in a packet of its own that most kernels need not read.
     Splats from `project64` become Float64 [12 N]: the same without rests, depth after opacity.
     """
+    # Four numbers at a time: a lane reads a splat in as few packets as possible.
     parts = [[s.mean_x, s.mean_y, s.shear, s.white_x]]
     if s.mean_x_rest is None:
         parts += [[s.white_y, s.log2_opacity, s.depth, 0], [*s.colour, 0]]
@@ -89,6 +90,7 @@ def unpack(packed: Any, place: Any) -> Splats:
             (*colour, shear_rest),
             (depth, *_),
         ) = (dr.gather(mi.Vector4f, packed, place * 4 + i) for i in range(4))
+        # Rounded part plus rounding error: 48 bits of the double.
         mean_x = mi.Float64(mean_x) + mi.Float64(x_rest)
         mean_y = mi.Float64(mean_y) + mi.Float64(y_rest)
         shear = mi.Float64(shear) + mi.Float64(shear_rest)
@@ -121,6 +123,7 @@ def lanes(lists: BlockLists) -> tuple[Lane, list[Any]]:
     the image."""
     columns, rows = lane_size()
     block, start, end, first = lists.block, lists.start, lists.end, lists.block * PIXELS
+    # On a GPU each lane is one pixel of its block, and the 32 lanes of a block are a warp.
     across, down = mi.UInt32(0), mi.UInt32(0)  # from the block's first pixel to the lane's
     if (per_block := PIXELS // (columns * rows)) > 1:
         lane = dr.arange(mi.UInt32, len(lists.block) * per_block)
@@ -169,6 +172,8 @@ def exp2(x: Any) -> Any:
     Half the instructions of dr.exp2, which also handles infinity and zero: an alpha of 2^-120 is
     not drawn.
     """
+    # x = n + f with n an integer and |f| <= 1/2: 2^f by the polynomial (Horner), times 2^n by
+    # adding n to the bits of the exponent.
     integer, bits = (mi.Int64, 52) if type(x) is mi.Float64 else (mi.Int32, 23)
     x = dr.select(x > -120, x, -120)
     shifted = x + 1.5 * 2.0**bits  # its last bit is worth 1, so x is rounded to an integer
@@ -200,9 +205,12 @@ def block_rows(lane: Lane, s: Splats) -> list[Row]:
     The offset of the lane's first pixel from the splat is computed in double: far along a slanted
     needle, xi is a small difference of large numbers.
     """
+    # (dx, dy): the lane's first pixel minus the splat's centre; corner: xi there.
     real, centre_column, centre_row = type(s.white_x), lane.columns // 2, lane.rows // 2
     dx, dy = mi.Float64(lane.left) - s.mean_x, mi.Float64(lane.top) - s.mean_y
     corner, down = real(mi.Float64(s.white_x) * (dx - s.shear * dy)), real(dy)
+    # xi at column i, row j: corner + white_x i - slant j. With h the step of xi from pixel to
+    # pixel, -(xi + h)^2 + xi^2 = -2 h xi - h^2: the log2 of the ratio of neighbouring alphas.
     slant = s.white_x * real(s.shear)
     bend = exp2(-2 * s.white_x * s.white_x)  # factor of the ratios from pixel to pixel
     middle = [
@@ -212,7 +220,9 @@ def block_rows(lane: Lane, s: Splats) -> list[Row]:
     ratios = {}  # of the alpha beside the centre of each row to that at the centre
     for side in (-1, 1):
         # side: -1 to the right, 1 to the left.
+        # 2^(side 2 white_x xi - white_x^2): ratio in the central row.
         beside = exp2(s.white_x * dr.fma(real(2 * side), middle[centre_row], -s.white_x))
+        # From row to row xi at the centre falls by slant, so ratios turn by 2^(2 side way h slant).
         ratio = [beside] * lane.rows
         above, below = range(centre_row - 1, -1, -1), range(centre_row + 1, lane.rows)
         for way, rows in ((-1, below), (1, above)):
@@ -223,11 +233,14 @@ def block_rows(lane: Lane, s: Splats) -> list[Row]:
     made = []
     left, right = range(centre_column - 1, -1, -1), range(centre_column + 1, lane.columns)
     for j in range(lane.rows):
+        # Central pixel of the row: log2 alpha = log2 o - eta^2 - xi^2.
         eta = s.white_y * (down + j)
         first = dr.fma(-slant, real(j), corner)
         xi = [dr.fma(s.white_x, real(i), first) for i in range(lane.columns)]
         centre = xi[centre_column]
         power = dr.fma(-centre, centre, dr.fma(-eta, eta, s.log2_opacity))
+        # Its neighbours by multiplication, to the right and to the left; each ratio bends by -2
+        # h^2.
         raw = [dr.select(power > -120, exp2(power), 0)] * lane.columns
         for side, columns in ((-1, right), (1, left)):
             ratio = ratios[side][j]
@@ -249,6 +262,7 @@ def blend(raw: Any, T: Any) -> tuple[Any, Any, Any, Any]:
     Thresholds are comparisons and selects, because dr.minimum and dr.maximum take five
     instructions to propagate NaN.
     """
+    # after = T (1 - alpha); the splat is drawn if that leaves more than TRANSMITTANCE_MIN.
     alpha = dr.select(raw >= ALPHA_MIN, dr.select(raw < ALPHA_MAX, raw, ALPHA_MAX), 0)
     after = dr.fma(-alpha, T, T)
     room = after > TRANSMITTANCE_MIN
@@ -299,12 +313,14 @@ def walk(
     """
 
     def visit(i: Any, drawn: list[tuple[Any, Splats, list[Row]]], pixels: Any) -> Any:
+        # Pixel by pixel, all splats of this iteration, so that a pixel's state is read once.
         started = [(start(pair, splat), rows) for pair, splat, rows in drawn]
         new: list[list[Any]] = []
         most: Any = None  # largest transmittance so far; that of a finished pixel is negative
         for number, pixel in enumerate(pixels):
             for of_splat, rows in started:
                 row, x = rows[number // lane.columns], number % lane.columns
+                # Compiled after the pixels before it (`computed_after`).
                 raw = computed_after(row.raw_alpha[x], [] if most is None else [mi.Float(most)])
                 pixel = draw(of_splat, raw, row.xi[x], row.eta, pixel)
             new.append(pixel)
@@ -353,6 +369,7 @@ def walk_and_store(
         store(pair, sums)
         return pixels, alive
 
+    # The sums are not cleared before: pairs behind finished pixels get their zeros here.
     def store_zeros(pair: Any) -> tuple[Any]:
         store(pair, [mi.Float(0)] * count)
         return (pair + 1,)
@@ -371,6 +388,7 @@ def pair_at(
     if k == 0:
         pair, splat = first, unpack(packed, dr.gather(mi.UInt32, lists.splat, first))
     else:
+        # Beyond the list's end: the first pair once more, with an alpha of 2^-200.
         there = first + k < lane.end
         pair = dr.select(there, first + k, first)
         splat = unpack(packed, dr.gather(mi.UInt32, lists.splat, pair))
@@ -422,9 +440,11 @@ def sums_by_place(lists: BlockLists, stored: Any, count: int, real: Any) -> Any:
     Returns [N * packets * 4] of type `real` (Float or Float64), by place.
     """
     dr.eval(stored)
+    # Slots of one splat are consecutive, so a lane adds those of one splat, in their order.
     packets, end = packet_count(count), lists.slot_end
 
     def body(first: Any, totals: list[Any]) -> Any:
+        # Reads of slots beyond the end are masked to 0.
         for slot in (first + k for k in range(AT_ONCE)):
             pair = dr.gather(mi.UInt32, lists.pair, slot, slot < end) * packets
             parts = [dr.gather(mi.Vector4f, stored, pair + i, slot < end) for i in range(packets)]
