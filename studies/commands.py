@@ -348,15 +348,6 @@ def calibration(runs: Runs) -> None:
                 CONSOLE.print(f"wrote {path}")
 
 
-def convergence(runs: Runs) -> None:
-    """Estimate how far the objective of each run's last fit is above its minimum."""
-    from studies.convergence import fit_line
-
-    runtime.start()
-    for run in runs:
-        CONSOLE.print(f"{run}: {fit_line(run)}")
-
-
 def bench(
     json: Annotated[Path | None, typer.Option(help="Write all measurements to this file.")] = None,
     gaussians: Annotated[int, typer.Option(help="Number of Gaussians.", min=1000)] = 100_000,

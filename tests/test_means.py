@@ -26,7 +26,6 @@ from mgs.run.nbv import resume_nbv, run_nbv, start_run
 from mgs.run.settings import NbvSettings
 from mgs.splat import MEANS, as_drjit, fisher, groups, render
 from mgs.view.subject import SCALARS, read_subject
-from studies.convergence import remaining_decrease
 
 N, SPACING = 300, (4 * np.pi / 300) ** 0.5
 MOVING = ("normal", "free")
@@ -182,7 +181,6 @@ def test_criteria_see_the_means_and_coverage_does_not(files, whole):
     made, prior = run_folder.open_run(out).settings, load_prior(files[1])
     dataset = load_dataset(files[0])
     frames = [dataset.frames[i] for i in state.taken]
-    cameras = [frame.camera for frame in dataset.frames]
     facing = initial_normals(prior)
     H = sum(
         fisher(state.gaussians, frame.camera, means=means, normals=facing).astype(float)
@@ -202,8 +200,6 @@ def test_criteria_see_the_means_and_coverage_does_not(files, whole):
     assert np.abs(moved).max() > 1e-3
     sideways = moved - (moved * facing).sum(1, keepdims=True) * facing
     assert (np.abs(sideways).max() < 1e-6) == (means == "normal")
-    left = remaining_decrease(state.gaussians, made, prior, frames, cameras)
-    assert 0 < left["predicted_decrease"] < 1
 
 
 def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, monkeypatch):

@@ -1,5 +1,5 @@
 """Objective of a fit: the negative logarithm of the posterior of the Gaussians' parameters, with
-its gradient and curvature.
+its gradient, and the diagonal of its curvature.
 
 Model: a pixel is the rendered value plus noise of standard deviation sigma, and each parameter is
 normally distributed around its start with standard deviation tau. The negative logarithm of the
@@ -21,9 +21,6 @@ alpha_weight = (sigma / sigma_alpha)^2 times. The criteria ignore alpha.
 Means are frozen by default, as in the paper. Means that are "free" are parameters like the others.
 Means that move along the "normal" have one parameter per Gaussian: the offset from the start along
 a given normal, metres.
-
-The curvature is never stored. Its product with a vector takes one derivative in forward mode and
-one in reverse mode for each image.
 """
 
 from __future__ import annotations
@@ -239,14 +236,6 @@ class Objective:
             lambda photo: _image_gradient(model, self.prior, self.view(model, photo)),
         )
 
-    def curvature_times(self, model: Gaussians, vector: Vector) -> Vector:
-        """Product of J^T J + lam and a vector."""
-        lam = self.prior.lam.values()
-        return self._summed(
-            [mi.TensorXf(part * v.array, v.shape) for v, part in zip(vector, lam, strict=True)],
-            lambda photo: _image_curvature(model, self.prior, self.view(model, photo), vector),
-        )
-
     def diagonal(self, model: Gaussians) -> Vector:
         """Diagonal of J^T J + lam, with pixel weights of 1."""
         return self._summed(
@@ -388,58 +377,6 @@ def _rendered(model: Gaussians, photo: Photo, cache: ListCache) -> Any:
     return composite_channels(splats, packed, lists, *photo.size).array
 
 
-def newton_decrease(
-    found: Objective,
-    model: Gaussians,
-    iterations: int,
-    progress: Callable[[int, int], None] = lambda done, most: None,
-) -> list[float]:
-    """Newton decrease 1/2 g^T (J^T J + lam)^-1 g after each iteration of conjugate gradients with
-    the diagonal as preconditioner.
-
-    It is the largest decrease of Phi if images were linear in the parameters. The numbers grow
-    towards it. The full J^T J is needed: its diagonal ignores that neighbouring splats can replace
-    each other. lam must not be 0.
-    """
-    gradient = found.gradient(model)
-    inverse = [dr.rcp(d.array) for d in found.diagonal(model)]
-
-    def preconditioned(vector: Vector) -> Vector:
-        return [mi.TensorXf(i * v.array, v.shape) for i, v in zip(inverse, vector, strict=True)]
-
-    x = [dr.zeros(mi.TensorXf, g.shape) for g in gradient]
-    residual = [-g for g in gradient]
-    z = preconditioned(residual)
-    direction, rz, decreases = z, dot(residual, z), []
-    if rz == 0:  # at a minimum, or no camera sees the model
-        return [0.0]
-    for done in range(iterations):
-        progress(done, iterations)
-        product = found.curvature_times(model, direction)
-        step = rz / dot(direction, product)
-        x, residual = plus(x, step, direction), plus(residual, -step, product)
-        z = preconditioned(residual)
-        before, rz = rz, dot(residual, z)
-        direction = plus(z, rz / before, direction)
-        dr.eval(x, residual, direction)
-        decreases.append(-0.5 * dot(gradient, x))
-    return decreases
-
-
-def dot(a: Vector, b: Vector) -> float:
-    """Dot product, in double precision."""
-    sums = [dr.sum(mi.Float64(x.array) * mi.Float64(y.array)) for x, y in zip(a, b, strict=True)]
-    return sum(float(s[0]) for s in sums)
-
-
-def plus(a: Vector, factor: float, b: Vector) -> Vector:
-    """a + factor b."""
-    scale = dr.opaque(mi.Float, factor)
-    return [
-        mi.TensorXf(dr.fma(scale, y.array, x.array), x.shape) for x, y in zip(a, b, strict=True)
-    ]
-
-
 def with_gradients(model: Gaussians, prior: ParameterPrior) -> Gaussians:
     """A copy of a model whose learned parameters have gradients enabled. For use in recorded
     functions."""
@@ -448,7 +385,7 @@ def with_gradients(model: Gaussians, prior: ParameterPrior) -> Gaussians:
     return replace(model, **values)
 
 
-def _sizes(model: Gaussians, prior: ParameterPrior, view: View, *others: Any) -> tuple[Any, ...]:
+def _sizes(model: Gaussians, prior: ParameterPrior, view: View) -> tuple[Any, ...]:
     return prior.means, *model.recorded, *view.recorded_sizes
 
 
@@ -458,20 +395,6 @@ def _image_gradient(model: Gaussians, prior: ParameterPrior, view: View) -> Vect
     copy = with_gradients(model, prior)
     error = (view.rendered(copy).array - view.target.pixels) * view.target.weights
     dr.backward(0.5 * dr.sum(dr.square(error)))
-    return _gradients(copy, prior)
-
-
-@frozen(_sizes)
-def _image_curvature(model: Gaussians, prior: ParameterPrior, view: View, vector: Vector) -> Vector:
-    """Product of J^T J of one image and a vector: J v in forward mode, then J^T in reverse mode."""
-    copy = with_gradients(model, prior)
-    for name, tangent in zip(prior.lam, vector, strict=True):
-        dr.set_grad(getattr(copy, name), prior.across(name, tangent))
-    rendered = view.rendered(copy)
-    dr.forward_to(rendered)
-    product = dr.detach(dr.grad(rendered).array) * dr.square(view.target.weights)
-    copy = with_gradients(model, prior)
-    dr.backward(dr.sum(view.rendered(copy).array * product))
     return _gradients(copy, prior)
 
 
