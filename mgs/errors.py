@@ -19,7 +19,6 @@ EXTRAS = {
     "plotly": "page",
     "jinja2": "page",
     "viser": "view",
-    "tensorboardX": "tensorboard",
 }
 """Modules that only some commands need -> extra of pyproject.toml that installs them."""
 

@@ -221,13 +221,3 @@ def test_without_masks_alpha_has_no_weight_by_default(dataset, prior, tmp_path):
     write_json(dataset / "transforms.json", made)
     assert weight("bare") == 0
     assert weight("given", train={"alpha_weight": 0.3}) == 0.3
-
-
-def test_steps_are_logged_for_tensorboard(dataset, prior, tmp_path):
-    pytest.importorskip("tensorboardX")
-    short = ["--seeds", 3, "--budget", 1, "--set", "train.passes=1", "--set", "evaluate_every=1"]
-    run = tmp_path / "run"
-    command("nbv", dataset, "--prior", prior, "--out", run, *short, "--tensorboard")
-    (log,) = (run / "tensorboard").iterdir()
-    logged = log.read_bytes()
-    assert all(name in logged for name in (b"psnr", b"information_gain", b"newest_view/render"))

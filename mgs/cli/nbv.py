@@ -115,9 +115,6 @@ def nbv(
     settings: Settings = None,
     config: Config = None,
     force: Force = False,
-    tensorboard: Annotated[
-        bool, typer.Option("--tensorboard", help="Also log to RUN/tensorboard.")
-    ] = False,
 ) -> None:
     """Choose the next best views: fit to a few seed views, choose a view, read its image, fit
     again.
@@ -129,17 +126,13 @@ def nbv(
     from mgs.cli.options import parse_gaussians
     from mgs.cli.terminal import Terminal
     from mgs.errors import InputError
-    from mgs.run.folder import open_run
 
-    if tensorboard:
-        import tensorboardX  # noqa: F401  # its absence is known before the work
     console = Terminal()
     values = parse_settings(settings, nbv)
     live = live_capture(capture_command, capture_folder, values.pop("capture", {}))
     if resume is not None:
         refuse_others(context, resume, values)
-        logged = _logged(open_run(resume), tensorboard)
-        resume_and_print(resume, console, policy, live=live, on_state=logged)
+        resume_and_print(resume, console, policy, live=live)
         return
     recorded = settings_in(config) if config else {}
     values = merged(recorded, values)
@@ -164,18 +157,7 @@ def nbv(
         force=force,
         **{key: value for key, value in values.items() if key not in ("dataset", "prior")},
     )
-    logged = _logged(run, tensorboard)
-    resume_and_print(run, console, run.settings.policy, live=live, on_state=logged)
-
-
-def _logged(run: Run, wanted: bool) -> Callable[[Checkpoint], None]:
-    """Callback that logs steps to RUN/tensorboard, or does nothing."""
-    from mgs.files import below
-    from mgs.run import tensorboard
-
-    if not wanted:
-        return lambda state: None
-    return tensorboard.tensorboard(below(run.folder, "tensorboard"), run.dataset)
+    resume_and_print(run, console, run.settings.policy, live=live)
 
 
 def live_capture(command: str | None, folder: Path | None, values: dict[str, Any]) -> Live | None:
@@ -201,7 +183,7 @@ def refuse_others(context: typer.Context, resume: Path, values: dict[str, Any]) 
     """Raises InputError where an option or a setting is given beside --resume."""
     from mgs.errors import InputError
 
-    again = ("resume", "policy", "tensorboard", "settings", "capture_command", "capture_folder")
+    again = ("resume", "policy", "settings", "capture_command", "capture_folder")
     others = [
         name
         for name in context.params
@@ -243,13 +225,11 @@ def resume_and_print(
     policy: str | None = None,
     pictures: bool = False,
     live: Live | None = None,
-    on_state: Callable[[Checkpoint], None] = lambda state: None,
 ) -> None:
     """Run or resume the loop of a run, evaluate (with pictures where asked), print the table of
     steps; where the output is no terminal, a line after each step instead.
 
     policy: FILE.py:FUNCTION where the run has a policy of the user's own. live: of its pictures.
-    on_state: called with every state that is on disk.
     """
     from functools import partial
 
@@ -264,7 +244,6 @@ def resume_and_print(
     with progress_bar("reading", console) as progress:
 
         def on_step(state: Checkpoint) -> None:
-            on_state(state)
             progress.whole(f"{run.folder.name}: images", len(state.taken), total)
             new = state.steps[len(known) :]
             known.extend(new)

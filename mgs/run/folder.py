@@ -59,7 +59,7 @@ CHECKPOINT, STEPS, POLICY_SOURCE = "checkpoint.npz", "steps.jsonl", "policy.py"
 
 FILES = [
     *("config.json", CHECKPOINT, STEPS, "metrics.json", "gaussians*", POLICY_SOURCE),
-    *("prior", "dataset", "renders", "diagnostics", "tensorboard", "export.*", "video.*"),
+    *("prior", "dataset", "renders", "diagnostics", "export.*", "video.*"),
 ]
 """Names in the folder of a run, with what commands add to it."""
 
