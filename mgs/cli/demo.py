@@ -77,8 +77,9 @@ def demo(
         else [*begin, "--policy", policy, "--out", str(folder)]
         for policy, folder in zip(POLICIES, runs, strict=True)
     ]
-    for words, printed in in_processes(jobs, runs, console):  # meanwhile the next runs go on
-        console.print(f"$ mgs {shlex.join(words)}\n{printed}", soft_wrap=True)
+    for k, printed in enumerate(in_processes(jobs, runs, console)):  # the next runs go on
+        console.print(f"$ mgs {shlex.join(jobs[k])}\n{printed}", soft_wrap=True)
+        console.print(f"$ mgs eval {runs[k]}", soft_wrap=True)
     run("diagnose", runs[0], "--force")
     heading("4/4 the report")
     run("report", *runs, "--out", report, "--force")
@@ -88,11 +89,9 @@ def demo(
         console.print(f"  {picture}", soft_wrap=True)
 
 
-def in_processes(
-    jobs: list[Words], runs: list[Path], console: Terminal
-) -> Iterator[tuple[Words, str]]:
-    """Call `mgs nbv` for several runs, as many at once as there are cores, each in a process; yield
-    each command and what it printed, in order.
+def in_processes(jobs: list[Words], runs: list[Path], console: Terminal) -> Iterator[str]:
+    """Call `mgs nbv` and `mgs eval` for several runs, as many at once as there are cores, each in a
+    process; yield what `nbv` printed, in order.
 
     The last ones, fewer than the cores, have several threads each: a run's kernels are small, so
     many threads mostly wait. Raises InputError as the command, and if a process is killed.
@@ -104,10 +103,10 @@ def in_processes(
         threads = [cores // (count if k < len(jobs) - last else last) for k in range(len(jobs))]
         calls = [pool.submit(nbv_and_eval, *job) for job in zip(jobs, runs, threads, strict=True)]
         try:
-            for words, call in zip(jobs, calls, strict=True):
+            for call in calls:
                 while not wait([call], 1).done:
                     progress("steps", sum(map(steps_done, runs)), len(runs) * (1 + BUDGET))
-                yield words, call.result()
+                yield call.result()
         except BrokenProcessPool:
             raise InputError(
                 "demo: a process was killed (is there too little memory?); give the command again"
