@@ -21,7 +21,6 @@ from mgs.data.dataset import load_dataset
 from mgs.fit.settings import COLOURS_ALONE, PASSES, WARM_PASSES
 from mgs.plotting import drawing
 from mgs.run.nbv import run_nbv
-from mgs.run.settings import PRESETS
 from mgs.run.state import Checkpoint
 from studies.case import Case, Rock, Size, judge, test_views_of
 from studies.output import Content, group_styles, logarithmic, table, write_table
@@ -50,6 +49,14 @@ LATER_PASSES = {2: 2, 5: 3, 10: 5, 20: 10, 40: 20}
 EQUAL_TIME, LOSS = 1.05, 0.1
 """Factor up to which times count as equal, and loss in dB up to which a preset is as good as the
 best run of equal time."""
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "fast": {"passes": 5, "warm_passes": 3, "density": 1 / 4},
+    "balanced": {"passes": PASSES, "warm_passes": WARM_PASSES, "density": 1 / 2},
+    "accurate": {"passes": PASSES, "warm_passes": WARM_PASSES, "density": 5 / 4},
+}
+"""Fields of a `Point` by name: settings that docs/speed-accuracy.md recommends."""
 
 
 @dataclass(frozen=True)
@@ -163,9 +170,9 @@ def factors(size: ChartSize) -> dict[str, list[Point]]:
 
 
 def preset_points(size: ChartSize) -> dict[str, Point]:
-    """Runs of `mgs nbv --preset`."""
+    """Runs with PRESETS."""
     run = Point(size.count, policy="d-optimal")
-    return {name: replace(run, **asdict(row)) for name, row in PRESETS.items()}
+    return {name: replace(run, **row) for name, row in PRESETS.items()}
 
 
 def points_of(size: ChartSize, kind: str) -> list[Point]:
@@ -256,7 +263,7 @@ def preset_losses(rows: Sequence[Row]) -> list[float]:
 
 
 PRESET_CLAIM = Claim(
-    "A preset of `mgs nbv` loses at most 0.1 dB against the best run of equal time.",
+    "A recommended setting loses at most 0.1 dB against the best run of equal time.",
     preset_losses, "dB", "below", LOSS, "preset",
 )  # fmt: skip
 

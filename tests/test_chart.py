@@ -16,10 +16,8 @@ from refusals import refused
 from mgs.cli.app import app
 from mgs.cli.nbv import nbv
 from mgs.cli.options import parse_settings
-from mgs.errors import InputError
-from mgs.fit.settings import ALPHA_WEIGHT, COLOURS_ALONE, TrainSettings
-from mgs.run.nbv import run_nbv, start_run
-from mgs.run.settings import PRESETS, NbvSettings, with_defaults
+from mgs.run.nbv import run_nbv
+from mgs.run.settings import NbvSettings
 from studies import case, chart, photographs, timing
 from studies.commands import program
 
@@ -70,7 +68,7 @@ def parsed(line):
 def test_commands_of_points_say_what_was_measured(size):
     points = [point for kind in chart.KINDS for point in chart.points_of(size, kind)]
     assert len({point.name for point in points}) == len(points)
-    assert set(chart.preset_points(size)) == set(PRESETS)
+    assert set(chart.preset_points(size)) == set(chart.PRESETS)
     assert set(chart.preset_points(size).values()) <= set(points)
     for point in points:
         words, made = parsed(point.command("DATA", "PRIOR", size.seeds)), point.settings(size.seeds)
@@ -87,41 +85,6 @@ def test_a_preset_that_is_beaten_by_a_run_of_its_time_fails():
     fast = row | {"seconds": 0.5, "psnr": 20.0, "preset": "fast", "factors": "preset"}
     other = row | {"factors": "policy", "psnr": 50.0}
     assert chart.preset_losses([row | {"preset": "balanced"}, *better, fast, other]) == [0.5, 0.0]
-
-
-def test_a_preset_gives_defaults_and_what_is_given_wins():
-    row = PRESETS["fast"]
-    usual = {"passes": row.passes, "alpha_weight": ALPHA_WEIGHT}
-    assert with_defaults({}, row)["train"] == usual
-    given = {"warm_passes": 7, "train": {"passes": 9, "optimiser": "adam", "alpha_weight": 0.0}}
-    assert with_defaults(given, row) == given
-    adam = with_defaults({"train": TrainSettings(optimiser="adam")}, row)
-    assert adam["train"] == usual | {"optimiser": "adam"}
-    assert with_defaults({"budget": 3}) == {"budget": 3, "train": {"alpha_weight": ALPHA_WEIGHT}}
-    assert with_defaults({"train": COLOURS_ALONE})["train"] == {"alpha_weight": 0.0}
-    for wrong in (None, "fast", 3):  # refused later
-        assert with_defaults({"train": wrong}) == {"train": wrong}
-
-
-def test_a_run_with_a_preset_writes_what_it_came_to(dataset, prior, tmp_path, monkeypatch):
-    start_run(dataset, tmp_path / "run", prior=prior, preset="fast", seeds=3, warm_passes=4)
-    settings = json.loads((tmp_path / "run/config.json").read_text())["settings"]
-    assert settings["train"]["passes"] == PRESETS["fast"].passes
-    assert settings["warm_passes"] == 4
-    with pytest.raises(InputError, match=r"^preset 'best': unknown; choose one of fast, balanced"):
-        start_run(dataset, tmp_path / "other", prior=prior, preset="best")
-    asked = []
-
-    def build(frames, given, source, on_stage):
-        asked.append(given)
-        raise InputError("enough")
-
-    monkeypatch.setattr("mgs.run.nbv.build_prior", build)
-    for options in ({"preset": "accurate"}, {"preset": "accurate", "gaussians": 50}):
-        with pytest.raises(InputError, match="enough"):
-            start_run(dataset, tmp_path / "built", seeds=3, **options)
-    density = PRESETS["accurate"].density
-    assert [(given.density, given.gaussians) for given in asked] == [(density, None), (density, 50)]
 
 
 @pytest.fixture

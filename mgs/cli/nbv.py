@@ -24,7 +24,7 @@ from mgs.cli.options import (
 )
 from mgs.run.policies import POLICIES
 from mgs.run.policy_file import in_file
-from mgs.run.settings import PRESETS, NbvSettings, Positive, settings_in, validated
+from mgs.run.settings import NbvSettings, Positive, settings_in, validated
 
 if TYPE_CHECKING:
     from mgs.cli.terminal import Terminal
@@ -108,10 +108,6 @@ def nbv(
     capture_folder: Annotated[
         Path | None, option("Folder to which poses are written; pictures are awaited there.")
     ] = None,
-    preset: Annotated[
-        str | None,
-        option(f"Defaults for passes and the number of Gaussians: {', '.join(PRESETS)}."),
-    ] = None,
     settings: Settings = None,
     config: Config = None,
     force: Force = False,
@@ -153,7 +149,6 @@ def nbv(
         live=live,
         prior=prior,
         gaussians=parse_gaussians(gaussians),
-        preset=preset,
         force=force,
         **{key: value for key, value in values.items() if key not in ("dataset", "prior")},
     )

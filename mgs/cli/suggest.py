@@ -114,7 +114,6 @@ def suggest(
     gaussians: Annotated[
         str | None, option("Build a prior of this many Gaussians.", metavar="N|auto")
     ] = None,
-    preset: Annotated[str | None, option("As in `mgs nbv`: fast, balanced or accurate.")] = None,
     settings: Settings = None,
     force: Force = False,
 ) -> None:
@@ -146,7 +145,7 @@ def suggest(
         check_new_folder(out, ours)
     runtime.start()
     with TemporaryDirectory() as scratch, progress_bar("reading", console) as progress:
-        fit = {"prior": prior, "gaussians": parse_gaussians(gaussians), "preset": preset}
+        fit: dict[str, Any] = {"prior": prior, "gaussians": parse_gaussians(gaussians)}
         fit |= {"policy": policy}
         run = _run(source, Path(scratch) / "run", fit, progress)
         if plan and run.dataset.unit != "m":
@@ -190,7 +189,7 @@ def _run(source: Path, scratch: Path, settings: dict[str, Any], progress: Any) -
     from mgs.run.nbv import resume_nbv, start_run
 
     if holds_run(source):
-        for name in ("prior", "gaussians", "preset"):
+        for name in ("prior", "gaussians"):
             if settings[name] is not None:
                 raise InputError(f"suggest: {source} is a run with its model; leave out `{name}`")
         return open_run(source)

@@ -14,7 +14,7 @@ from mgs import runtime
 from mgs.camera import extent_of
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.visibility import has_masks
-from mgs.errors import InputError, row_named
+from mgs.errors import InputError
 from mgs.files import THERE, Ours, atomic_folder, reading
 from mgs.fit.settings import ModelSettings, as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE
@@ -33,7 +33,6 @@ from mgs.run.policies import Policy
 from mgs.run.policy_file import in_file, is_function, label, name_of, policy_of, source_of
 from mgs.run.settings import (
     ALPHA_WEIGHT,
-    PRESETS,
     NbvSettings,
     check_settings,
     validated,
@@ -121,7 +120,6 @@ def start_run(
     prior: str | Path | Prior | None = None,
     gaussians: int | Literal["auto"] | None = None,
     source: str | None = None,
-    preset: str | None = None,
     loose: float = 1.0,
     force: bool = False,
     progress: Progress = no_progress,
@@ -136,7 +134,7 @@ def start_run(
     - prior: a folder, or a Prior, which is copied into the run. Default: DATASET/prior if it
       exists, else a prior of `gaussians` built in the run (default: as many as cameras resolve).
     - source: what a prior built in the run is made from (`mgs.prior.photographs.source_of`).
-    - preset: a row of `PRESETS`, whose values are defaults. loose: as `NbvSettings.with_spacing`.
+    - loose: as `NbvSettings.with_spacing`.
     - force: replace an existing run.
     - settings: fields of `NbvSettings`. `policy` may also be a function (docs/howto/policy.md),
       whose source is kept in the run. The default of `budget` is 50 views or all candidates;
@@ -161,7 +159,6 @@ def start_run(
         raise InputError("nbv: `gaussians` builds a prior; leave it out, or leave out `prior`")
     if (prior, gaussians, source) == (None,) * 3 and (root / "prior/prior.json").is_file():
         prior = root / "prior"
-    row = None if preset is None else row_named(PRESETS, preset, "preset")
     loaded = given
     if given is None and capture is None:
         loaded = load_dataset(root, to_capture=live is not None)
@@ -178,7 +175,7 @@ def start_run(
         settings = settings | {"budget": 1}
     outlined = not loaded or loaded.outlined
     weight = ALPHA_WEIGHT if outlined else 0.0
-    wanted = with_defaults(settings | {"policy": named}, row, weight)
+    wanted = with_defaults(settings | {"policy": named}, weight)
     known = validated(
         NbvSettings, {"dataset": images.resolve(), "prior": where.resolve(), **wanted}
     )
@@ -190,7 +187,7 @@ def start_run(
     read = [path for path in (root if capture is None else None, prior) if isinstance(path, Path)]
     with atomic_folder(out, Ours(FILES, read) if holds_run(out) else None) as unfinished:
         frames = loaded or _poses(unfinished / DATASET, str(capture), complete.seed, progress)
-        built = found or _built_prior(frames, gaussians, source, row, complete.seed, progress)
+        built = found or _built_prior(frames, gaussians, source, complete.seed, progress)
         if not isinstance(prior, str | Path):
             save_prior(unfinished / "prior", built)
         _check_near(built, frames, where)
@@ -280,10 +277,10 @@ def _automatic(
 
 
 def _built_prior(
-    frames: Dataset, gaussians: Any, source: str | None, row: Any, seed: int, progress: Progress
+    frames: Dataset, gaussians: Any, source: str | None, seed: int, progress: Progress
 ) -> Prior:
     """Build a prior of a dataset, or of its survey."""
-    asked = PriorSettings(gaussians=gaussians, seed=seed, density=row.density if row else None)
+    asked = PriorSettings(gaussians=gaussians, seed=seed)
     return build_prior(
         frames.survey(),
         asked,

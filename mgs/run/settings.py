@@ -7,7 +7,6 @@ nor Dr.Jit.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from reprlib import repr
 from typing import Annotated, Any, TypeVar
@@ -19,8 +18,6 @@ from mgs.files import read_json, read_toml
 from mgs.fit.settings import (
     ALPHA_WEIGHT,
     MEAN_RATE,
-    PASSES,
-    WARM_PASSES,
     ModelSettings,
     Positive,
     Scale,
@@ -28,27 +25,6 @@ from mgs.fit.settings import (
 )
 from mgs.policy.criteria import MEAN_STD, PRIOR_STD
 from mgs.run.policy_file import check_policy
-
-
-@dataclass(frozen=True)
-class RunPreset:
-    """Defaults that trade speed for accuracy (docs/speed-accuracy.md); other options win.
-
-    passes: `TrainSettings.passes`. warm_passes: `NbvSettings.warm_passes`. density:
-    `mgs.prior.settings.PriorSettings.density` of a prior built in the run, without a number given.
-    """
-
-    passes: int
-    warm_passes: int
-    density: float
-
-
-PRESETS = {
-    "fast": RunPreset(passes=5, warm_passes=3, density=1 / 4),
-    "balanced": RunPreset(passes=PASSES, warm_passes=WARM_PASSES, density=1 / 2),
-    "accurate": RunPreset(passes=PASSES, warm_passes=WARM_PASSES, density=5 / 4),
-}
-
 
 ENOUGH = 0.95
 """Default of `Mission.enough` (docs/certificate.md)."""
@@ -156,17 +132,13 @@ class NbvSettings(ModelSettings, Mission):
         return self.model_copy(update={"train": train, "prior_std": prior_std})
 
 
-def with_defaults(
-    values: Mapping[str, Any], preset: RunPreset | None = None, alpha_weight: float = ALPHA_WEIGHT
-) -> dict[str, Any]:
-    """Add this alpha_weight and a preset's values to fields of NbvSettings that lack them."""
+def with_defaults(values: Mapping[str, Any], alpha_weight: float = ALPHA_WEIGHT) -> dict[str, Any]:
+    """Add this alpha_weight to fields of NbvSettings that lack it."""
     train = values.get("train", {})
     given = train.model_dump(exclude_unset=True) if isinstance(train, TrainSettings) else train
     if not isinstance(given, Mapping):
         return dict(values)  # `validated` reports it
-    passes = {} if preset is None else {"passes": preset.passes}
-    warm = {} if preset is None else {"warm_passes": preset.warm_passes}
-    return {**warm, **values, "train": {**passes, "alpha_weight": alpha_weight, **given}}
+    return {**values, "train": {"alpha_weight": alpha_weight, **given}}
 
 
 Model = TypeVar("Model", bound=BaseModel)
