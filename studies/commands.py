@@ -215,6 +215,18 @@ def flights(
     _result("flights", out, scale, rocks, workers, scheduler, meshes=mesh)
 
 
+def certificate(
+    out: Out,
+    scale: Scale = "quick",
+    rocks: Rocks = None,
+    mesh: Meshes = None,
+    workers: Workers = 1,
+    scheduler: Scheduler = None,
+) -> None:
+    """Compare plans with upper bounds of all sets of views, and the criterion with PSNR."""
+    _result("certificate", out, scale, rocks, workers, scheduler, meshes=mesh)
+
+
 def stress(
     out: Out,
     scale: QuickOrFull = "quick",

@@ -18,7 +18,7 @@ from mgs.report.evaluation import evaluate_run
 from mgs.report.writing import write_report
 from mgs.run import policy_file
 from mgs.run.inputs import file_digest
-from studies import flights, setups
+from studies import certificate, flights, setups
 from studies.case import Rock
 from studies.output import table, write_table
 from studies.setups import ORACLE, POLICIES, SURVEYED, Found, cells_of
@@ -159,6 +159,17 @@ def write_flights(work: Work) -> list[Path]:
     return [*written, work.out / "flights.png"]
 
 
+def write_certificate(work: Work) -> list[Path]:
+    """certificate.csv, .json, .md and .png, and certificate-curve.csv."""
+    rows = certificate.rows_of(work.results, work.cells)
+    curve = certificate.curve_of(work.results, work.cells)
+    certificate.draw(work.out / "certificate.png", curve)
+    text = certificate.text_of(rows)
+    written = write_table(work.out, "certificate", rows, text, work.command, rocks=work.count)
+    more = write_csv(work.out / "certificate-curve.csv", curve)
+    return [*written, more, work.out / "certificate.png"]
+
+
 def _runs_cells(runs: Iterable[Run]) -> list[Cell]:
     return [cell for run in runs for cell in run.cells()]
 
@@ -179,6 +190,10 @@ def _oracle_cells(size: ReproduceSize, count: int) -> list[Cell]:
 
 def _flight_cells(size: ReproduceSize, count: int) -> list[Cell]:
     return flights.cells_of(size.flights, size.some_rocks(count))
+
+
+def _certificate_cells(size: ReproduceSize, count: int) -> list[Cell]:
+    return certificate.cells_of(size.setups, size.some_rocks(count))
 
 
 @dataclass(frozen=True)
@@ -202,6 +217,7 @@ RESULTS = {
     "table1": Result(lambda size, _: _runs_cells(table_runs(size).values()), write_table1),
     "setups": Result(_setup_cells, write_setups, "setup_rocks"),
     "flights": Result(_flight_cells, write_flights, "setup_rocks"),
+    "certificate": Result(_certificate_cells, write_certificate, "setup_rocks"),
     "survey": Result(_survey_cells, write_survey, "setup_rocks"),
     "oracle": Result(_oracle_cells, write_setups, "oracle_rocks"),
 }

@@ -23,7 +23,7 @@ from mgs.run.policies import Poses
 from mgs.scene import fit_views
 from mgs.survey import flight
 from mgs.survey.flight import SurveySettings, fly
-from studies import case, flights, free_fit, results, setups, table1
+from studies import case, certificate, flights, free_fit, results, setups, table1
 from studies.case import Case, Rock, Size
 from studies.oracle import foretold
 from studies.setups import SetupSize
@@ -113,6 +113,29 @@ def test_setups_are_made_once_and_compare_a_policy_of_ones_own(
     assert {row["command"] for row in rows} == {line}
     mine.write_text("def first(candidates):\n    return candidates[:, 0]\n")
     assert "mine.py:first" in done(capsys, *one), "another file is another policy"
+
+
+def test_no_set_of_a_study_is_above_its_bound(quick, tmp_path, capsys, monkeypatch):
+    small = {"COUNTS": (2,), "GROWING": (1, 2, 3), "SETS": 4, "SIZE": 2, "DRAWS": 3}
+    for name, value in small.items():
+        monkeypatch.setattr(certificate, name, value)
+    out = tmp_path / "out"
+    done(capsys, "certificate", out, "--rocks", 2)
+    folder = out / "results"
+    rows = rows_of(folder / "certificate.csv")
+    assert [row["policy"] for row in rows] == [*certificate.POLICIES] * 2
+    for row in rows:
+        kinds = ("plan", "greedy", "farthest", "random", "random_best", "best")
+        shares = {key: float(row[key]) for key in kinds}
+        assert max(shares.values()) <= 1 + 1e-9
+        assert shares["best"] >= shares["plan"] >= shares["random"] > 0
+    curve = rows_of(folder / "certificate-curve.csv")
+    for row in curve:
+        assert 0 < float(row["percent"]) <= 100.1
+    at = {(row["rock"], row["views"], row["kind"]): float(row["percent"]) for row in curve}
+    bounds = {key: value for key, value in at.items() if key[2] == certificate.KINDS["bound"]}
+    assert all(value <= bounds[(*key[:2], certificate.KINDS["bound"])] for key, value in at.items())
+    assert (folder / "certificate.png").is_file()
 
 
 def test_flights_keep_their_length_and_are_compared_with_even_spacing(
