@@ -205,7 +205,7 @@ def _candidates(
     import numpy as np
 
     from mgs.data.meshes import distances_to_mesh
-    from mgs.run.candidates import Site, place_poses, read_poses
+    from mgs.run.candidates import MOST_POSES, Site, place_poses, read_poses
 
     shapes = given(dome=dome, ring=asked.ring, grid=asked.grid)
     if len(shapes) + (poses is not None) > 1:
@@ -218,6 +218,8 @@ def _candidates(
     if not shapes and left:
         return [(frame.name, frame.camera) for frame in left], safe or 0.0, band
     ((kind, count),) = shapes.items() or {"dome": DOME}.items()
+    if count > MOST_POSES:
+        raise InputError(f"suggest: {kind} {count:,}: give at most {MOST_POSES:,} poses")
     eyes = np.stack([frame.camera.position for frame in run.taken])
     band = band or (10.0, 80.0)
     if safe is None:

@@ -16,11 +16,14 @@ from xml.etree import ElementTree
 import numpy as np
 
 from mgs.camera import Camera, heading_and_pitch
-from mgs.errors import InputError
+from mgs.errors import InputError, printable
 from mgs.files import atomic_path, write_json
 
 EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
 """Radius of the equator, metres, and flattening of the ellipsoid WGS 84."""
+
+HIGHEST = 1e5
+"""Largest height of an origin above or below the sea, metres."""
 
 WAYPOINT, HOME, TAKEOFF, SPEED, MOUNT, PICTURE = 16, 20, 22, 178, 205, 2000
 """MAVLink commands: NAV_WAYPOINT, NAV_RETURN_TO_LAUNCH, NAV_TAKEOFF, DO_CHANGE_SPEED,
@@ -75,6 +78,8 @@ def parse_origin(text: str) -> Origin:
         origin = Origin(*(float(part) for part in text.split(",")))
         good = all(math.isfinite(value) for value in vars(origin).values())
         if not good or abs(origin.latitude) > 85 or abs(origin.longitude) > 180:
+            raise ValueError
+        if abs(origin.altitude) > HIGHEST:
             raise ValueError
     except (TypeError, ValueError):
         raise InputError(
@@ -203,7 +208,7 @@ def _write_kml(
         if stop.camera is None:
             continue
         place = _add(document, "Placemark")
-        _add(place, "name", stop.name)
+        _add(place, "name", printable(stop.name))
         heading, pitch = stop.heading_and_pitch(origin.bearing)
         lat, lon, alt = origin.geodetic(stop.position)
         camera = _add(place, "Camera")

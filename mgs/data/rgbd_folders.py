@@ -23,6 +23,9 @@ from mgs.images import image_size
 TUM_DEPTH_UNIT = 1 / 5000
 """Metres in a step of a TUM RGB-D depth image."""
 
+LARGEST_NUMBER = 1e15
+"""Numbers beyond it are mistakes, also of times."""
+
 SYNCHRONOUS = 0.02
 """Largest difference of the times of a colour and its depth image, seconds (TUM's associate.py)."""
 
@@ -47,7 +50,7 @@ def numbers(path: Path, words: list[str]) -> list[float]:
         found = [float(word) for word in words]
     except ValueError:
         found = [np.nan]
-    if not np.isfinite(found).all():
+    if not (np.abs(found) < LARGEST_NUMBER).all():
         raise InputError(f"{path}: {' '.join(words)[:60]!r} are not all numbers; correct the line")
     return found
 

@@ -32,7 +32,7 @@ constant (docs/fit.md, An opaque surface)."""
 COLOURS_ALONE = {"alpha_weight": 0.0}
 """Values of `TrainSettings` that fit colours alone, as in the paper."""
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
 
 Scale = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
 """A number that others are divided by, bounded so that the results neither overflow nor vanish."""

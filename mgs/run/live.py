@@ -7,6 +7,8 @@ the watched folder; what was refused is renamed there.
 
 from __future__ import annotations
 
+import re
+import secrets
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -81,7 +83,8 @@ def begin(folder: Path, poses: Dataset, prior: Prior) -> None:
         for key in FILES.values():
             record.pop(key, None)
         record |= {"file_path": f"images/{name}.png", "mask_path": f"masks/{name}.png"}
-    write_json(folder / "transforms.json", data | {"on_demand": True, "frames": records})
+    demand = {"on_demand": True, "token": secrets.token_hex(4), "frames": records}
+    write_json(folder / "transforms.json", data | demand)
     frames = load_dataset(folder).frames
     silhouette = cache(lambda: silhouette_of(prior.mesh))
     for given, frame in zip(poses.frames, frames, strict=True):
@@ -100,6 +103,8 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
     """
     silhouette = cache(lambda: silhouette_of(prior.mesh))
     centre = prior.points.mean(axis=0)
+    token = token_of(dataset) if live and live.folder else ""
+    used = dict[Path, set[str]]()
 
     def capture(frame: Frame) -> Frame:
         known = as_captured(frame)
@@ -112,10 +117,13 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
             )
         folder, reason = live.folder or below(dataset.root, "flight"), ""
         for attempt in range(1, live.tries + 1):
-            pose, out = ask(folder, frame, dataset, attempt)
+            pose, out = ask(folder, frame, dataset, attempt, token)
             try:
                 live.deliver(pose, out)
-                return _received(dataset.root, frame, out, live, centre, silhouette)
+                _warn_of_late(used)
+                received = _received(dataset.root, frame, out, live, centre, silhouette)
+                used[out] = {*answers(out)}
+                return received
             except (InputError, OSError) as error:
                 reason = str(error)
                 _set_aside(out)
@@ -132,14 +140,38 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
     return capture
 
 
-def ask(folder: Path, frame: Frame, dataset: Dataset, attempt: int) -> tuple[Path, Path]:
-    """Write the pose file of a frame; return its path, and that of the picture to come.
+def token_of(dataset: Dataset) -> str:
+    """Token of a live run, which tells its pictures from those of other runs in a folder; empty in
+    a dataset that has none."""
+    token = read_json(dataset.root / "transforms.json").get("token", "")
+    return token if isinstance(token, str) and re.fullmatch(r"[0-9a-f]{8}", token) else ""
+
+
+def _warn_of_late(used: dict[Path, set[str]]) -> None:
+    """Warn, once each, of files that came after the picture they belong to was read."""
+    for out, ends in used.items():
+        for end, path in answers(out).items():
+            if end not in ends:
+                ends.add(end)
+                said = (
+                    f"{path}: came after its picture and is not used; write it before the picture"
+                )
+                warnings.warn(Notice(said), stacklevel=3)
+
+
+def ask(
+    folder: Path, frame: Frame, dataset: Dataset, attempt: int, token: str = ""
+) -> tuple[Path, Path]:
+    """Write the pose file of a frame; return its path, and that of the picture to come. Both names
+    end with the token of the run, where its folder may be that of several.
 
     Raises InputError where an answer lies there already though this pose was never asked for.
     """
     heading, pitch = heading_and_pitch(frame.camera, levelled(dataset.up))
+    name = f"{frame.name}-{token}" if token else frame.name
     asked = {
         "name": frame.name,
+        "picture": f"{name}.png",
         "convention": CONVENTION,
         "unit": dataset.unit,
         "up": list(dataset.up),
@@ -150,7 +182,7 @@ def ask(folder: Path, frame: Frame, dataset: Dataset, attempt: int) -> tuple[Pat
         "camera_model": "OPENCV",
         **intrinsics(frame.camera),
     }
-    pose, out = folder / f"{frame.name}.pose.json", folder / f"{frame.name}.png"
+    pose, out = folder / f"{name}.pose.json", folder / f"{name}.png"
     known: Any = read_json(pose) if pose.is_file() else {}
     same = isinstance(known, dict) and known == asked | {"attempt": known.get("attempt")}
     if not same and (there := [*answers(out).values()]):
@@ -228,6 +260,8 @@ def _commit(
 
 def _set_aside(out: Path) -> None:
     """Rename a refused answer, so that another can come in its place."""
+    if not out.parent.is_dir():  # the command removed it
+        return
     names = {path.name.partition(f"{out.stem}.refused-")[2] for path in out.parent.iterdir()}
     numbers = [number for name in names if (number := name.split(".")[0]).isdecimal()]
     last = max(map(int, numbers), default=0)

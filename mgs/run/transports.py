@@ -72,6 +72,7 @@ def command(text: str, timeout: float) -> Transport:
         paths = {"pose": str(pose), "out": str(out)}
         arguments = [re.sub(r"\{(pose|out)\}", lambda field: paths[field[1]], w) for w in words]
         log = out.with_suffix(".log")
+        log.unlink(missing_ok=True)  # it may be a link
         with open(log, "wb") as file:
             process = subprocess.Popen(
                 arguments,
