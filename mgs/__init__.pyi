@@ -19,11 +19,11 @@ from .prior.build import prior_from_mesh as prior_from_mesh
 from .prior.build import save_prior as save_prior
 from .prior.initial import initial_gaussians as initial_gaussians
 from .prior.settings import PriorSettings as PriorSettings
-from .report.diagnostics import diagnose as diagnose
-from .report.evaluation import evaluate as evaluate
-from .report.evaluation import evaluate_run as evaluate_run
-from .report.page import write_page as write_page
-from .report.writing import write_report as write_report
+from .reports.diagnostics import diagnose as diagnose
+from .reports.evaluation import evaluate as evaluate
+from .reports.evaluation import evaluate_run as evaluate_run
+from .reports.page import write_page as write_page
+from .reports.writing import report as report
 from .run.folder import Run as Run
 from .run.folder import open_run as open_run
 from .run.loop import choose as choose

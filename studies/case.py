@@ -23,7 +23,7 @@ from mgs.fit.settings import COLOURS_ALONE
 from mgs.gaussians import Gaussians
 from mgs.prior.build import build_prior, load_prior, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.report.evaluation import evaluate_run
+from mgs.reports.evaluation import evaluate_run
 from mgs.run.folder import Run, open_run
 from mgs.run.nbv import resume_nbv, start_run
 from studies.sweep import CELLS, Cell

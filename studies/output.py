@@ -14,8 +14,8 @@ import numpy as np
 from mgs.files import atomic_path, write_csv, write_json
 from mgs.plotting import NO_GRID, STYLE, drawing
 from mgs.provenance import versions
-from mgs.report.figures import POLICY_STYLE
-from mgs.report.tables import markdown
+from mgs.reports.figures import POLICY_STYLE
+from mgs.reports.tables import markdown
 from mgs.runtime import processor
 from studies.statistics import interval
 from studies.verdict import Row

@@ -14,8 +14,8 @@ import numpy as np
 
 from mgs.errors import InputError
 from mgs.files import write_csv
-from mgs.report.evaluation import evaluate_run
-from mgs.report.writing import write_report
+from mgs.reports.evaluation import evaluate_run
+from mgs.reports.writing import report
 from mgs.run import policy_file
 from mgs.run.inputs import file_digest
 from studies import certificate, flights, setups
@@ -120,7 +120,7 @@ def _write_figures(work: Work) -> list[Path]:
     runs = [cell_folder(work.root, run.name) / "run" for run in figure_runs(work.size)]
     for run in runs:
         evaluate_run(run)  # draws; the metrics are there already
-    return write_report(work.out / "figures", runs)
+    return report(runs, work.out / "figures")
 
 
 def write_setups(work: Work) -> list[Path]:

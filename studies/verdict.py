@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mgs.report.tables import markdown
+from mgs.reports.tables import markdown
 from studies.statistics import interval
 
 Row = dict[str, Any]

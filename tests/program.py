@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mgs.cli.app import main
-from mgs.report.runs import compare_runs
-from mgs.report.tables import comparison_rows
+from mgs.reports.runs import compare_runs
+from mgs.reports.tables import comparison_rows
 from studies.commands import start
 
 

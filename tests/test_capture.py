@@ -18,7 +18,7 @@ from mgs.data.dataset import FILES, load_dataset
 from mgs.errors import InputError
 from mgs.prior.build import build_prior, prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.report.tables import table_columns
+from mgs.reports.tables import table_columns
 from mgs.run import nbv
 from mgs.run.inputs import prior_digest
 from mgs.synth import arena, rendering

@@ -18,7 +18,7 @@ from mgs.evaluation import evaluate_model
 from mgs.images import write_png
 from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.report.page_facts import measured, notes
+from mgs.reports.page_facts import measured, notes
 from mgs.run import folder as run_folder
 from mgs.run.checks import predicted_psnr
 from mgs.run.detectors import (

@@ -13,7 +13,7 @@ from mgs.errors import InputError
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import read_exr
 from mgs.policy import criteria
-from mgs.report import diagnostics
+from mgs.reports import diagnostics
 from mgs.run import folder as run_folder
 from mgs.run.folder import Run
 from mgs.run.settings import NbvSettings

@@ -150,7 +150,7 @@ def test_demo_shows_the_table_and_the_pictures_and_can_be_repeated(tmp_path, cap
     monkeypatch.setattr("mgs.cli.demo.POLICIES", policies)
     monkeypatch.setattr("mgs.cli.demo.GAUSSIANS", "150")
     monkeypatch.setattr("mgs.cli.demo.BUDGET", 1)
-    monkeypatch.setattr("mgs.report.diagnostics.VIEWS", 1)
+    monkeypatch.setattr("mgs.reports.diagnostics.VIEWS", 1)
     command("demo", out)
     shown = capsys.readouterr().out
     lines = shown.splitlines()

@@ -23,8 +23,8 @@ from mgs.evaluation import evaluate_model, read_comparison, write_comparison
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr, write_png
 from mgs.metrics import METRICS, OPAQUE, PSNR_LIMIT, SURFACE_METRICS, compare_surface, psnr, ssim
-from mgs.report import evaluation as measuring
-from mgs.report.evaluation import evaluate_run
+from mgs.reports import evaluation as measuring
+from mgs.reports.evaluation import evaluate_run
 from mgs.run.folder import read_checkpoint
 from mgs.splat_ply import write_ply
 

@@ -24,8 +24,8 @@ from mgs.data.dataset import load_cameras, load_dataset
 from mgs.errors import InputError, Notice
 from mgs.gaussians import Gaussians
 from mgs.images import read_mask
-from mgs.report.evaluation import compare_models, evaluate
-from mgs.report.exporting import difference, in_srgb, to_y_up
+from mgs.reports.evaluation import compare_models, evaluate
+from mgs.reports.exporting import difference, in_srgb, to_y_up
 from mgs.rotation import rotmat_from_quat
 from mgs.run.folder import open_run
 from mgs.splat import reference, render

@@ -19,8 +19,8 @@ from mgs.metrics import colour_corrected
 from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.exposure import DARK, GAIN_STD, RATIO_STD, SATURATED, solve_gains
 from mgs.prior.settings import PriorSettings
-from mgs.report.evaluation import evaluate_run
-from mgs.report.tables import markdown_table
+from mgs.reports.evaluation import evaluate_run
+from mgs.reports.tables import markdown_table
 from mgs.run.folder import read_checkpoint
 from mgs.run.nbv import resume_nbv, run_nbv
 from mgs.run.state import Checkpoint

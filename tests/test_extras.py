@@ -25,7 +25,7 @@ dataset, prior, out = sys.argv[1:]
 run = mgs.run_nbv(dataset, out, prior=prior, seeds=3, budget=1, train={{"passes": 1}})
 image = mgs.render(run.gaussians, run.dataset.frames[0].camera)
 print(mgs.evaluate(run)["images"], image.rgb.shape)
-mgs.write_report(out + "-report", [run])
+mgs.report(run, out + "-report")
 """
 
 

@@ -44,9 +44,9 @@ from mgs.images import (
     write_png,
 )
 from mgs.prior.build import load_prior
-from mgs.report.evaluation import evaluate_run
-from mgs.report.page import write_page
-from mgs.report.runs import compare_runs
+from mgs.reports.evaluation import evaluate_run
+from mgs.reports.page import write_page
+from mgs.reports.runs import compare_runs
 from mgs.run.candidates import Site, read_poses, refusals
 from mgs.run.folder import open_run
 from mgs.splat_ply import read_ply, write_ply

@@ -19,7 +19,7 @@ from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
 from mgs.policy.criteria import DIRECTIONAL_STD, MEAN_STD
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_normals
-from mgs.report.diagnostics import diagnose
+from mgs.reports.diagnostics import diagnose
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
 from mgs.run.nbv import resume_nbv, run_nbv, start_run

@@ -19,10 +19,10 @@ from refusals import refused
 from mgs.camera import Camera
 from mgs.data.dataset import load_dataset
 from mgs.files import read_json, write_json
-from mgs.report import page_pictures
-from mgs.report.evaluation import evaluate_run
-from mgs.report.page import write_page
-from mgs.report.page_plots import corners_at
+from mgs.reports import page_pictures
+from mgs.reports.evaluation import evaluate_run
+from mgs.reports.page import write_page
+from mgs.reports.page_plots import corners_at
 from mgs.run.folder import open_run
 
 

@@ -32,8 +32,8 @@ from mgs.fit.fitting import fit
 from mgs.fit.settings import TrainSettings
 from mgs.gaussians import LEARNED
 from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD
-from mgs.report.evaluation import evaluate_run
-from mgs.report.simplify import REFITTED, refit_run
+from mgs.reports.evaluation import evaluate_run
+from mgs.reports.simplify import REFITTED, refit_run
 from mgs.run.folder import open_run
 from mgs.run.nbv import run_nbv
 from mgs.run.settings import NbvSettings

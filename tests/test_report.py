@@ -20,10 +20,10 @@ from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import read_json, write_json
-from mgs.report import figures, tables, writing
-from mgs.report.figures import POLICY_STYLE
-from mgs.report.page_plots import SYMBOLS
-from mgs.report.runs import compare_runs
+from mgs.reports import figures, tables, writing
+from mgs.reports.figures import POLICY_STYLE
+from mgs.reports.page_plots import SYMBOLS
+from mgs.reports.runs import compare_runs
 from mgs.run.folder import open_run
 from mgs.run.policies import POLICIES
 
@@ -88,7 +88,7 @@ def images(figure):
 def test_report_writes_every_figure(runs, tmp_path, drawn):
     """Each shows the numbers of the runs."""
     out = tmp_path / "report"
-    written = writing.write_report(out, runs)
+    written = writing.report(runs, out)
     names = [*(f"{name}.png" for name in FIGURES), "table.md", "table.json"]
     assert [path.name for path in written] == names
     assert {path.name for path in out.iterdir()} == set(names)
@@ -193,7 +193,7 @@ def test_a_run_that_was_not_measured_on_the_test_views_is_compared_on_the_others
     run = shutil.copytree(runs[1], tmp_path / "random")
     change_steps(run, no_line_has("test"))
     write_json(run / "metrics.json", without("test", read_json(run / "metrics.json")))
-    writing.write_report(tmp_path / "report", [runs[0], run])
+    writing.report([runs[0], run], tmp_path / "report")
     read = [open_run(folder) for folder in (runs[0], run)]
     axis = drawn["psnr.png"].axes[0]
     assert axis.get_ylabel() == "PSNR, all views (dB)"
@@ -256,7 +256,7 @@ def test_runs_that_cannot_be_reported(runs, tmp_path, change, named):
     run = shutil.copytree(runs[1], tmp_path / "run")
     change(run)
     with pytest.raises(InputError, match=re.escape(named)):
-        writing.write_report(tmp_path / "report", [runs[0], run])
+        writing.report([runs[0], run], tmp_path / "report")
     assert not (tmp_path / "report").exists()
 
 

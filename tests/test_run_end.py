@@ -8,8 +8,8 @@ from program import change_settings, command, steps, table_numbers
 from tiny import resume, run
 
 from mgs.policy import criteria
-from mgs.report.page_facts import notes
-from mgs.report.tables import markdown_table
+from mgs.reports.page_facts import notes
+from mgs.reports.tables import markdown_table
 from mgs.run.ending import GAIN_UNIT, run_end, why_ended
 from mgs.run.folder import open_run
 from mgs.run.settings import NbvSettings

@@ -13,8 +13,8 @@ from program import change_settings, command
 from refusals import refused
 
 from mgs.errors import InputError
-from mgs.report import story
-from mgs.report.video import PATHS, camera_path, write_film
+from mgs.reports import story
+from mgs.reports.video import PATHS, camera_path, write_film
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from mgs.camera import Camera, look_at
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset
-from mgs.report.evaluation import evaluate_run
+from mgs.reports.evaluation import evaluate_run
 from mgs.run.folder import open_run
 from mgs.splat import render
 from mgs.splat_ply import write_ply

@@ -15,9 +15,9 @@ from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.up import PLUS_Z, unit_up, upright
 from mgs.files import write_json
 from mgs.gaussians import Gaussians
-from mgs.report import diagnostics
-from mgs.report.page import write_page
-from mgs.report.writing import write_report
+from mgs.reports import diagnostics
+from mgs.reports.page import write_page
+from mgs.reports.writing import report
 from mgs.run.folder import Run, open_run
 from mgs.view import layers
 from mgs.view.subject import read_subject
@@ -68,7 +68,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> dict[str, Figure]:
 def test_the_orbit_of_a_tilted_world_is_drawn_as_that_of_the_upright_one(runs, drawn, tmp_path):
     shown = []
     for run, length in zip(runs, ("1 m", "1 unit"), strict=True):
-        write_report(tmp_path / "report", [run])
+        report(run, tmp_path / "report")
         axis = drawn["orbit.png"].axes[0]
         assert length in [text.get_text() for text in axis.texts]
         shown.append([np.asarray(points.get_offsets()) for points in axis.collections])

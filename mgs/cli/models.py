@@ -16,7 +16,7 @@ from mgs.files import below, check_new_file, folder_locked, working_in
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
 
 if TYPE_CHECKING:
-    from mgs.report.simplify import PrunedRun, RefittedRun
+    from mgs.reports.simplify import PrunedRun, RefittedRun
 
 
 def evaluate(
@@ -40,9 +40,9 @@ def evaluate(
     and masked to the pixels of the rock. metrics.json also has the errors of alpha and depth, where
     the dataset has their truth.
     """
-    from mgs.report.evaluation import evaluate as measured
-    from mgs.report.simplify import PRUNED, REFITTED
-    from mgs.report.tables import metrics_row
+    from mgs.reports.evaluation import evaluate as measured
+    from mgs.reports.simplify import PRUNED, REFITTED
+    from mgs.reports.tables import metrics_row
 
     runtime.start()
     rows, said = list[dict[str, Any]](), list[str]()
@@ -74,8 +74,8 @@ def _measured_run(
 ) -> list[dict[str, Any]]:
     """Evaluate a run; return its row of the table. alone: whether no other one is shown. said: gets
     the lines for the user."""
-    from mgs.report.evaluation import evaluate_run
-    from mgs.report.tables import comparison_rows
+    from mgs.reports.evaluation import evaluate_run
+    from mgs.reports.tables import comparison_rows
     from mgs.run.folder import open_run
 
     opened = open_run(run)
@@ -100,7 +100,7 @@ def diagnose(
     PNG that shows them; and information.ply, a point for each Gaussian, coloured by its
     information.
     """
-    from mgs.report.diagnostics import diagnose as mapped
+    from mgs.reports.diagnostics import diagnose as mapped
     from mgs.run.folder import open_run
 
     wanted = None if views is None else [name.strip() for name in views.split(",") if name.strip()]
@@ -163,7 +163,7 @@ def simplify(
 
     No test view is used, and the run itself is not changed.
     """
-    from mgs.report.simplify import PRUNED, REFITTED, prune_run, refit_run
+    from mgs.reports.simplify import PRUNED, REFITTED, prune_run, refit_run
     from mgs.run.folder import open_run
 
     of_prune, of_refit = given(noise=noise), given(learn=learn, sh=sh, loss=loss)

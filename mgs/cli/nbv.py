@@ -230,7 +230,7 @@ def resume_and_print(
 
     from mgs.cli.printing import certificate_line, print_run, step_line
     from mgs.cli.progress import progress_bar
-    from mgs.report.evaluation import evaluate_run
+    from mgs.reports.evaluation import evaluate_run
     from mgs.run.folder import Run, open_run
     from mgs.run.nbv import resume_nbv
 

@@ -73,8 +73,8 @@ def render(
     Writes one PNG for each camera, with the name of the camera's image.
     """
     from mgs.data.dataset import load_cameras, load_origin
-    from mgs.report.exporting import read_model
-    from mgs.report.pictures import draw_views
+    from mgs.reports.exporting import read_model
+    from mgs.reports.pictures import draw_views
     from mgs.run.folder import open_run
 
     if not all(0 <= value <= 1 for value in background):

@@ -57,7 +57,7 @@ def settings_table(keys: Sequence[tuple[str, str, str]]) -> Table:
 
 
 def print_quality(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print the rows of `mgs.report.tables.comparison_rows` as a table, for 80 columns.
+    """Print the rows of `mgs.reports.tables.comparison_rows` as a table, for 80 columns.
 
     Names that do not fit beside the numbers are printed below, by the number of their row.
     """
@@ -74,7 +74,7 @@ def print_quality(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def _quality(heading: str, first: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> Table:
     """The table of `print_quality`. heading, first: its first column."""
-    from mgs.report.tables import has_held_out, table_cell
+    from mgs.reports.tables import has_held_out, table_cell
 
     tested, new = any("test.psnr" in row for row in rows), has_held_out(rows)
     metrics = [key for key in SHOWN[tested] if new or not key.startswith("held_out.")]
@@ -181,7 +181,7 @@ def certificate_line(record: Mapping[str, Any]) -> str:
 
 def _quality_lines(metrics: dict[str, Any], exposure: bool) -> list[str]:
     """Mean quality over each set of views in metrics.json."""
-    from mgs.report.tables import table_cell
+    from mgs.reports.tables import table_cell
 
     every = "all views" if metrics.get("held_out", {}).get("count") else "training views"
     sets = {"test": "test views", "all": every, "held_out": "held-out views"}

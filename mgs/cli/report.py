@@ -58,16 +58,17 @@ def report(
 
 def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
     """Write the figures and the table, and print the table."""
-    from mgs.report.runs import compare_runs
-    from mgs.report.tables import comparison_rows
-    from mgs.report.writing import report_files, write_report
+    from mgs.reports.runs import compare_runs
+    from mgs.reports.tables import comparison_rows
+    from mgs.reports.writing import report as compared_in
+    from mgs.reports.writing import report_files
     from mgs.run.ending import why_ended
 
     for name in report_files(kind):
         check_new_file(out / name, force)
     compared = compare_runs(runs)
     with folder_locked(out):
-        written = write_report(out, list(compared.values()), kind)
+        written = compared_in(list(compared.values()), out, kind)
     rows = comparison_rows(compared)
     print_quality(Terminal(), rows)
     for row, run in zip(rows, compared.values(), strict=True):
@@ -83,7 +84,7 @@ def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
 
 def _write_page(runs: list[Path], html: Path) -> None:
     """Write the page, and print its size."""
-    from mgs.report.page import write_page
+    from mgs.reports.page import write_page
 
     runtime.start()
     with progress_bar() as bar:

@@ -53,7 +53,7 @@ def export(
 
     All formats can also be read, so the command converts between them, too.
     """
-    from mgs.report.exporting import read_model, to_y_up
+    from mgs.reports.exporting import read_model, to_y_up
     from mgs.splat_files import FORMATS, write_gaussians
 
     if to in ("nerfstudio", "colmap"):
@@ -82,7 +82,7 @@ def export(
 
 def _export_views(runs: list[Path], kind: str, out: Path | None, every: bool, force: bool) -> None:
     """Write the views of each run as a folder. Raises InputError as `check_new_folder`."""
-    from mgs.report.chosen_views import NAMES, write_views
+    from mgs.reports.chosen_views import NAMES, write_views
     from mgs.run.folder import open_run
 
     if out is not None and len(runs) > 1:
@@ -97,8 +97,8 @@ def _export_views(runs: list[Path], kind: str, out: Path | None, every: bool, fo
 def _in_srgb(model: Path, linear: Gaussians) -> Gaussians:
     """Gaussians of a linear model, of this file or run folder, for sRGB blending. Prints what that
     costs."""
-    from mgs.report.evaluation import compare_models
-    from mgs.report.exporting import difference, in_srgb, refit_in_srgb
+    from mgs.reports.evaluation import compare_models
+    from mgs.reports.exporting import difference, in_srgb, refit_in_srgb
     from mgs.run.folder import open_run
 
     if not model.is_dir():
@@ -176,8 +176,8 @@ def video(
 ) -> None:
     """Make a video of each run: a camera path around its model, or the model view by view."""
     from mgs import runtime
-    from mgs.report.story import story_frames
-    from mgs.report.video import check_film, path_frames, write_film
+    from mgs.reports.story import story_frames
+    from mgs.reports.video import check_film, path_frames, write_film
     from mgs.run.folder import open_run
 
     one_by_one = story or beside == "truth"

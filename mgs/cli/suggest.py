@@ -171,7 +171,7 @@ def suggest(
                 f"suggest: {crossed}, so no flight plan is written; give flight.no_fly"
             )
         if out is not None:
-            from mgs.report.suggestion import write_suggestion
+            from mgs.reports.suggestion import write_suggestion
 
             with atomic_folder(out, ours) as unfinished:
                 write_suggestion(unfinished, run, found)

@@ -117,7 +117,7 @@ class _View(_Strict, extra="allow"):
 
 
 class Metrics(_Strict):
-    """metrics.json (`mgs.evaluation.evaluate_model`, `mgs.report.evaluation.evaluate_run`)."""
+    """metrics.json (`mgs.evaluation.evaluate_model`, `mgs.reports.evaluation.evaluate_run`)."""
 
     images: PositiveInt
     all: dict[str, float | None]

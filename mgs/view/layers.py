@@ -13,7 +13,7 @@ from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.gaussians import Gaussians
 from mgs.plotting import painted
-from mgs.report.diagnostics import PANELS, VISIBLE, picture, view_maps
+from mgs.reports.diagnostics import PANELS, VISIBLE, picture, view_maps
 from mgs.rotation import rotmat_from_quat
 from mgs.view.access import plain
 from mgs.view.subject import Subject

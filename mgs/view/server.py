@@ -22,7 +22,7 @@ from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.data.up import upright
 from mgs.errors import InputError
-from mgs.report.page_plots import FRUSTUM
+from mgs.reports.page_plots import FRUSTUM
 from mgs.view import layers
 from mgs.view.access import Access, bound_socket, plain
 from mgs.view.subject import View, read_subject

@@ -13,14 +13,14 @@ from mgs.data.meshes import Mesh, read_mesh
 from mgs.data.up import PLUS_Z, Up
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
-from mgs.report.diagnostics import run_scalars
-from mgs.report.page_facts import step_facts
+from mgs.reports.diagnostics import run_scalars
+from mgs.reports.page_facts import step_facts
 from mgs.run.ending import RunEnd
 from mgs.run.folder import Run, open_run
 from mgs.splat_files import load_gaussians, upward
 
 SCALARS = ("information", "uncertainty", "unobserved")
-"""Scalars of `mgs.report.diagnostics` that the viewer shows."""
+"""Scalars of `mgs.reports.diagnostics` that the viewer shows."""
 
 LARGEST = 40.0
 """Largest distance of a camera, or of 95 % of the Gaussians, from the middle. Worlds may have any

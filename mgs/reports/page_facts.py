@@ -10,8 +10,8 @@ from urllib.parse import quote
 
 from mgs.policy.certificate import Certificate
 from mgs.policy.criteria import GAIN_UNIT
-from mgs.report.page_plots import METRIC_NAMES
-from mgs.report.tables import table_cell, table_columns, table_heading, table_row
+from mgs.reports.page_plots import METRIC_NAMES
+from mgs.reports.tables import table_cell, table_columns, table_heading, table_row
 from mgs.run.ending import RunEnd, why_ended
 from mgs.run.folder import Run
 

@@ -21,7 +21,7 @@ from mgs.data.up import upright
 from mgs.evaluation import render_view
 from mgs.files import write_text
 from mgs.policy.criteria import GAIN_UNIT
-from mgs.report.page_facts import (
+from mgs.reports.page_facts import (
     links,
     measured,
     measured_views,
@@ -31,7 +31,7 @@ from mgs.report.page_facts import (
     step_facts,
     summary_rows,
 )
-from mgs.report.page_pictures import (
+from mgs.reports.page_pictures import (
     ERROR_COLOURS,
     UNCERTAINTY_COLOURS,
     Album,
@@ -40,9 +40,9 @@ from mgs.report.page_pictures import (
     draw_taken,
     new_album,
 )
-from mgs.report.page_plots import METRIC_NAMES, line_plot, orbit_plot, timing_plot, views_plot
-from mgs.report.runs import compare_runs, least_trained, step_curves
-from mgs.report.writing import shown_view
+from mgs.reports.page_plots import METRIC_NAMES, line_plot, orbit_plot, timing_plot, views_plot
+from mgs.reports.runs import compare_runs, least_trained, step_curves
+from mgs.reports.writing import shown_view
 from mgs.run.folder import Run
 
 COMPARED = 6
@@ -58,7 +58,7 @@ def write_page(
 
     folders: run folders on one dataset, finished or not. progress: called as progress(pictures of
     views drawn, all). Links to other files are relative to the page. The same files give the same
-    page, byte for byte. Raises InputError as `mgs.report.runs.compare_runs`, and if a file is
+    page, byte for byte. Raises InputError as `mgs.reports.runs.compare_runs`, and if a file is
     damaged or the page cannot be written.
     """
     path, runs = Path(path), compare_runs(folders)

@@ -16,7 +16,7 @@ from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.data.up import upright
 from mgs.gaussians import Gaussians
-from mgs.report.figures import Curves, axis_names, line_styles
+from mgs.reports.figures import Curves, axis_names, line_styles
 from mgs.run.folder import Run
 
 SYMBOLS: dict[str | tuple[int, int, int], str] = {
@@ -25,7 +25,7 @@ SYMBOLS: dict[str | tuple[int, int, int], str] = {
     ">": "triangle-right", "h": "hexagon", "d": "diamond-tall", (4, 1, 0): "star-diamond",
     (6, 1, 0): "hexagram", "8": "octagon", "H": "hexagon2",
 }  # fmt: skip
-"""Matplotlib's markers in `mgs.report.figures.POLICY_STYLE` -> Plotly's."""
+"""Matplotlib's markers in `mgs.reports.figures.POLICY_STYLE` -> Plotly's."""
 
 POINTS = 4000
 """Most Gaussians in the plot of the orbit: every n-th of the model."""

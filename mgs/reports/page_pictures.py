@@ -19,7 +19,7 @@ from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
 from mgs.plotting import crop, painted
 from mgs.policy.criteria import regularisation, uncertainty
-from mgs.report.diagnostics import VISIBLE, view_maps
+from mgs.reports.diagnostics import VISIBLE, view_maps
 from mgs.run.folder import Run
 
 PIXELS = 40e6

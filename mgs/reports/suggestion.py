@@ -14,7 +14,7 @@ from mgs.data.frames import Frame
 from mgs.data.up import upright
 from mgs.files import write_json
 from mgs.policy.criteria import GAIN_UNIT
-from mgs.report.diagnostics import VISIBLE, picture, run_scalars, view_maps
+from mgs.reports.diagnostics import VISIBLE, picture, run_scalars, view_maps
 from mgs.run.folder import Run
 from mgs.run.suggest import Suggestion, View, taken_in_order
 

@@ -22,7 +22,7 @@ from mgs.data.up import upright
 from mgs.errors import InputError
 from mgs.files import atomic_path
 from mgs.plotting import painted
-from mgs.report.diagnostics import VISIBLE, picture, run_scalars, view_maps
+from mgs.reports.diagnostics import VISIBLE, picture, run_scalars, view_maps
 from mgs.run.folder import Run
 
 Film = Iterator[np.ndarray]

@@ -14,15 +14,15 @@ from mgs.errors import InputError
 from mgs.evaluation import read_comparison
 from mgs.files import write_json, write_text
 from mgs.policy.criteria import GAIN_UNIT
-from mgs.report import figures
-from mgs.report.runs import (
+from mgs.reports import figures
+from mgs.reports.runs import (
     check_finished,
     check_measured,
     compare_runs,
     least_trained,
     step_curves,
 )
-from mgs.report.tables import comparison_rows, markdown_table, table_cell
+from mgs.reports.tables import comparison_rows, markdown_table, table_cell
 from mgs.run.folder import Run
 
 CHOICES = ("orbit", "gain", "coverage")
@@ -32,28 +32,31 @@ FIGURES = (*CHOICES, "comparison", "psnr")
 
 
 def report_files(kind: str) -> list[str]:
-    """Names of the files of a report; `write_report` says which are not in all."""
+    """Names of the files of a report; `report` says which are not in all."""
     return [*(f"{name}.{kind}" for name in FIGURES), "table.md", "table.json"]
 
 
-def write_report(
-    out: str | Path, runs: Sequence[str | PathLike[str]], kind: str = "png"
+def report(
+    runs: str | PathLike[str] | Sequence[str | PathLike[str]],
+    out: str | Path = "report",
+    kind: str = "png",
 ) -> list[Path]:
     """Write all figures and the table of runs into the folder `out`; return the paths of the files.
 
-    runs: run folders, or opened runs. kind: format of the figures, one of `mgs.plotting.FORMATS`.
+    runs: runs, their folders, or a folder of runs. kind: format of the figures, one of
+    `mgs.plotting.FORMATS`.
 
-    - orbit.png, gain.png, coverage.png (`mgs.report.figures`): only if a run has chosen views;
+    - orbit.png, gain.png, coverage.png (`mgs.reports.figures`): only if a run has chosen views;
     - comparison.png: a view as `shown_view` chooses it;
     - psnr.png: only if all runs were evaluated after some of their steps; over the test views, or
       without them over all views;
-    - table.md and table.json (`mgs.report.tables.comparison_rows`).
+    - table.md and table.json (`mgs.reports.tables.comparison_rows`).
 
     Files of an earlier report are replaced. Raises InputError as `compare_runs`; if a run is
     unfinished or was not evaluated since its last step; and if a picture of `mgs eval` is missing
     or damaged. Then nothing is written.
     """
-    compared = compare_runs(runs)
+    compared = compare_runs([runs] if isinstance(runs, str | PathLike) else runs)
     for run in compared.values():
         check_finished(run)
         check_measured(run)

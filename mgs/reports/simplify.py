@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from mgs.errors import InputError
 from mgs.files import check_writable
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
-from mgs.report.evaluation import compare_models
+from mgs.reports.evaluation import compare_models
 from mgs.run import inputs
 from mgs.run.folder import open_run
 from mgs.run.settings import NbvSettings

@@ -15,9 +15,9 @@ from mgs.metrics import psnr
 from mgs.plotting import NO_GRID, crop, new_figure
 from mgs.policy import criteria
 from mgs.progress import Progress, listening
-from mgs.report.diagnostics import VISIBLE, picture, view_maps
-from mgs.report.figures import NEWEST, draw_cameras
-from mgs.report.video import UNKNOWN, Film
+from mgs.reports.diagnostics import VISIBLE, picture, view_maps
+from mgs.reports.figures import NEWEST, draw_cameras
+from mgs.reports.video import UNKNOWN, Film
 from mgs.run.folder import Run
 from mgs.run.nbv import scene_of
 from mgs.scene import Scene, State, learn

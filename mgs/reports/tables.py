@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mgs.policy.poses import path_length
-from mgs.report.runs import check_measured
+from mgs.reports.runs import check_measured
 from mgs.run.ending import RunEnd
 from mgs.run.folder import Run
 
@@ -35,7 +35,7 @@ COLUMNS = {
 
 
 def comparison_rows(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
-    """Numbers of each run, a row each. runs: by label (`mgs.report.runs.compare_runs`).
+    """Numbers of each run, a row each. runs: by label (`mgs.reports.runs.compare_runs`).
 
     - policy: the label; images: number of training images; coverage: Gaussians observed,
       per cent.

@@ -9,7 +9,7 @@ from pathlib import Path
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import read_text
-from mgs.report.figures import Curves
+from mgs.reports.figures import Curves
 from mgs.run.folder import STEPS, Run, holds_run, open_run, text_of
 
 
