@@ -402,7 +402,7 @@ WRONG = {
     ],
     "metrics": [
         {"images": 0}, {"images": True}, {"all": {"psnr": "30"}}, {"views": [{"name": 1}]},
-        {"pictures": "no"}, {"fit": {"converged": 1}}, {"test_views": {}}, {"held_out": None},
+        {"pictures": "no"}, {"test_views": {}}, {"held_out": None},
     ],
 }  # fmt: skip
 """Values of a wrong type in the first step, and in metrics.json."""
