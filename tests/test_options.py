@@ -94,19 +94,17 @@ OPTIONS: dict[str, list[tuple[str, str]]] = {
         ("--gaussians 50 --spacing 0.1", "give one of them"),
         ("--spacing 9", "samples are too few"),
         ("--spacing nan", "must be positive"),
-        ("--prior-noise nan", "must be 0 or more"),
-        ("--holes 1.0", "0 to 0.9"),
         ("--poisson-depth 0", "poisson_depth"),
         ("--up skyward", f"up 'skyward': {UP}"),
         ("--up 0,0,0", f"up '0,0,0': {UP}"),
         ("--source dreams", "choose one of depth, mesh, points, hull, random"),
         ("--source mesh", "give `mesh`"),
         ("--source hull --mesh rock.glb", "give one of them"),
-        ("--source hull --prior-noise 0.1", "of a cloud, but a hull is carved"),
+        ("--source hull --poisson-depth 6", "of a cloud, but a hull is carved"),
     ],
     "prior {rock} --out {out} --mesh {rock}/rock.glb": [
         ("--spacing 1e-300", "samples take about"),
-        ("--gaussians 100 --holes 0.2", "holes"),
+        ("--gaussians 100 --poisson-depth 6", "poisson_depth"),
     ],
 }
 """Beginning of a command -> its options, and words of the line."""

@@ -436,7 +436,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], list[str], str]] = {
     "few": (few, [], "7 photographs without depth are too few; take at least 8"),
     "no overlap": (apart, [], "the photographs do not overlap"),
     "no object": (no_object, [], "points lie in one cluster above the ground; give masks"),
-    "a surface at random": (bare, ["--source", "random", "--holes", "0.1"], "has no surface"),
+    "a surface at random": (bare, ["--source", "random", "--poisson-depth", "6"], "has no surface"),
     "hull without masks": (bare, ["--source", "hull"], "has no masks; "),
     "depth without depth": (
         few,

@@ -82,13 +82,6 @@ def prior(
         int | None,
         option("Octree depth of the Poisson surface, 3 to 12. Default: from the cloud's density."),
     ] = None,
-    prior_noise: Annotated[
-        float,
-        option("Degrade the prior: standard deviation of noise on the rock's points, metres."),
-    ] = 0.0,
-    holes: Annotated[
-        float, option("Degrade the prior: share of the rock's points to remove, in round holes.")
-    ] = 0.0,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
@@ -118,7 +111,7 @@ def prior(
     loaded = load_dataset(dataset)
     folder = out if out is not None else below(dataset, "prior")
     number = parse_gaussians(gaussians)
-    settings = PriorSettings(number, spacing, poisson_depth, prior_noise, holes, seed, backing)
+    settings = PriorSettings(number, spacing, poisson_depth, seed, backing)
     # The folder is checked and locked before the work.
     ours = Ours(FILES, [path for path in (dataset, mesh, points) if path]) if force else None
     with atomic_folder(folder, ours) as unfinished, progress_bar(console=console) as progress:

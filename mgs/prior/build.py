@@ -189,8 +189,7 @@ def _depth_surface(
     assert plane is not None
     on_stage("Poisson mesh")
     points, normals = segmented.rock_points, segmented.rock_normals
-    cell = max(cloud.voxel, settings.noise)
-    mesh, depth = poisson_mesh(points, normals, cell, plane, settings.poisson_depth)
+    mesh, depth = poisson_mesh(points, normals, cloud.voxel, plane, settings.poisson_depth)
     numbers = {
         "pixels": cloud.pixels,
         "points": len(cloud.points),
@@ -259,7 +258,7 @@ def prior_from_mesh(
 
     up, unit, cameras, origin: of the dataset; the cameras decide the number of Gaussians if the
     settings do not. Raises InputError if the mesh cannot be read or sampled, if no camera sees it,
-    and for settings that only a cloud has: noise, holes, poisson_depth and density.
+    and for settings that only a cloud has: poisson_depth and density.
     """
     settings.refuse_shaping("`mesh` gives one")
     from mgs.data.raycast import mesh_in_sight  # imported here because it loads Mitsuba

@@ -23,12 +23,11 @@ from mgs.prior.segmentation import (
     NoSurface,
     Plane,
     SegmentedCloud,
-    degrade,
     estimate_normals,
     ground_plane,
 )
 from mgs.prior.settings import PriorSettings
-from mgs.seeds import derive_seed, generator
+from mgs.seeds import derive_seed
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD
 from mgs.survey.fusion import REACH, Cloud, focus
 
@@ -170,10 +169,9 @@ def segment_points(
             points,
             kept,
         )
-    rng = generator(settings.seed, "prior/degrade")
-    rock, left = degrade(points[kept], settings.noise, settings.holes, rng)
-    normals = estimate_normals(rock[left], views[kept][left], settings.noise / cloud.voxel)
-    return SegmentedCloud(cloud, plane, ground, rock[left], normals, 0.0, clusters)
+    rock = points[kept]
+    normals = estimate_normals(rock, views[kept])
+    return SegmentedCloud(cloud, plane, ground, rock, normals, 0.0, clusters)
 
 
 def _plane_or_none(

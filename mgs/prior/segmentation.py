@@ -13,7 +13,7 @@ from mgs.data.frames import Frame
 from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError
 from mgs.prior.settings import PriorSettings
-from mgs.seeds import derive_seed, generator
+from mgs.seeds import derive_seed
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD
 from mgs.survey.fusion import FILTERED_SHARE, Cloud, focus, fuse_frames, voxel_means
 
@@ -202,23 +202,6 @@ def rock_cluster(
     return inside, eps, count
 
 
-def degrade(
-    points: np.ndarray, noise: float, holes: float, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Add noise to the points of a rock [N,3], and cut holes into them, to study the effect.
-
-    noise: standard deviation per coordinate, metres. holes: share of points removed, in balls
-    around random points, with a radius of a tenth of the extent. Returns (points [N,3], kept [N]
-    bool).
-    """
-    kept = np.ones(len(points), bool)
-    radius = 0.1 * float(np.ptp(points, axis=0).max())
-    while (~kept).mean() < holes:
-        centre = points[rng.choice(np.flatnonzero(kept))]
-        kept &= np.linalg.norm(points - centre, axis=1) > radius
-    return points + noise * rng.standard_normal(points.shape), kept
-
-
 def estimate_normals(points: np.ndarray, views: np.ndarray, roughness: float = 0.0) -> np.ndarray:
     """Unit normals [N,3] of points [N,3], of the plane through their neighbours (Hoppe et al.
     1992).
@@ -240,7 +223,7 @@ class SegmentedCloud:
 
     plane: None if there is none or it was not needed. ground: [P] bool, points on the plane.
     rock_points, rock_normals: [M,3] points, metres, and unit normals of which the mesh is built:
-    degraded if asked for, without the ground at the rock's foot. eps (metres), clusters: DBSCAN's.
+    without the ground at the rock's foot. eps (metres), clusters: DBSCAN's.
     """
 
     cloud: Cloud
@@ -288,10 +271,7 @@ def segment_dataset(
         cloud.points[above], cloud.voxel, target, name, weight, cloud.sparse, belongs
     )
     points, views = cloud.points[above][inside], cloud.views[above][inside]
-    rng = generator(settings.seed, "prior/degrade")
-    points, kept = degrade(points, settings.noise, settings.holes, rng)
-    points, views = points[kept], views[kept]
-    roughness = (FILTERED_SHARE * cloud.noise + settings.noise) / cloud.voxel
+    roughness = FILTERED_SHARE * cloud.noise / cloud.voxel
     normals = estimate_normals(points, views, roughness)
     floor = (plane.height(points) < 2 * plane.tolerance) & (normals @ plane.normal > FLOOR_UPRIGHT)
     return SegmentedCloud(cloud, plane, ground, points[~floor], normals[~floor], eps, clusters)

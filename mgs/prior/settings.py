@@ -23,8 +23,6 @@ class PriorSettings:
     - backing: Gaussians behind the surface per sample (`mgs.prior.initial`), 0 to 1; the paper: 0.
     - poisson_depth: octree depth of the Poisson reconstruction, 3 to 12; by default its finest
       cells are at most 1.5 voxels.
-    - noise: standard deviation, metres, and holes: share of points, 0 to 0.9, to degrade the rock's
-      points (`mgs.prior.segmentation.degrade`).
     - seed: of all random draws.
 
     Raises InputError if a number is out of range, or `gaussians` and `spacing` are both given.
@@ -33,8 +31,6 @@ class PriorSettings:
     gaussians: int | Literal["auto"] | None = None
     spacing: float | None = None
     poisson_depth: int | None = None
-    noise: float = 0.0
-    holes: float = 0.0
     seed: int = 0
     backing: float = 0.5
     density: float | None = None
@@ -46,18 +42,14 @@ class PriorSettings:
         return self.gaussians == "auto" or given == (None, None, None)
 
     def refuse_shaping(self, why: str) -> None:
-        """Raise InputError if noise, holes or a Poisson depth are set, which need a cloud.
+        """Raise InputError if a Poisson depth is set, which needs a cloud.
 
         why: end of the message, what the surface is made of instead.
         """
-        options = {
-            "noise": self.noise > 0,
-            "holes": self.holes > 0,
-            "poisson_depth": self.poisson_depth is not None,
-        }
-        if given := " and ".join(f"`{option}`" for option, is_given in options.items() if is_given):
+        if self.poisson_depth is not None:
             raise InputError(
-                f"prior: {given} shape a mesh that is built of a cloud, but {why}; leave out either"
+                "prior: `poisson_depth` shapes a mesh that is built of a cloud, "
+                f"but {why}; leave out either"
             )
 
     def __post_init__(self) -> None:
@@ -78,13 +70,6 @@ class PriorSettings:
             raise InputError(
                 f"prior: Poisson depth {self.poisson_depth} is not within 3 to 12; "
                 "correct `poisson_depth`"
-            )
-        if not 0 <= self.noise < np.inf:
-            raise InputError(f"prior: noise {self.noise} m must be 0 or more; correct `noise`")
-        if not 0 <= self.holes <= 0.9:
-            raise InputError(
-                f"prior: holes {self.holes} is a share of the rock's points, 0 to 0.9; "
-                "correct `holes`"
             )
         if not 0 <= self.backing <= 1:
             raise InputError(
