@@ -231,10 +231,10 @@ def resume_and_print(
     from mgs.cli.printing import certificate_line, print_run, step_line
     from mgs.cli.progress import progress_bar
     from mgs.reports.evaluation import evaluate_run
-    from mgs.run.folder import Run, open_run
+    from mgs.run.folder import open_run
     from mgs.run.nbv import resume_nbv
 
-    run = run if isinstance(run, Run) else open_run(run)
+    run = open_run(run)
     total, known = run.settings.seeds + run.settings.budget, list[dict[str, Any]]()
     with progress_bar("reading", console) as progress:
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -217,7 +218,7 @@ def choose_views(
 
 
 def diagnose(
-    run: str | Path,
+    run: str | PathLike[str],
     wanted: Sequence[str] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:

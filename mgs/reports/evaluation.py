@@ -43,7 +43,7 @@ def evaluate_run(
     """
     from mgs.splat import as_drjit
 
-    run = run if isinstance(run, Run) else open_run(run)
+    run = open_run(run)
     gc.collect()  # images and lists of the run itself, if it ended in this process
     release(KEPT_BYTES)
     file, folder = run.folder / "metrics.json", run.folder / "renders"

@@ -34,6 +34,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -227,11 +228,13 @@ class Run:
         return self.metrics if fresh else None
 
 
-def open_run(folder: str | Path) -> Run:
-    """Open a run folder.
+def open_run(folder: str | PathLike[str]) -> Run:
+    """Open a run folder; a `Run` stays as it is.
 
     Raises InputError as `read_config`, where a setting is wrong, and where the dataset is gone.
     """
+    if isinstance(folder, Run):
+        return folder
     folder = Path(folder)
     path = folder / "config.json"
     settings = validated(NbvSettings, read_config(folder)["settings"], path)

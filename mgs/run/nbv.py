@@ -343,7 +343,7 @@ def resume_nbv(
     are missing or changed, another process works on it, a fit diverged, or `policy` is not the
     run's.
     """
-    run = run if isinstance(run, Run) else open_run(run)
+    run = open_run(run)
     policy = policy or run.policy
     check_named(run, policy)
     live = live if live is None or isinstance(live, Live) else Live(live)
