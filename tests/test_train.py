@@ -264,8 +264,8 @@ def test_a_start_of_another_shape_is_refused(truth, cameras, targets):
     [
         ({"optimiser": "dreams"}, "natural, adam"),
         ({"loss": "dreams"}, "squared, l1-dssim"),
-        ({"density": "dreams"}, "fixed, relocate, adaptive"),
-        ({"density": "relocate"}, "free means"),
+        ({"density": "dreams"}, "fixed, adaptive"),
+        ({"density": "adaptive"}, "free means"),
         ({"means": "free"}, "no rate of mean"),
         ({"means": "normal", "rates": RATES | {"mean": 1.0}}, "needs normals"),
     ],

@@ -3,42 +3,23 @@ need it."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.special import comb, logit
+from scipy.special import logit
 
 from mgs.camera import Camera, extent_of
-from mgs.colour import SH_C0
-from mgs.fit.objective import Objective, View
+from mgs.fit.objective import Objective
 from mgs.gaussians import ARRAYS, Gaussians
 from mgs.memory import padded
 from mgs.rotation import rotmat_from_quat
 from mgs.splat import as_drjit
-from mgs.splat.recording import frozen
-
-RELOCATION_PASSES = 5
-"""Passes between two calls of `relocate`, each as costly as a pass."""
-
-RELOCATION_UNTIL = 0.75
-"""Share of the passes after which Gaussians are left in their places by `relocate`."""
 
 LEAST_OPACITY = 0.005
-"""Opacity at and below which a Gaussian is dead (Kheradmand et al. 2024)."""
-
-MOVED_SHARE = 0.05
-"""Share of the Gaussians, those of least blending weight in the images, that count as dead too."""
-
-MOST_COPIES = 51
-"""Most Gaussians in one place after a relocation (Kheradmand et al. 2024)."""
-
-SPREAD = 0.5
-"""Standard deviation of a moved Gaussian's offset from its copy, over that of the copy."""
+"""Opacity below which a Gaussian is removed."""
 
 LEAST_GRADIENT = 2e-4
 """Least gradient (`Slopes`) at which `adapt` adds a Gaussian. This and the next numbers are those
@@ -59,17 +40,6 @@ RESET_OPACITY, RESET_STEPS = 0.01, 3000
 ADAPTION_STEPS, ADAPTION_FROM, ADAPTION_UNTIL = 100, 500, 15_000
 """Steps between two calls of `adapt`, and the steps after and before which it is called; the last
 is half of all steps in a shorter fit."""
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """Sums over images and pixels for each Gaussian at a model, [N].
-
-    weight: blending weights. error: squared residuals times blending weights.
-    """
-
-    weight: np.ndarray
-    error: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -96,59 +66,10 @@ class Density:
     control(model, found, rng) -> (model, kept [N]): index i of the Gaussian of the given model that
         each still is, or ~i for a changed copy of i. Models have NumPy fields.
     times(passes, images): the numbers of passes after which it is called.
-    slopes: whether `found` are `Slopes` of the steps before, or `Statistics` of an extra pass.
     """
 
-    control: Callable[[Gaussians, Any, np.random.Generator], tuple[Gaussians, np.ndarray]]
+    control: Callable[[Gaussians, Slopes, np.random.Generator], tuple[Gaussians, np.ndarray]]
     times: Callable[[int, int], Sequence[int]]
-    slopes: bool = False
-
-
-def split(opacity: np.ndarray, copies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Opacity and scale factor of `copies` equal Gaussians that replace one of this opacity, [M].
-
-    They keep the opacity at the centre, and its integral along a line through the centre (Eq. 9 of
-    Kheradmand et al. 2024, 3D Gaussian splatting as Markov chain Monte Carlo).
-    """
-    o = np.asarray(opacity, np.float64)
-    new = -np.expm1(np.log1p(-o) / copies)
-    k = np.arange(1, MOST_COPIES + 1)
-    signed = (-1.0) ** (k + 1) / np.sqrt(k) * comb(np.asarray(copies)[:, None], k)
-    return new, o / (signed * new[:, None] ** k).sum(1)
-
-
-def relocate(
-    model: Gaussians, found: Statistics, rng: np.random.Generator
-) -> tuple[Gaussians, np.ndarray]:
-    """A control with a fixed number of Gaussians: dead ones become copies of others, drawn by their
-    error.
-
-    As Kheradmand et al. 2024, but the error of the images, not opacity, says where Gaussians are
-    needed, and the least seen ones move too.
-    """
-    n = len(model)
-    opacity = np.clip(model.opacities.astype(np.float64), 1e-6, 1 - 1e-6)
-    dead = opacity <= LEAST_OPACITY
-    dead[np.argsort(found.weight, kind="stable")[: round(MOVED_SHARE * n)]] = True
-    needed = np.where(dead, 0.0, found.error)
-    if not dead.any() or not needed.sum() > 0:
-        return model, np.arange(n)
-    drawn = rng.multinomial(dead.sum(), needed / needed.sum())
-    count = np.minimum(drawn, MOST_COPIES - 1)
-    split_ones = np.flatnonzero(count)
-    sources = np.repeat(np.arange(n), count)
-    moved = rng.permutation(np.flatnonzero(dead))[: len(sources)]
-    new = model.map(np.array)
-    opacities, factors = split(opacity[split_ones], count[split_ones] + 1)
-    new.logit_opacities[split_ones] = logit(opacities)
-    new.log_scales[split_ones] += np.log(factors)[:, None]
-    for name in ARRAYS:
-        getattr(new, name)[moved] = getattr(new, name)[sources]
-    along = SPREAD * np.exp(new.log_scales[moved].astype(np.float64))
-    new.means[moved] += _rotated(new.quats[moved], along * rng.normal(size=along.shape))
-    kept = np.arange(n)
-    kept[moved], kept[split_ones] = ~sources, ~split_ones
-    return new, kept
 
 
 def _rotated(quats: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -211,29 +132,23 @@ def _adaption_times(passes: int, images: int) -> list[int]:
 
 DENSITIES: dict[str, Density | None] = {
     "fixed": None,
-    "relocate": Density(
-        relocate,
-        lambda passes, _: range(
-            RELOCATION_PASSES, math.ceil(RELOCATION_UNTIL * passes), RELOCATION_PASSES
-        ),
-    ),
-    "adaptive": Density(adapt, _adaption_times, slopes=True),
+    "adaptive": Density(adapt, _adaption_times),
 }
 """Density controls by name."""
 
 
 def controlled(
     density: Density,
-    found: Slopes | None,
+    found: Slopes,
     goal: Objective,
     model: Gaussians,
     buffers: list[list[Any]],
     rng: np.random.Generator,
 ) -> tuple[Objective, Gaussians, list[list[Any]]]:
     """Call a control. A Gaussian that changed is its own start in the prior; buffers are zero where
-    a parameter changed. found: None for `Statistics`, which are measured here."""
+    a parameter changed."""
     before = model.map(np.array)
-    after, kept = density.control(before, found or statistics(goal, model), rng)
+    after, kept = density.control(before, found, rng)
     same, source, prior = kept >= 0, np.where(kept < 0, ~kept, kept), goal.prior
 
     def start(name: str) -> Any:
@@ -263,31 +178,3 @@ def controlled(
         for name, each in zip(prior.lam, buffers, strict=True)
     ]
     return replace(goal, prior=refilled), as_drjit(after), kept_buffers
-
-
-def statistics(goal: Objective, model: Gaussians) -> Statistics:
-    """Statistics of a model, TensorXf fields, in all images of an objective."""
-    weight, error = np.zeros(len(model)), np.zeros(len(model))
-    for photo in goal.photos:
-        found = _image_statistics(model, goal.view(model, photo))
-        weight, error = weight + np.array(found[0]), error + np.array(found[1])
-    return Statistics(weight, error)
-
-
-@frozen(lambda model, view: (*model.recorded, *view.recorded_sizes))
-def _image_statistics(model: Gaussians, view: View) -> list[Any]:
-    """Blending weights, and squared residuals times blending weights, of one image, Float [N] each.
-
-    A colour's derivative is the blending weight, so both are derivatives of a sum of pixels.
-    """
-    found, (count, coefficients, _) = [], model.sh.shape
-    first = dr.arange(mi.UInt32, count) * (3 * coefficients)
-    for squared in (False, True):
-        copy = replace(model, sh=dr.copy(dr.detach(model.sh)))
-        dr.enable_grad(copy.sh)
-        drawn = view.rendered(copy).array
-        residual = dr.detach((drawn - view.target.pixels) * view.target.weights)
-        dr.backward(dr.sum(drawn * dr.square(residual) if squared else drawn))
-        slope = dr.grad(copy.sh).array
-        found.append(sum(dr.gather(mi.Float, slope, first + c) for c in range(3)) / (3 * SH_C0))
-    return found

@@ -184,13 +184,11 @@ def fit(
         done = len(losses) - 1
         changes = density is not None and done in times
         if density and changes:
-            found = None
-            if density.slopes:
-                between = last * len(cameras), done * len(cameras)
-                found = slopes_of(slopes, cameras, between, settings.most_gaussians)
+            between = last * len(cameras), done * len(cameras)
+            found = slopes_of(slopes, cameras, between, settings.most_gaussians)
             goal, model, buffers = controlled(density, found, goal, model, buffers, draws)
             slopes, last = [], done
-        if density and density.slopes and not slopes and done < end:
+        if density and not slopes and done < end:
             slopes = [dr.zeros(mi.Float, len(model)) for _ in range(2)]
             dr.make_opaque(slopes)
         if optimiser.uses_information and (changes or done % INFORMATION_PASSES == 0):

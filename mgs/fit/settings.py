@@ -60,8 +60,7 @@ class TrainSettings(BaseModel):
     means: Literal["frozen", "normal", "free"] = "frozen"
     """How means move: frozen, as in the paper; normal, along the prior's normals; or free."""
     density: str = "fixed"
-    """Density control of free means: fixed, relocate (move little-seen ones to large errors), or
-    adaptive (add and remove as 3DGS)."""
+    """Density control of free means: fixed, or adaptive (add and remove as 3DGS)."""
     most_gaussians: Annotated[int, Field(ge=1, le=2**25)] = 200_000
     """Number of Gaussians beyond which adaptive density adds none."""
     loss: str = "squared"
