@@ -26,19 +26,22 @@ def mesh_in_sight(path: Path, cameras: Sequence[Camera], origin: Sequence[float]
     """Read a mesh, move it to a dataset of this origin (`towards`), and check that it is in some
     picture.
 
-    Raises InputError as `read_mesh`, and if none of a few cameras sees the mesh, as happens with
-    another unit or other axes.
+    Raises InputError as `read_mesh`, and if none of a few cameras sees the mesh, or all are inside,
+    as happens with another unit or other axes.
     """
     mesh = read_mesh(path)
     mesh = replace(mesh, vertices=towards(mesh.vertices, origin))
     depth, some = mesh_depth(mesh), cameras[:: max(1, len(cameras) // 4)]
-    if any((depth(shrunk_to(camera, SMALL)[0]) > 0).any() for camera in some):
+    hits = [depth(shrunk_to(camera, SMALL)[0]) > 0 for camera in some]
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    within = all(((low < camera.position) & (camera.position < high)).all() for camera in some)
+    if any(hit.any() for hit in hits) and not (within and all(hit.all() for hit in hits)):
         return mesh
     size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     near = min(float(np.linalg.norm(camera.position - mesh.vertices.mean(0))) for camera in some)
     raise InputError(
-        f"{path}: the mesh is in no picture: it is {size:.3g} across, and the nearest camera is "
-        f"{near:.3g} from its middle; give it in the unit and axes of the cameras"
+        f"{path}: the mesh is in no picture, or around all cameras: it is {size:.3g} across, and "
+        f"the nearest camera is {near:.3g} from its middle; give it in the unit and axes of the cameras"
     )
 
 

@@ -1,0 +1,387 @@
+"""Imports judged by the truth: cameras of a scene in closed form, written as other programs do."""
+
+import shutil
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+import synthetic
+from PIL import Image
+from program import command, said
+from refusals import refused
+from test_recordings import MOUNT, OPTICAL, Bag, write_open3d, write_rtabmap
+
+from mgs.camera import Camera
+from mgs.data import tracks
+from mgs.data.clouds import read_cloud
+from mgs.data.dataset import load_dataset
+from mgs.data.lens import Lens
+from mgs.data.sources import read_source
+from mgs.errors import InputError
+from mgs.images import read_depth
+
+COLOUR = "/camera/color/image_raw"
+
+
+@pytest.fixture
+def data(tmp_path):
+    """Twelve views, so that names without zeros are not in the order of text."""
+    return synthetic.write_dataset(tmp_path / "data", synthetic.orbit_cameras(12, 32, 24))
+
+
+def errors(dataset, shots) -> np.ndarray:
+    """Largest difference of a pose's entries from the truth, by the place of its pixels."""
+    found = []
+    for shot in shots:
+        with Image.open(shot.image) as image:
+            pixels = np.asarray(image.convert("RGB"))
+        true = next(f for f in dataset.frames if np.array_equal(Image.open(f.image_path), pixels))
+        found.append(np.abs(shot.camera.camera_to_world - true.camera.camera_to_world).max())
+    return np.array(found)
+
+
+class Robot:
+    """A bag of a robot's camera; each test adds the poses."""
+
+    def __init__(self, path, data):
+        self.bag, self.path, self.frames = Bag(path, 2), path, data.frames
+
+    def images(self):
+        for k, frame in enumerate(self.frames):
+            rgb = np.asarray(Image.open(frame.image_path))
+            self.bag.image(COLOUR, 100 + 0.5 * k, "rgb8", rgb)
+            self.bag.lens("/camera/color/camera_info", 100 + 0.5 * k, frame.camera)
+
+    def bodies(self):
+        for k, frame in enumerate(self.frames):
+            yield k, 100 + 0.5 * k, frame.camera.camera_to_world @ np.linalg.inv(MOUNT)
+
+    def mount(self):
+        self.bag.tf("/tf_static", 99, "base_link", OPTICAL, MOUNT)
+
+    def odometry(self, topic, time, pose):
+        T = self.bag
+        place = T.pose("Pose", "Point", pose)
+        made = T.make("geometry_msgs/msg/PoseWithCovariance", place, np.zeros(36))
+        zero = T.make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+        twist = T.make("geometry_msgs/msg/Twist", zero, zero)
+        twist = T.make("geometry_msgs/msg/TwistWithCovariance", twist, np.zeros(36))
+        head = T.header(time, "odom")
+        T.write(topic, "nav_msgs/msg/Odometry", time, head, "base_link", made, twist)
+
+
+def wrong(pose, k):
+    """A pose of wheels that slip."""
+    return tracks.rigid((0.3 * k, 0, 0), (0, 0, np.sin(0.1 * k), np.cos(0.1 * k))) @ pose
+
+
+def bag_of(tmp_path, data, kind):
+    robot = Robot(tmp_path / "bag", data)
+    with robot.bag.writer:
+        robot.images()
+        if kind != "pose only":
+            robot.mount()
+        for k, time, body in robot.bodies():
+            if kind in ("tf and wheels", "tf and goal", "gap") and not (
+                kind == "gap" and 3 < k < 8
+            ):
+                robot.bag.tf("/tf", time, "odom", "base_link", body)
+            if kind in ("tf and wheels", "wheels and filter"):
+                robot.odometry("/wheels", time + 0.01, wrong(body, k))
+            if kind == "wheels and filter":
+                robot.odometry("/filter", time, body)
+            if kind in ("body", "pose only"):
+                pose = body if kind == "body" else body @ MOUNT
+                robot.bag.stamped("/local/pose", time, pose)
+        if kind == "tf and goal":
+            robot.bag.stamped("/goal_pose", 99.5, np.eye(4))
+    return robot.path
+
+
+@pytest.mark.parametrize(
+    ("kind", "pose", "frames"),
+    [
+        ("tf and wheels", None, 12),
+        ("tf and goal", None, 12),
+        ("gap", None, 8),
+        ("wheels and filter", "/filter", 12),
+        ("body", "/local/pose", 12),
+        ("pose only", "/local/pose", 12),
+    ],
+)
+def test_poses_of_a_bag_are_those_that_move_the_camera(tmp_path, data, kind, pose, frames):
+    source = read_source(bag_of(tmp_path, data, kind), unpack=tmp_path / "x", pose=pose)
+    assert errors(data, source.shots).max() < 1e-6
+    assert len(source.shots) == frames
+    assert source.left_out.total() == 12 - frames
+
+
+@pytest.mark.parametrize("kind", ["static", "wheels and filter", "body", "pose only"])
+def test_a_bag_whose_poses_are_not_plain_is_refused(tmp_path, data, kind):
+    with pytest.raises(InputError, match=r"does not move|come from|no tf or odometry leads"):
+        read_source(bag_of(tmp_path, data, kind), unpack=tmp_path / "x")
+
+
+def test_names_with_numbers_are_in_their_order(tmp_path, data):
+    source = read_source(write_open3d(tmp_path / "o", data))
+    assert errors(data, source.shots).max() < 1e-9
+    (tmp_path / "o/color/11.png").unlink()
+    with pytest.raises(InputError, match="12 poses for 11 images in color"):
+        read_source(tmp_path / "o")
+    folder = write_rtabmap(tmp_path / "r", data)
+    with open(folder / "rtabmap_camera_poses.txt", "a") as file:
+        file.write("\n0 1 2 3 0 0 0 1 -7\n")
+    source = read_source(folder)
+    assert errors(data, source.shots).max() < 1e-9
+    assert source.left_out == {"landmark": 1}
+
+
+def test_a_transforms_json_is_read_as_its_authors_mean_it(tmp_path, data):
+    def change(json):
+        json["test_filenames"] = [json["frames"][k]["file_path"] for k in (0, 5)]
+        json["camera_angle_x"] = 2 * np.arctan(json["w"] / 2 / json.pop("fl_x"))
+        json["camera_angle_y"] = 2 * np.arctan(json["h"] / 2 / (1.25 * json.pop("fl_y")))
+        for k, frame in enumerate(json["frames"]):
+            name = f"images/r.{k}"
+            shutil.move(data.root / frame["file_path"], data.root / f"{name}.png")
+            frame["file_path"] = name.replace("/", "\\")
+            frame["transform_matrix"] = np.round(frame["transform_matrix"], 4).tolist()
+        json["test_filenames"] = [json["frames"][k]["file_path"] for k in (0, 5)]
+
+    frames = data.frames
+    synthetic.edit(data.root, change)
+    source = read_source(data.root)
+    assert source.tests == {"r.0", "r.5"}
+    train, tests = source.set_apart(None)
+    assert (len(train.shots), len(tests.shots)) == (10, 2)
+    for shot, frame in zip(source.shots, frames, strict=True):
+        K = frame.camera.K
+        assert np.allclose(shot.camera.K, np.diag([1, 1.25, 1]) @ K * [1, 1, 0] + K * [0, 0, 1])
+        assert np.abs(shot.camera.world_to_camera - frame.camera.world_to_camera).max() < 2e-3
+    assert "12 rotations were rounded" in source.notes[0]
+
+
+MODELS = {
+    "SIMPLE_RADIAL": {"k1": 0.1},
+    "RADIAL_FISHEYE": {"k1": 0.02, "k2": -0.01},
+    "OPENCV_FISHEYE": {"k1": 0.02, "k4": 0.001},
+    "THIN_PRISM_FISHEYE": {"k1": 0.02, "p1": 0.001, "sx1": 0.001},
+    "FOV": {"omega": 0.6},
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_lens_of_colmap_is_one_of_transforms_json(data, model):
+    """The lens has the parameters under the names that COLMAP gives them."""
+    import pycolmap
+
+    change = {"camera_model": model, **MODELS[model]}
+    synthetic.edit(data.root, lambda json: json.update(change))
+    shot = read_source(data.root).shots[0]
+    K = shot.camera.K
+    names = {"k1": "k"} if model == "SIMPLE_RADIAL" else {}
+    values = {names.get(key, key): value for key, value in MODELS[model].items()}
+    number = pycolmap.CameraModelId.__members__[model]
+    lens = pycolmap.Camera.create_from_model_id(1, number, K[0, 0], 32, 24)
+    place = [name.strip() for name in lens.params_info.split(",")]
+    known = {"f": K[0, 0], "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    lens.params = [{**known, **values}.get(name, 0.0) for name in place]
+    rays = np.array([[0.2, 0.1, 1.0], [-0.3, 0.25, 1.0]])
+    ours = shot.lens.camera(32, 24).img_from_cam(rays)
+    assert np.allclose(ours, lens.img_from_cam(rays), atol=1e-9)
+
+
+def test_a_coefficient_that_a_model_lacks_is_named():
+    with pytest.raises(InputError, match="p1, which the model OPENCV_FISHEYE lacks"):
+        Lens.of("a", "OPENCV_FISHEYE", np.eye(3), {"p1": 0.1})
+
+
+def colmap_text(data, tmp_path, rename=str):
+    synthetic.write_colmap(data, tmp_path / "c", False)
+    path = tmp_path / "c/sparse/0/images.txt"
+    text = path.read_text()
+    for frame in data.frames:
+        text = text.replace(frame.image_path.name, rename(frame.image_path.name))
+    path.write_text(text)
+    return tmp_path / "c", path
+
+
+def test_colmap_text_keeps_names_and_loses_no_image(data, tmp_path):
+    source, path = colmap_text(data, tmp_path, lambda name: f"left cam/{name}")
+    (source / "images").unlink()
+    shutil.copytree(data.root / "images", source / "images/left cam")
+    shots = read_source(source).shots
+    assert errors(data, shots).max() < 1e-9
+    assert [shot.name for shot in shots[:2]] == ["left cam_kf_0000", "left cam_kf_0001"]
+    lines = [line for line in path.read_text().splitlines() if line.endswith(".png")]
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(InputError, match="has no line of points after that of image"):
+        read_source(source)
+    path.write_text(lines[0] + "\n\n" + lines[1][:40])
+    with pytest.raises(InputError, match="is no line of an image"):
+        read_source(source)
+
+
+def test_the_largest_model_is_taken_and_far_origins_are_moved(data, tmp_path):
+    import pycolmap
+
+    synthetic.write_colmap(data, tmp_path / "c", True)
+    model = pycolmap.Reconstruction(tmp_path / "c/sparse/0")
+    (tmp_path / "c/sparse/10").mkdir()
+    far = np.array([448262.0, 5411932.0, 412.0])
+    model.transform(pycolmap.Sim3d(1, pycolmap.Rotation3d(), far))
+    model.write_binary(tmp_path / "c/sparse/10")
+    for number in list(model.images)[:9]:
+        model.deregister_frame(number)
+    model.write_binary(tmp_path / "c/sparse/0")
+    command("import", tmp_path / "c", "--out", tmp_path / "out", "--mesh", write_far(tmp_path, far))
+    made = load_dataset(tmp_path / "out")
+    moved = np.subtract(far, made.origin)
+    for one, other in zip(made.frames, data.frames, strict=True):
+        assert np.allclose(one.camera.position, other.camera.position + moved, atol=1e-6)
+        assert (one.mask() ^ other.mask()).mean() < 0.01
+    points = read_cloud(tmp_path / "out/sparse.ply").points - moved
+    on_rock = points[:, 2] > 0.02
+    assert np.abs(synthetic.level(points[on_rock])).max() < 1e-4
+
+
+def write_far(tmp_path, far):
+    mesh = synthetic.rock_mesh()
+    text = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in (mesh.vertices + far).tolist())
+    text += "".join(f"f {a} {b} {c}\n" for a, b, c in (mesh.faces + 1).tolist())
+    (tmp_path / "far.obj").write_text(text)
+    return tmp_path / "far.obj"
+
+
+def test_a_mesh_in_millimetres_is_refused(data, tmp_path, capsys):
+    mesh = synthetic.rock_mesh()
+    mesh.vertices *= 1000
+    mesh.export(tmp_path / "mm.ply")
+    for name in ("import", "prior"):
+        asked = [name, data.root, "--mesh", tmp_path / "mm.ply", "--out", tmp_path / "out"]
+        assert "the mesh is in no picture" in refused(capsys, asked)
+
+
+def test_masks_in_folders_are_those_of_their_images(data, tmp_path, capsys):
+    """Two cameras with pictures of the same names."""
+
+    def change(json):
+        for k, frame in enumerate(json["frames"]):
+            name = f"images/cam{k % 2}/{k // 2:03d}.png"
+            (data.root / name).parent.mkdir(exist_ok=True)
+            shutil.move(data.root / frame["file_path"], data.root / name)
+            mask = tmp_path / "m" / f"cam{k % 2}" / f"{k // 2:03d}.png.png"
+            mask.parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(data.root / frame.pop("mask_path"), mask)
+            frame["file_path"] = name
+
+    true = [frame.mask() for frame in data.frames]
+    synthetic.edit(data.root, change)
+    asked = ["import", data.root, "--masks", tmp_path / "m", "--out"]
+    command(*asked, tmp_path / "out")
+    made = load_dataset(tmp_path / "out").frames
+    assert all(np.array_equal(one.mask(), mask) for one, mask in zip(made, true, strict=True))
+    for path in (tmp_path / "m/cam1").iterdir():
+        path.unlink()
+    for path in (tmp_path / "m/cam0").iterdir():
+        path.rename(tmp_path / "m" / path.name)
+    assert "2 images have this name" in refused(capsys, [*asked, tmp_path / "no"], tmp_path)
+
+
+def write_channels(path, channels):
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))
+
+
+def test_depth_is_right_or_refused(tmp_path):
+    depth = np.linspace(1, 3, 12, dtype=np.float32).reshape(3, 4)
+    grey = np.full((3, 4), 0.5, np.float32)
+    exr, tiff, png = (tmp_path / f"a.{end}" for end in ("exr", "tif", "png"))
+    layers = {f"Layer.Combined.{c}": grey for c in "RGB"} | {"Layer.Depth.Z": depth}
+    for channels in (layers, {"R": depth, "G": depth, "B": depth, "A": grey}, {"V": depth}):
+        write_channels(exr, channels)
+        assert np.array_equal(read_depth(exr), depth)
+    for channels in ({"R": depth, "G": grey, "B": grey}, {"a.Z": depth, "b.Z": grey}):
+        write_channels(exr, channels)
+        with pytest.raises(InputError, match="is not plain"):
+            read_depth(exr)
+    Image.fromarray(depth).save(tiff)
+    assert np.array_equal(read_depth(tiff), depth)
+    cv2.imwrite(str(png), np.round(1000 * depth).astype(np.uint16))
+    assert np.abs(read_depth(png) - depth).max() < 6e-4
+    cv2.imwrite(str(png), np.uint8(80 * depth))
+    with pytest.raises(InputError, match="a picture of 8 bits is no depth"):
+        read_depth(png)
+
+
+@pytest.mark.parametrize("applied", [True, False])
+def test_a_set_shows_whether_its_cameras_are_of_turned_pictures(data, applied):
+    """One picture on its side tells, also for one that is upside down."""
+
+    def change(json):
+        for k, tag in ((3, 6), (5, 3)):
+            path = data.root / json["frames"][k]["file_path"]
+            with Image.open(path) as image:
+                pixels, exif = np.asarray(image), Image.Exif()
+            exif[0x112] = tag
+            stored = np.rot90(pixels, {6: 1, 3: 2}[tag]) if applied else pixels
+            Image.fromarray(np.ascontiguousarray(stored)).save(path, exif=exif)
+
+    true = [frame.rgb() for frame in data.frames]
+    synthetic.edit(data.root, change)
+    source = read_source(data.root)
+    assert all(shot.turned == applied for shot in source.shots)
+    command("import", data.root, "--out", data.root.with_name("out"))
+    made = load_dataset(data.root.with_name("out")).frames
+    assert all(np.array_equal(one.rgb(), rgb) for one, rgb in zip(made, true, strict=True))
+
+
+def test_dark_pictures_of_12_bits_are_noticed(data, capsys):
+    for frame in data.frames:
+        pixels = np.asarray(Image.open(frame.image_path)).astype(np.uint16)
+        cv2.imwrite(str(frame.image_path), pixels * 16)
+    command("import", data.root, "--out", data.root.with_name("out"))
+    assert (
+        "use 12 of 16 bits, so the pictures are nearly black; multiply them by 16"
+        in said(capsys)[1]
+    )
+
+
+def test_cameras_of_metashape_that_are_disabled_are_left_out(data, tmp_path):
+    camera, rows = data.frames[0].camera, ""
+    for k, frame in enumerate(data.frames):
+        words = " ".join(map(repr, frame.camera.camera_to_world.ravel().tolist()))
+        state = ' enabled="false"' if k in (2, 7) else ""
+        rows += f'<camera id="{k}" sensor_id="0" label="{frame.name}"{state}>'
+        rows += f"<transform>{words}</transform></camera>"
+    rows += '<camera id="9" sensor_id="0" label="../../up"><transform>'
+    rows += f"{' '.join(map(repr, np.eye(4).ravel().tolist()))}</transform></camera>"
+    inner = f'<resolution width="32" height="24"/><f>{camera.K[0, 0]}</f><k1>0.05</k1><p1>.001</p1>'
+    lens = f'<calibration type="fisheye" class="adjusted">{inner}</calibration>'
+    path = data.root / "cameras.xml"
+    path.write_text(
+        f'<document><chunk><sensors><sensor id="0" type="fisheye">{lens}</sensor></sensors>'
+        f"<cameras>{rows}</cameras></chunk></document>"
+    )
+    source = read_source(path)
+    assert len(source.shots) == 10
+    assert source.left_out["disabled"] == 2
+    assert errors(data, source.shots).max() < 1e-9
+    assert source.shots[0].lens.model == "THIN_PRISM_FISHEYE"
+    point = np.array([[0.3, 0.2, 1.0]])
+    theta = np.arctan(np.hypot(0.3, 0.2))
+    x, y = theta / np.hypot(0.3, 0.2) * point[0, :2]
+    radial, r2 = 1 + 0.05 * theta**2, theta**2
+    expected = [x * radial + 0.001 * (r2 + 2 * x * x), y * radial + 2 * 0.001 * x * y]
+    found = source.shots[0].lens.camera(32, 24).img_from_cam(point)[0]
+    assert np.allclose(found, np.array(expected) * camera.K[0, 0] + camera.K[:2, 2], atol=1e-9)
+
+
+def test_a_moved_camera_sees_the_same():
+    camera = synthetic.orbit_cameras(3)[1]
+    points, offset = np.random.default_rng(0).normal(size=(5, 3)), np.array([1.0, -2, 3])
+    moved = camera.moved(offset)
+    assert isinstance(moved, Camera)
+    assert np.allclose(moved.project(points + offset)[0], camera.project(points)[0])
