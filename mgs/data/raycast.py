@@ -41,7 +41,7 @@ def mesh_in_sight(path: Path, cameras: Sequence[Camera], origin: Sequence[float]
     near = min(float(np.linalg.norm(camera.position - mesh.vertices.mean(0))) for camera in some)
     raise InputError(
         f"{path}: the mesh is in no picture, or around all cameras: it is {size:.3g} across, and "
-        f"the nearest camera is {near:.3g} from its middle; give it in the unit and axes of the cameras"
+        f"the nearest camera is {near:.3g} from its middle; give it in the cameras' unit and axes"
     )
 
 
