@@ -56,6 +56,6 @@ from .splat import render as render
 from .splat_ply import read_ply as read_ply
 from .splat_ply import write_ply as write_ply
 from .synth.rendering import RenderPreset as RenderPreset
-from .synth.rendering import synthesise as synthesise
+from .synth.rendering import synth_orbit as synth_orbit
 
 __version__: str

@@ -155,7 +155,7 @@ def make_dataset(
     mesh: str | None = None,
 ) -> dict[str, Any]:
     """Render the dataset of a `Case` into OUT/dataset, as `mgs synth-orbit` does."""
-    from mgs.synth.rendering import RenderPreset, synthesise  # needs a variant of Mitsuba
+    from mgs.synth.rendering import RenderPreset, synth_orbit  # needs a variant of Mitsuba
     from mgs.synth.scene_file import SceneFile, load_scene_file
 
     folder = out / "dataset"
@@ -165,7 +165,7 @@ def make_dataset(
         for section, values in (changes or {}).items():
             sections[section] |= values
         changed = SceneFile.model_validate(sections)
-        synthesise(folder, changed, images, seed, mesh, test_views=size["tests"])
+        synth_orbit(folder, changed, images, seed, mesh, test_views=size["tests"])
     return {"frames": len(load_dataset(folder))}
 
 

@@ -23,7 +23,7 @@ from mgs.run import nbv
 from mgs.run.inputs import prior_digest
 from mgs.synth import arena, rendering
 from mgs.synth.capture import capture_of
-from mgs.synth.rendering import PoseNoise, RenderPreset, synthesise
+from mgs.synth.rendering import PoseNoise, RenderPreset, synth_orbit
 from mgs.synth.scene_file import Arena, Rock, SceneFile
 from mgs.view.subject import read_subject
 
@@ -65,13 +65,13 @@ def root(tmp_path_factory):
 @pytest.fixture(scope="module")
 def full(root):
     """The dataset with all its images."""
-    return synthesise(root / "full", SCENE, TINY, seed=3, test_views=2)
+    return synth_orbit(root / "full", SCENE, TINY, seed=3, test_views=2)
 
 
 @pytest.fixture(scope="module")
 def poses(root):
     """The same on demand; none of its frames is ever taken."""
-    return synthesise(root / "poses", SCENE, TINY, seed=3, test_views=2, on_demand=True)
+    return synth_orbit(root / "poses", SCENE, TINY, seed=3, test_views=2, on_demand=True)
 
 
 @pytest.fixture(scope="module")
@@ -137,10 +137,10 @@ def test_an_interrupted_dataset_goes_on_only_as_on_demand(poses, tmp_path):
 
     given, out = (SCENE, TINY), tmp_path / "again"
     with pytest.raises(KeyboardInterrupt):
-        synthesise(out, *given, seed=3, test_views=2, on_demand=True, progress=stop)
+        synth_orbit(out, *given, seed=3, test_views=2, on_demand=True, progress=stop)
     with pytest.raises(InputError, match="unfinished dataset of other settings"):
-        synthesise(out, *given, seed=3, test_views=2)
-    synthesise(out, *given, seed=3, test_views=2, on_demand=True)
+        synth_orbit(out, *given, seed=3, test_views=2)
+    synth_orbit(out, *given, seed=3, test_views=2, on_demand=True)
     ours, theirs = listing(out), listing(poses.root)
     assert ours == theirs
 
@@ -170,7 +170,7 @@ def test_a_mesh_with_noisy_poses_is_captured_from_the_true_ones(full, tmp_path):
     mesh, noise = shutil.copy(full.root / "rock.glb", tmp_path), PoseNoise(0.01, 0.2)
     given = (SCENE, RenderPreset(32, 24, 4, 2))
     whole, poses = (
-        synthesise(tmp_path / name, *given, mesh=mesh, pose_noise=noise, on_demand=name == "poses")
+        synth_orbit(tmp_path / name, *given, mesh=mesh, pose_noise=noise, on_demand=name == "poses")
         for name in ("full", "poses")
     )
     capture = capture_of(poses)

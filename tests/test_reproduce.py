@@ -228,7 +228,7 @@ def test_rocks_of_ones_own_take_the_place_of_the_others(quick, tmp_path, capsys,
 def test_a_case_is_the_scene_with_some_keys_changed(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(
-        "mgs.synth.rendering.synthesise", lambda out, scene, *_, **__: made.append(scene)
+        "mgs.synth.rendering.synth_orbit", lambda out, scene, *_, **__: made.append(scene)
     )
     monkeypatch.setattr(case, "load_dataset", lambda folder: ())
     changes = {"rock": {"specular": 0.0}, "orbit": {"kind": "hemisphere", "distances": [1, 2]}}

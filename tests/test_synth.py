@@ -15,7 +15,7 @@ from mgs.files import locked, read_json
 from mgs.resources import resource_folder
 from mgs.seeds import generator
 from mgs.synth.orbit import evaluation_cameras, rock_cameras
-from mgs.synth.rendering import ROCK_EXPOSURE, PoseNoise, RenderPreset, _meter, rock_of, synthesise
+from mgs.synth.rendering import ROCK_EXPOSURE, PoseNoise, RenderPreset, _meter, rock_of, synth_orbit
 from mgs.synth.rock import make_rock
 from mgs.synth.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_scene_file
 
@@ -39,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("coarse_arena")
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    return synthesise(tmp_path_factory.mktemp("synth") / "tiny", SCENE, TINY, seed=3)
+    return synth_orbit(tmp_path_factory.mktemp("synth") / "tiny", SCENE, TINY, seed=3)
 
 
 def test_depth_inside_the_mask_lies_on_the_rock(dataset):
@@ -76,18 +76,18 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise_and_test_views(dataset, 
     made |= {"pose_noise": PoseNoise(0.01, 0.1)}
     for views, unwritten in ((2, "transforms.json"), (7, "test/transforms.json")):
         with pytest.raises(KeyboardInterrupt):
-            synthesise(out, **made, progress=stop_at(views))
+            synth_orbit(out, **made, progress=stop_at(views))
         assert not (out / unwritten).exists()
     written = {path: path.stat().st_mtime_ns for path in out.rglob("*_0*.*")}
     assert len(written) == 4 * 7
     left = out / "images/.kf_0003.1073741824-01234567.part.png"
     left.touch()
     with locked(out), pytest.raises(InputError, match="works on it"):
-        synthesise(out, **made)
+        synth_orbit(out, **made)
     assert left.exists()  # of that process, still at work
     with pytest.raises(InputError, match="other settings"):
-        synthesise(out, **(made | {"test_views": 5}))
-    again = synthesise(out, **made)
+        synth_orbit(out, **(made | {"test_views": 5}))
+    again = synth_orbit(out, **made)
     assert {path: path.stat().st_mtime_ns for path in written} == written
     assert not list(out.rglob(".*"))
     truth = read_json(out / "true_poses.json")["poses"]
@@ -130,20 +130,20 @@ def test_another_mesh_of_the_same_name_is_not_gone_on_with(tmp_path):
     made = {"scene": SCENE, "preset": ONE, "mesh": path}
     trimesh.creation.icosphere(subdivisions=2).export(path)
     with pytest.raises(KeyboardInterrupt):
-        synthesise(tmp_path / "out", **made, progress=stop_at(1))
+        synth_orbit(tmp_path / "out", **made, progress=stop_at(1))
     trimesh.creation.icosphere(subdivisions=3).export(path)
     with pytest.raises(InputError, match="other settings"):
-        synthesise(tmp_path / "out", **made)
+        synth_orbit(tmp_path / "out", **made)
     trimesh.creation.icosphere(subdivisions=2).export(path)
     with pytest.raises(InputError, match="other settings"):
-        synthesise(tmp_path / "out", **made, mesh_up="y")
-    assert len(synthesise(tmp_path / "out", **made)) == 1
+        synth_orbit(tmp_path / "out", **made, mesh_up="y")
+    assert len(synth_orbit(tmp_path / "out", **made)) == 1
 
 
 def test_the_rock_of_a_dataset_given_back_as_mesh_is_the_same_scene(dataset, tmp_path):
     notes = []
     mesh = dataset.root / "rock.glb"
-    again = synthesise(tmp_path / "again", SCENE, TINY, 3, mesh, say=notes.append)
+    again = synth_orbit(tmp_path / "again", SCENE, TINY, 3, mesh, say=notes.append)
     assert "rock.glb: +Y is up, as in all GLB files; scaled 1 times" in notes[0]
     for a, b in zip(dataset.frames, again.frames, strict=True):
         assert (a.mask() != b.mask()).mean() < 1e-3
@@ -163,7 +163,7 @@ def test_what_is_taken_as_up_is_said(tmp_path):
 def test_a_dark_rock_does_not_blow_out_the_ground(tmp_path):
     black, notes = (0.01, 0.01, 0.01), []
     scene = SCENE.model_copy(update={"rock": Rock(detail=0.06, colours=(black, black), dust=black)})
-    dataset = synthesise(tmp_path / "dark", scene, TINY, seed=3, say=notes.append)
+    dataset = synth_orbit(tmp_path / "dark", scene, TINY, seed=3, say=notes.append)
     clipped = [(frame.rgb().max(-1) >= 1)[frame.depth() > 0].mean() for frame in dataset.frames]
     assert 0.05 < np.mean(clipped) < 0.25
     assert "lower than so dark a rock needs, so that about 20% of rock and ground clips" in notes[0]
@@ -173,7 +173,7 @@ def test_a_dark_rock_does_not_blow_out_the_ground(tmp_path):
 def test_the_exposure_of_other_rocks_is_that_of_the_rock_alone(tmp_path):
     notes = []
     small = RenderPreset(width=32, height=24, frames=4, spp=64)
-    usual = synthesise(tmp_path / "usual", SCENE, small, seed=3, say=notes.append)
+    usual = synth_orbit(tmp_path / "usual", SCENE, small, seed=3, say=notes.append)
     assert notes == []
     means = [frame.rgb()[frame.mask()].mean() for frame in usual.frames]
     assert np.mean(means) == pytest.approx(ROCK_EXPOSURE, rel=0.05)
@@ -182,14 +182,14 @@ def test_the_exposure_of_other_rocks_is_that_of_the_rock_alone(tmp_path):
 def test_rock_that_does_not_fit_the_frame(tmp_path):
     near = SCENE.model_copy(update={"orbit": Orbit(radius=1.5, altitude=1.5)})
     with pytest.raises(InputError, match="not wholly in frame 0"):
-        synthesise(tmp_path / "near", near, TINY)
+        synth_orbit(tmp_path / "near", near, TINY)
     assert not (tmp_path / "near").exists()
 
 
 def test_without_the_denoiser_more_samples_and_a_note(tmp_path, monkeypatch):
     monkeypatch.setattr("mgs.synth.rendering.importlib.util.find_spec", lambda name: None)
     notes = []
-    dataset = synthesise(tmp_path / "plain", SCENE, ONE, say=notes.append)
+    dataset = synth_orbit(tmp_path / "plain", SCENE, ONE, say=notes.append)
     assert '`pip install "mgs[denoise]"`' in notes[0]
     assert read_json(dataset.root / "config.json")["samples_per_pixel"] == 8
     assert dataset.frames[0].rgb()[dataset.frames[0].mask()].mean() == pytest.approx(0.2, rel=0.5)

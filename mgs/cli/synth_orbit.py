@@ -94,7 +94,8 @@ def synth_orbit(
     """
     runtime.start()
     from mgs.synth.orbit import PoseNoise
-    from mgs.synth.rendering import PRESETS, synthesise
+    from mgs.synth.rendering import PRESETS
+    from mgs.synth.rendering import synth_orbit as rendered
 
     settings = load_scene_file(scene)
     if orbit is not None and orbit not in ORBITS:
@@ -115,7 +116,7 @@ def synth_orbit(
     if force:
         clear_folder(out, Ours(FILES, [path for path in (mesh, Path(scene)) if path]))
     with progress_bar(stage, console) as progress:
-        synthesise(
+        rendered(
             out,
             settings,
             images,

@@ -312,13 +312,13 @@ def _candidates(scene: str | Path | None) -> int:
 
 def _poses(folder: Path, scene: str, seed: int, progress: Progress) -> Dataset:
     """Write the on-demand dataset of a run that captures a scene."""
-    from mgs.synth.rendering import synthesise  # needs the variant that `_candidates` sets
+    from mgs.synth.rendering import synth_orbit  # needs the variant that `_candidates` sets
 
     def rendered(done: int, total: int) -> None:
         progress("rendering test views", done, total)
 
     views = CAPTURE_TEST_VIEWS
-    return synthesise(
+    return synth_orbit(
         folder, scene, CAPTURE_PRESET, seed, progress=rendered, test_views=views, on_demand=True
     )
 

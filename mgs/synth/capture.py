@@ -30,7 +30,7 @@ POSE_TOLERANCE = 1e-9
 def capture_of(dataset: Dataset) -> Callable[[Frame], Frame]:
     """Return capture(frame) -> frame, which renders a frame of an on-demand dataset unless done.
 
-    The files are bit for bit those of `synthesise` without `on_demand`. The scene is built at the
+    The files are bit for bit those of `synth_orbit` without `on_demand`. The scene is built at the
     first call, in seconds. capture raises InputError if the dataset has no config.json of `mgs
     synth-orbit --on-demand`, its mesh has changed or is gone, its denoiser is not installed, or the
     frame is not one of the scene's orbit.

@@ -80,7 +80,7 @@ class RenderPreset:
 PRESETS = {"quick": RenderPreset(320, 240, 32, 8), "paper": RenderPreset(640, 480, 100, 12)}
 
 
-def synthesise(
+def synth_orbit(
     out: str | Path,
     scene: SceneFile | str | Path = "boulder",
     preset: RenderPreset | str = "quick",
@@ -92,11 +92,16 @@ def synthesise(
     mesh_up: str | None = None,
     test_views: int = 0,
     on_demand: bool = False,
+    *,
+    frames: int | None = None,
+    size: tuple[int, int] | None = None,
+    spp: int | None = None,
 ) -> Dataset:
     """Render a scene as a dataset into the folder `out` (files: docs/data.md); return the dataset.
 
     - scene: name of a scene of mgs, path of a TOML file, or a loaded scene.
-    - preset: a name of PRESETS, or a `RenderPreset`.
+    - preset: a name of PRESETS, or a `RenderPreset`. frames, size (width, height) and spp replace
+      its numbers.
     - seed: of all random draws in rock, ground and rendering.
     - mesh: file of a rock in place of the procedural one. mesh_up: its up axis, "y" or "z"; by
       default `up_axis`.
@@ -114,6 +119,9 @@ def synthesise(
     out = Path(out)
     settings = scene if isinstance(scene, SceneFile) else load_scene_file(scene)
     preset = row_named(PRESETS, preset, "preset") if isinstance(preset, str) else preset
+    width, height = size or (None, None)
+    numbers = {"width": width, "height": height, "frames": frames, "spp": spp}
+    preset = replace(preset, **{key: n for key, n in numbers.items() if n is not None})
     denoise = importlib.util.find_spec("pyoidn") is not None
     spp = whole_grid(preset.spp * (1 if denoise else NOISY_FACTOR))
     made_of = None
@@ -139,7 +147,7 @@ def synthesise(
         rock, scale = rock_of(settings, seed, mesh, mesh_up, say)
         size = preset.width, preset.height
         cameras = rock_cameras(settings, size, preset.frames, rock)
-        frames = orbit_frames(out, cameras)
+        orbit = orbit_frames(out, cameras)
         dome = evaluation_cameras(settings, size, test_views, rock)
         tests = orbit_frames(out / TEST_FOLDER, dome, "tv")
         own = rock.copy(include_cache=True)  # the scene adds its attributes to the mesh
@@ -157,10 +165,10 @@ def synthesise(
         with atomic_path(out / "rock.glb") as temporary:
             temporary.write_bytes(glb.result())
         photographer = Photographer(world, exposure, spp, seed, denoise)
-        views = tests if on_demand else [*frames, *tests]
+        views = tests if on_demand else [*orbit, *tests]
         _render_frames(photographer, views, progress)
         if views:
-            write_contact_sheet(out / "contact_sheet.png", tests if on_demand else frames)
+            write_contact_sheet(out / "contact_sheet.png", tests if on_demand else orbit)
         record = {
             "mesh_scale": scale,
             "exposure": exposure,
@@ -170,7 +178,7 @@ def synthesise(
         write_json(out / "config.json", resolved | record)
         if tests:
             write_transforms(out / TEST_FOLDER, tests)
-        published = frames if pose_noise is None else _with_noise(out, frames, pose_noise, seed)
+        published = orbit if pose_noise is None else _with_noise(out, orbit, pose_noise, seed)
         if on_demand:
             published = [replace(frame, on_demand=True) for frame in published]
             copy_file(out / "rock.glb", out / SURVEY_FOLDER / "rock.glb")
