@@ -363,6 +363,31 @@ def test_two_commands_on_one_run(capsys, stranger, monkeypatch):
         assert "works on it" in refused(capsys, ["nbv", "--resume", stranger], stranger)
 
 
+LINKED = {
+    "eval": (".lock", "renders"),
+    "diagnose": ("diagnostics", "diagnostics/.lock"),
+    "simplify": (".lock",),
+    "nbv --resume": (".lock",),
+    "prior": ("dataset/prior", "dataset/.prior.part", "dataset/.prior.old"),
+    "survey": ("dataset/survey", "dataset/.survey.part"),
+}
+
+
+@pytest.mark.parametrize(("name", "place"), [(n, one) for n in LINKED for one in LINKED[n]])
+def test_no_command_writes_through_a_link(stranger, dataset, tmp_path, name, place, capsys):
+    """The link leads to a folder, or for a lock to a file, that stays as it is."""
+    shutil.copytree(dataset, stranger / "dataset")
+    outside, link = tmp_path / "outside", stranger / place
+    outside.mkdir()
+    (outside / "kf_0000.png").write_text("mine")
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(outside / "kf_0000.png" if place.endswith(".lock") else outside)
+    folder = stranger / "dataset" if name in ("prior", "survey") else stranger
+    more = ["--force"] if name in ("prior", "survey", "diagnose", "simplify") else []
+    line = refused(capsys, [*name.split(), folder, *more], outside)
+    assert f"{place}: leads out of" in line or f"{place}: is in the way" in line
+
+
 @pytest.mark.parametrize("damage", CHECKPOINTS)
 def test_the_checkpoint_of_a_stranger(capsys, stranger, damage):
     CHECKPOINTS[damage](stranger / "checkpoint.npz")
