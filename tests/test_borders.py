@@ -151,6 +151,10 @@ def test_a_name_is_no_markup_and_controls_no_terminal(tmp_path, dataset, capsys)
     assert "\x1b" not in text
 
 
+def test_a_name_that_is_not_utf_8_is_refused(capsys):
+    assert "a\\udcff: is not UTF-8" in refused(capsys, ["dataset", "check", "a\udcff"])
+
+
 def test_a_strangers_settings_name_a_program_that_is_not_run(tmp_path, dataset, capsys):
     (tmp_path / "evil.py").write_text("raise SystemExit")
     (tmp_path / "a.toml").write_text(f'policy = "{tmp_path}/evil.py:f"')
