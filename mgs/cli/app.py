@@ -152,6 +152,9 @@ def main(arguments: list[str] | None = None) -> None:
     Always raises SystemExit, except that errors of the program itself pass through.
     """
     arguments = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    for argument in arguments:
+        if any("\udc80" <= character <= "\udcff" for character in argument):
+            raise _stop(f"{argument}: is not UTF-8, as libraries need it; rename the file", 2)
     if isinstance(sys.stdout, io.TextIOWrapper):  # a terminal may lack characters of the tables
         sys.stdout.reconfigure(errors="replace")
     warnings.simplefilter("always", Notice)
