@@ -238,6 +238,8 @@ def test_the_largest_model_is_taken_and_far_origins_are_moved(data, tmp_path):
     command("import", tmp_path / "c", "--out", tmp_path / "out", "--mesh", write_far(tmp_path, far))
     made = load_dataset(tmp_path / "out")
     moved = np.subtract(far, made.origin)
+    scaled = read_source(tmp_path / "c").in_metres(0.5)
+    assert np.allclose(scaled.origin, np.divide(made.origin, 2))
     for one, other in zip(made.frames, data.frames, strict=True):
         assert np.allclose(one.camera.position, other.camera.position + moved, atol=1e-6)
         assert (one.mask() ^ other.mask()).mean() < 0.01

@@ -156,8 +156,8 @@ def _advice(found: Source, result: Dataset) -> Iterator[str]:
     if any(found.origin):
         yield (
             "the cameras are far from the origin, where float32 is coarse: "
-            f"{_numbers(found.origin)} is subtracted from all positions, and added again in "
-            "flight plans"
+            f"{_numbers(found.origin)} is the origin now, from which all positions count; exports "
+            "add it again, and `mgs suggest --origin` is its latitude and longitude"
         )
     stops = [value for shot in found.shots if (value := exif_exposure(shot.image)) is not None]
     if stops and max(stops) - min(stops) > EXPOSURE_DIFFERS:

@@ -75,7 +75,9 @@ class Source:
         if not 0 < unit < np.inf:
             raise InputError(f"import: unit {unit} must be a positive number of metres; correct it")
         shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
-        return replace(self, shots=shots, sparse=self.sparse and self.sparse.scaled(unit), unit="m")
+        sparse, (x, y, z) = self.sparse and self.sparse.scaled(unit), self.origin
+        origin = x * unit, y * unit, z * unit
+        return replace(self, shots=shots, sparse=sparse, unit="m", origin=origin)
 
     def near_origin(self) -> Source:
         """Move the origin to the cameras, in whole units, if they are FAR from it."""

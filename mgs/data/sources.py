@@ -37,7 +37,7 @@ COEFFICIENTS = (
 )
 """Keys of transforms.json that are parameters of COLMAP's camera models, by the same name."""
 
-SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".PNG")
+SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
 """NeRF-synthetic names images without a suffix."""
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")

@@ -39,7 +39,8 @@ def write_suggestion(out: Path, run: Run, found: Suggestion) -> None:
         for k, view in enumerate(found.plan)
     ]
     up, unit = run.dataset.up, run.dataset.unit
-    write_transforms(out, frames, up, unit, {"convention": CONVENTION})
+    notes, origin = {"convention": CONVENTION}, run.dataset.origin
+    write_transforms(out, frames, up, unit, notes, origin)
     draw_suggestion(out / "suggestions.png", run, found)
 
 
