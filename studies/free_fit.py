@@ -52,7 +52,7 @@ def _fit(dataset: Path, prior: Path, settings: dict[str, Any]) -> dict[str, Any]
     cameras = [frame.camera for frame in frames]
     passes = settings.get("passes", 1) * PASSES
     train = TrainSettings(**as_3dgs(extent_of(cameras)), passes=passes, seed=seed)
-    start = round_gaussians(points, frames)[0].with_degree(DEGREE)
+    start = round_gaussians(points, frames, linear=False)[0].with_degree(DEGREE)
     start = replace(start, antialiased=train.antialiased)
     kept = kept_within(IMAGE_BYTES, lambda i: target_of(frames[i]), lambda target: target.nbytes)
     targets = Deferred(range(len(frames)), kept)

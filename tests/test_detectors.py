@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from mgs.cli.nbv import resume_and_print
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset, target_of, write_transforms
-from mgs.evaluation import evaluate_model
+from mgs.evaluation import evaluate_model, render_view
 from mgs.images import write_png
 from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
@@ -35,7 +35,7 @@ from mgs.run.detectors import (
 from mgs.run.ending import why_ended
 from mgs.run.folder import open_run
 from mgs.run.nbv import run_nbv, start_run
-from mgs.splat import as_drjit, render
+from mgs.splat import as_drjit
 
 FITS = Before(outline=0.001, offset=0.01)
 GOOD = ViewIndicators(FITS, 0.05, 0.02, 1e-3, ratios=(-0.08, 0.0, 0.08), pixels=2000)
@@ -214,7 +214,8 @@ def warnings(state) -> list[str]:
 
 
 def test_a_good_run_has_no_warning_and_the_residual_of_new_images(rock, tmp_path):
-    given = {"policy": "d-optimal", "seeds": 5}  # which does not plan, so that both begin alike
+    # A policy that does not plan, so that both begin alike; on few pixels fits settle late.
+    given = {"policy": "d-optimal", "seeds": 5, "warm_passes": 8}
     before, after = (
         run_nbv(rock, tmp_path / f"{budget}", budget=budget, **given).state for budget in (1, 2)
     )
@@ -225,7 +226,7 @@ def test_a_good_run_has_no_warning_and_the_residual_of_new_images(rock, tmp_path
     frame = load_dataset(rock).frames[after.taken[-1]]
     target = target_of(frame)
     known = frame.mask() & (target[..., 3] > 0)
-    wrong = np.asarray(render(before.gaussians, frame.camera).rgb) - target[..., :3]
+    wrong = render_view(before.gaussians, frame.camera)[0] - target[..., :3]
     expected = np.sqrt(np.mean(wrong[known] ** 2))
     assert after.steps[-1]["residual"] == pytest.approx(expected, rel=1e-4)
 

@@ -76,7 +76,7 @@ class TrainSettings(BaseModel):
     antialiased: bool = True
     """Make Gaussians that are smaller than a pixel fainter, so that near and far views agree. 3DGS
     and the paper do not."""
-    space: Literal["linear", "srgb"] = "linear"
+    space: Literal["linear", "srgb"] = "srgb"
     """Space in which colours are blended: linear, as light adds; srgb, as in 3DGS and viewers."""
     alpha_weight: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)] = 0.0
     """Weight of alpha as a fourth channel in the loss, (sigma_rgb / sigma_alpha)^2; 0: not used.

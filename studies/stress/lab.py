@@ -153,7 +153,9 @@ class Lab:
     def start(self, taken: Sequence[int]) -> Gaussians:
         """Gaussians before training, in the colours of the views taken."""
         pixel = pixel_on(self.prior, self.cameras)
-        return initial_gaussians(self.prior, [self.frames[i] for i in taken], pixel)[0]
+        return initial_gaussians(self.prior, [self.frames[i] for i in taken], pixel, linear=False)[
+            0
+        ]
 
     def lam(self, means: str = "frozen") -> Array:
         """Lambda of each column of the information [P], with the default settings of `mgs nbv`."""
