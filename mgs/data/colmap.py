@@ -125,6 +125,7 @@ def _image_count(model: Path) -> int:
 
 def _opened(model: Path) -> tuple[Any, dict[int, str]]:
     """The reconstruction of pycolmap, and the names of its images by their numbers."""
+    import PIL.Image  # noqa: F401  # after pycolmap, writing a PNG would crash in its zlib
     import pycolmap
 
     for file in RECORDS:
