@@ -71,7 +71,7 @@ def test_ground_plane_of_a_tilted_noisy_floor(dataset):
         ground_plane(Cloud(points, points, 0.05, 0.0, 4000), dataset.frames, seed=0)
 
 
-def test_parts_of_an_overhang_are_kept_together(dataset, built):
+def test_parts_of_an_overhang_are_kept_together(dataset, built, tmp_path):
     """A cap, a base under it, and a stone beside them, of which no point joins them."""
     rng = np.random.default_rng(5)
     cap, base = (rng.uniform([-0.5, -0.5, z], [0.5, 0.5, z + 0.3], (3000, 3)) for z in (0.8, 0.1))
@@ -82,6 +82,14 @@ def test_parts_of_an_overhang_are_kept_together(dataset, built):
     assert count == 3
     assert inside[:5000].mean() > 0.99
     assert not inside[5000:].any()
+    cap, base = (synthetic.CENTRE + z * Z for z in (0.9, 0.0))
+    rocks = [(cap, np.array([0.6, 0.5, 0.3])), (base, np.array([0.35, 0.3, 0.3]))]
+    cameras = synthetic.orbit_cameras(12, 96, 72, 3.5)
+    views = synthetic.write_dataset(tmp_path, cameras, rocks)
+    overhang = prior_and_cloud(views, PriorSettings(gaussians=800, backing=0))[0]
+    low = (overhang.points[:, 2] < 0.6).mean()
+    assert 0.15 < low < 0.4
+    assert outline_error(overhang.mesh, views.frames) < 0.02
     mesh, frames = built[0].mesh, dataset.frames
     half = mesh.faces[mesh.vertices[mesh.faces].mean(1)[:, 0] > synthetic.CENTRE[0]]
     assert outline_error(mesh, frames) < 0.02

@@ -295,7 +295,7 @@ def write_transforms(
     notes: Mapping[str, str | float] | None = None,
     origin: Position = (0.0, 0.0, 0.0),
 ) -> None:
-    """Write transforms.json into the folder `root`, with paths relative to it.
+    """Write transforms.json into the folder `root`, with paths relative to it if they are below it.
 
     up, unit, origin: as `Dataset`. notes: more entries. Frames are either all on demand
     or none. Intrinsics equal to those of the first frame are written once. Write this file last:
@@ -311,7 +311,9 @@ def write_transforms(
     for frame in frames:
         paths = {key: getattr(frame, field) for field, key in FILES.items()}
         record: dict[str, Any] = {
-            key: path.relative_to(root).as_posix() for key, path in paths.items() if path
+            key: (path.relative_to(root) if path.is_relative_to(root) else path).as_posix()
+            for key, path in paths.items()
+            if path
         }
         record["transform_matrix"] = opengl_from_opencv(frame.camera.world_to_camera).tolist()
         record["timestamp"] = frame.timestamp

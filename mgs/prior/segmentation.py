@@ -38,7 +38,7 @@ EQUAL_SIZE = 0.8
 NEARER = 1.25
 """Least ratio of distances from the focus that tells equally large clusters apart."""
 
-IN_MASKS = 0.9
+IN_MASKS = 0.8
 """Least share of the masks that the median point of another cluster of the rock lies in."""
 
 STACKED = 0.5

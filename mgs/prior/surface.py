@@ -26,6 +26,9 @@ POISSON_CELL = 1.5
 POISSON_DEPTHS = (5, 10)
 """Least and largest octree depth chosen automatically. Beyond 12, pymeshlab crashes."""
 
+SUPPORT = 0.02
+"""Least share of the points next to a piece of the surface, for the piece to be kept."""
+
 CUBES = ((1, 0), (2, 1))
 """Cubes to try: factor on POISSON_SCALE, and on the octree depth what keeps the cells' size."""
 
@@ -60,9 +63,8 @@ def poisson_mesh(
     2013, by pymeshlab; the cut by manifold3d.
     """
     solid, depth = _closed_solid(points, normals, voxel, depth, plane)
-    pieces = solid.trim_by_plane(plane.normal, plane.offset).decompose()
-    solid = max(pieces, key=lambda part: part.volume(), default=None)
-    if solid is None or solid.is_empty():
+    solid = _supported(solid.trim_by_plane(plane.normal, plane.offset), points)
+    if solid.is_empty():
         raise InputError(
             f"prior: Poisson at depth {depth} gives nothing above the ground; "
             "give more frames, or take the source hull"
@@ -76,13 +78,27 @@ def poisson_mesh(
 def closed_poisson(
     points: np.ndarray, normals: np.ndarray, voxel: float, depth: int | None
 ) -> tuple[Mesh, int]:
-    """Largest piece of the watertight Poisson surface of points all around an object, and octree
-    depth.
+    """The watertight Poisson surface of points all around an object, and octree depth.
 
     Arguments and errors as `poisson_mesh`, without plane and cut.
     """
     solid, depth = _closed_solid(points, normals, voxel, depth, None)
-    return _from_solid(max(solid.decompose(), key=lambda part: part.volume())), depth
+    return _from_solid(_supported(solid, points)), depth
+
+
+def _supported(solid: Any, points: np.ndarray) -> Any:
+    """The pieces of a solid of manifold3d next to which SUPPORT of the points [M,3] or more lie."""
+    import manifold3d
+
+    pieces = [piece for piece in solid.decompose() if piece.num_vert()]
+    if len(pieces) < 2:
+        return solid
+    corners = [np.asarray(piece.to_mesh64().vert_properties)[:, :3] for piece in pieces]
+    owner = np.repeat(np.arange(len(pieces)), [len(each) for each in corners])
+    nearest = owner[cKDTree(np.concatenate(corners)).query(points)[1]]
+    share = np.bincount(nearest, minlength=len(pieces)) / len(points)
+    chosen = [piece for piece, part in zip(pieces, share, strict=True) if part >= SUPPORT]
+    return manifold3d.Manifold.compose(chosen)
 
 
 def intersection(a: Mesh, b: Mesh) -> Mesh:
