@@ -97,7 +97,8 @@ def _subject(gaussians: Gaussians, frames: Sequence[Frame], trained: list[str]) 
         [frame.name, camera_digest(frame.camera), frame_digests(frame, kinds)] for frame in frames
     ]
     known = {name: version for name, version in versions().items() if name != "commit"}
-    model = array_digest(getattr(gaussians, name) for name in ARRAYS), gaussians.antialiased
+    marks = gaussians.antialiased, gaussians.linear
+    model = array_digest(getattr(gaussians, name) for name in ARRAYS), *marks
     text = json.dumps([*model, views, trained, known])
     return array_digest([np.frombuffer(text.encode(), np.uint8)])
 
