@@ -15,7 +15,7 @@ from test_recordings import MOUNT, OPTICAL, Bag, write_open3d, write_rtabmap
 from mgs.camera import Camera
 from mgs.data import tracks
 from mgs.data.clouds import read_cloud
-from mgs.data.dataset import load_dataset
+from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.lens import Lens
 from mgs.data.sources import read_source
 from mgs.errors import InputError
@@ -295,6 +295,19 @@ def write_channels(path, channels):
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, channels) as file:
         file.write(str(path))
+
+
+def test_frames_elsewhere_stay_there_when_transforms_json_is_written(data, tmp_path):
+    first = data.frames[0].image_path
+    shutil.move(first, tmp_path / "else.png")
+
+    def change(json):
+        json["frames"][0]["file_path"] = str(tmp_path / "else.png")
+
+    synthetic.edit(data.root, change)
+    moved = load_dataset(data.root)
+    write_transforms(data.root, moved.frames)
+    assert load_dataset(data.root).frames[0].image_path == tmp_path / "else.png"
 
 
 def test_depth_is_right_or_refused(tmp_path):

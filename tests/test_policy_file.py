@@ -108,11 +108,13 @@ def test_draws_do_not_depend_on_the_folder_of_the_file(loaded, file, tmp_path):
         ("missing.py:poses", r"no such file .*missing\.py; correct the path"),
         ("bad.py:poses", r"line 2 of .*bad\.py failed: SyntaxError"),
         ("worse.py:poses", r"line 3 of .*worse\.py failed: ModuleNotFoundError: No module named"),
+        ("exit.py:poses", r"line 1 of .*exit\.py failed: SystemExit: 0"),
     ],
 )
 def test_a_policy_that_cannot_be_loaded_is_one_line(dataset, file, tmp_path, name, message):
     (tmp_path / "bad.py").write_text("x = 1\ndef (:\n")
     (tmp_path / "worse.py").write_text("\n\nimport nothing_like_it\n")
+    (tmp_path / "exit.py").write_text("raise SystemExit(0)\n")
     prior, out, policy = tiny.write_prior(tmp_path / "prior"), tmp_path / "run", tmp_path / name
     with pytest.raises(InputError, match=message) as found:
         mgs.run_nbv(dataset, out, prior=prior, policy=str(policy))

@@ -285,6 +285,10 @@ def test_poses_are_interpolated():
     assert track.at(0.9) is None
     assert track.at(3.1) is None
     assert tracks.Track.of([(1.0, end)]).at(9.0)[0, 3] == 2
+    lost = tracks.Track.of([(t, start) for t in (0.0, 0.1, 0.2, 0.3, 2.0)] + [(4.0, end)])
+    assert lost.at(1.0) is not None, "it did not move"
+    assert lost.at(3.0) is None
+    assert np.allclose(lost.at(4.0), end)
 
 
 @pytest.mark.parametrize("text", ["", "0.5", "-1s", "1 km"])
