@@ -14,7 +14,7 @@ from mgs.camera import Camera, look_at
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, write_transforms
 from mgs.data.rock_image import write_rock_image
 from mgs.files import read_json, write_json
-from mgs.images import write_exr
+from mgs.images import write_exr, write_png
 from mgs.prior.build import build_prior
 from mgs.prior.settings import PriorSettings
 from mgs.survey.depth_sensor import (
@@ -213,6 +213,8 @@ def test_the_survey_is_a_dataset_and_gives_a_prior(dataset, survey, tmp_path):
     assert np.allclose(result.frames[5].camera.camera_to_world, survey.optimised[5], atol=1e-9)
     assert np.allclose(result.frames[5].depth(), survey.depths[5], atol=1e-6)
     assert np.array_equal(result.frames[5].rgb(), dataset.frames[5].rgb())
+    for frame in result.frames:  # the masks of the dataset have all rocks, rock.glb the first
+        write_png(frame.mask_path, synthetic.cast(frame.camera, ROCKS[:1])[1])
     prior = build_prior(result, PriorSettings(gaussians=1000, backing=0))
     assert prior.numbers["truth"]["accuracy"] < 0.04
 
