@@ -146,7 +146,7 @@ def runs(rock: Path, varied: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     kinds = {"constant": (rock, False), "without": (varied, False), "with": (varied, True)}
     for name, (root, exposure) in kinds.items():
         state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=5, **RUN).state
-        evaluate_run(folder / name, pictures=False, convergence=True)
+        evaluate_run(folder / name, pictures=False)
         made[name] = state, folder / name
     return made
 
@@ -173,14 +173,6 @@ def test_a_fit_with_gains_is_nearly_as_good_as_one_of_constant_exposure(runs):
     assert corrected["with"] > corrected["constant"] - 0.5
     assert corrected["without"] < corrected["constant"] - 1.5
     assert held_out["with"]["psnr_mask"] < corrected["with"] - 1  # what is not corrected says so
-    phi = {name: found["fit"]["phi"] for name, found in metrics.items()}
-    assert phi["with"] < 1.1 * phi["constant"] < 0.7 * phi["without"]
-    for name, (_, out) in runs.items():
-        table = markdown_table(table_numbers([out]))
-        assert ("exposure fitted (dB)" in table) == (name == "with")
-    measured = runs["with"][0].steps[-1]
-    assert measured["held_out_psnr_mask_corrected"] == pytest.approx(corrected["with"], abs=1e-3)
-    assert not any("corrected" in key for key in runs["constant"][0].steps[-1])
 
 
 def test_the_alarm_of_exposure_is_silent_where_gains_explain_it(runs):

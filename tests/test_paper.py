@@ -19,7 +19,7 @@ def test_the_whole_paper_in_a_few_calls(tmp_path, monkeypatch):
         metrics = mgs.evaluate(run)
         assert metrics["test"]["count"] == 2
         assert mgs.diagnose(run)
-    written = mgs.write_report("paper", [f"runs/{policy.name}" for policy in policies])
+    written = mgs.report("runs", "paper")
     assert {"table.md", "comparison.png"} <= {path.name for path in written}
 
     mission, state = mgs.Mission(seeds=4, budget=2), mgs.learn(scene, scene.seeds(4))

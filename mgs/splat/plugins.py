@@ -35,9 +35,7 @@ def register(*_: Any) -> None:
 
 
 def _refuse(_: Any) -> Any:
-    raise InputError(
-        f"mgs_splat: has no {mi.variant()}; set a differentiable RGB variant, such as llvm_ad_rgb"
-    )
+    raise InputError(f"mgs_splat: has no {mi.variant()}; set a differentiable RGB variant")
 
 
 mi.detail.add_variant_callback(register)

@@ -26,6 +26,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.gaussians import SH_MAX, Gaussians
+from mgs.memory import padded
 from mgs.rotation import QUAT_MIN
 from mgs.splat.constants import (
     COMPENSATION_MIN,
@@ -111,7 +112,10 @@ def camera_array(camera: Camera) -> Any:
 def _entries(tensor: Any) -> np.ndarray:
     """Entries of a square TensorXf, Float64 [1] each, with their gradients, as an array of objects
     of its shape."""
-    flat = mi.Float64(tensor.array if dr.is_tensor_v(tensor) else np.ravel(tensor))
+    if not dr.is_tensor_v(tensor):
+        flat = mi.Float64(padded(np.ravel(tensor), np.float64))
+    else:
+        flat = mi.Float64(tensor.array)
     entries = [dr.gather(mi.Float64, flat, mi.UInt32(i)) for i in range(len(flat))]
     size = round(len(flat) ** 0.5)
     square = np.empty((size, size), object)
