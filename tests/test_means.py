@@ -1,4 +1,4 @@
-"""Learned means, along the prior's normals or free: steps of a fit, and runs of `mgs nbv`."""
+"""Learned means: steps of a fit, and runs of `mgs nbv`."""
 
 import shutil
 
@@ -18,7 +18,6 @@ from mgs.fit.settings import MEAN_RATE, TrainSettings
 from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
 from mgs.policy.criteria import DIRECTIONAL_STD, MEAN_STD
 from mgs.prior.build import load_prior
-from mgs.prior.initial import initial_normals
 from mgs.reports.diagnostics import diagnose
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
@@ -28,7 +27,6 @@ from mgs.splat import MEANS, as_drjit, fisher, groups, render
 from mgs.view.subject import SCALARS, read_subject
 
 N, SPACING = 300, (4 * np.pi / 300) ** 0.5
-MOVING = ("normal", "free")
 
 
 def normals() -> np.ndarray:
@@ -79,10 +77,10 @@ LAM = {
 def fitted(begun, cameras, targets, train, start=None):
     """A fit from `begun`; start: the mean of the prior, by default the same."""
     start = begun if start is None else start
-    return fit(begun, cameras, targets, train, start=start, lam=LAM, normals=3 * normals())
+    return fit(begun, cameras, targets, train, start=start, lam=LAM)
 
 
-def test_frozen_is_the_default_and_ignores_normals_and_their_lam(cameras, targets):
+def test_frozen_is_the_default_and_ignores_the_lam_of_means(cameras, targets):
     start, lam = ball(0.05), {kind: value for kind, value in LAM.items() if kind != "mean"}
     plain = fit(start, cameras, targets, TrainSettings(passes=3), start=start, lam=lam)
     frozen = fitted(start, cameras, targets, settings("frozen", 3))
@@ -92,35 +90,29 @@ def test_frozen_is_the_default_and_ignores_normals_and_their_lam(cameras, target
     assert not np.array_equal(plain.gaussians.sh, start.sh)
 
 
-@pytest.mark.parametrize("means", MOVING)
-def test_one_step_is_natural_on_the_gradient_of_the_objective(cameras, targets, means):
+def test_one_step_is_natural_on_the_gradient_of_the_objective(cameras, targets):
     """The first step is minus a tenth of the gradient over four times the information, at most the
     rate. The second round is replayed."""
     start, rng = ball(0.02), np.random.default_rng(1)
     for _ in range(2):
         begun = ball(0.02 + 0.01 * rng.standard_normal(N))
-        train = settings(means, 1, 0.002)
-        goal = objective(begun, cameras[:1], targets[:1], start, LAM, None, means, normals())
+        train = settings("free", 1, 0.002)
+        goal = objective(begun, cameras[:1], targets[:1], start, LAM, means="free")
         model = as_drjit(begun)
         g, d = (np.asarray(part(model)[-1]) for part in (goal.gradient, goal.diagonal))
         expected = np.clip(-0.1 * g / (4 * d), -0.002, 0.002)
         moved = fitted(begun, cameras[:1], targets[:1], train, start).gaussians
         step = moved.means.astype(np.float64) - begun.means
-        if means == "normal":
-            along = (step * normals()).sum(1)
-            assert np.allclose(step, along[:, None] * normals(), atol=3e-7)
-            step = along
         assert 0.2 < (np.abs(step) < 0.0019).mean() < 1  # not all are cut
         assert np.allclose(step, expected, atol=3e-7 + 2e-3 * np.abs(expected))
         assert np.abs(step).max() > 1e-3
 
 
-@pytest.mark.parametrize("means", MOVING)
-def test_displaced_means_move_back_to_the_surface(cameras, targets, means):
+def test_displaced_means_move_back_to_the_surface(cameras, targets):
     offsets = 0.4 * SPACING * np.random.default_rng(3).standard_normal(N)
     start = ball(offsets)
     frozen, moved = (
-        fitted(start, cameras, targets, settings(mode, 10)) for mode in ("frozen", means)
+        fitted(start, cameras, targets, settings(means, 10)) for means in ("frozen", "free")
     )
     seen = sum(fisher(start, camera)[:, 0] for camera in cameras) > 0.3
     assert seen.sum() > 0.8 * N
@@ -140,10 +132,6 @@ def test_a_rate_that_is_missing_is_named(cameras, targets):
         wanted.regularisation(groups(0, "free"))
 
 
-DEGREE = {"frozen": 0, "normal": 0, "free": 1}
-"""SH degree of the runs with these means."""
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory, pristine):
     """A dataset and a prior on disk."""
@@ -152,24 +140,24 @@ def files(tmp_path_factory, pristine):
 
 def options(files, means: str, **values):
     train = {"means": means, "passes": 3}
-    start = {"prior": files[1], "budget": 2, "seeds": 3, "sh": DEGREE[means]}
+    start = {"prior": files[1], "budget": 2, "seeds": 3, "sh": int(means == "free")}
     return start | {"train": train} | values
 
 
-@pytest.fixture(scope="module", params=MOVING)
-def whole(request, files, tmp_path_factory):
-    """(means, run folder, last state) of a complete run."""
-    out = tmp_path_factory.mktemp(request.param) / "run"
-    return request.param, out, run_nbv(files[0], out, **options(files, request.param)).state
+@pytest.fixture(scope="module")
+def whole(files, tmp_path_factory):
+    """(run folder, last state) of a complete run with free means."""
+    out = tmp_path_factory.mktemp("free") / "run"
+    return out, run_nbv(files[0], out, **options(files, "free")).state
 
 
 def test_units_are_spacings_of_the_prior_unless_given(files, tmp_path):
-    made = start_run(files[0], tmp_path / "run", **options(files, "normal")).settings
+    made = start_run(files[0], tmp_path / "run", **options(files, "free")).settings
     assert made.prior_std["mean"] == MEAN_STD * 0.5
     assert made.train.rates["mean"] == MEAN_RATE * 0.5
     assert run_folder.open_run(tmp_path / "run").settings == made
-    train = {"means": "normal", "rates": {"mean": 0.01}}
-    given = options(files, "normal", prior_std={"mean": 0.3}, train=train)
+    train = {"means": "free", "rates": {"mean": 0.01}}
+    given = options(files, "free", prior_std={"mean": 0.3}, train=train)
     own = start_run(files[0], tmp_path / "own", **given).settings
     assert (own.prior_std["mean"], own.train.rates["mean"]) == (0.3, 0.01)
     frozen = start_run(files[0], tmp_path / "frozen", **options(files, "frozen")).settings
@@ -177,33 +165,26 @@ def test_units_are_spacings_of_the_prior_unless_given(files, tmp_path):
 
 
 def test_criteria_see_the_means_and_coverage_does_not(files, whole):
-    means, out, state = whole
+    out, state = whole
     made, prior = run_folder.open_run(out).settings, load_prior(files[1])
     dataset = load_dataset(files[0])
     frames = [dataset.frames[i] for i in state.taken]
-    facing = initial_normals(prior)
-    H = sum(
-        fisher(state.gaussians, frame.camera, means=means, normals=facing).astype(float)
-        for frame in frames
-    )
+    H = sum(fisher(state.gaussians, frame.camera, means="free").astype(float) for frame in frames)
     np.testing.assert_array_equal(state.H, H)
-    flat = 8 + 3 * (DEGREE[means] + 1) ** 2
-    assert state.H.shape[1] == flat + MEANS[means]
-    lam = made.regularisation(groups(DEGREE[means], means))
+    flat = 8 + 3 * 4
+    assert state.H.shape[1] == flat + MEANS["free"]
+    lam = made.regularisation(groups(1, "free"))
     assert lam[flat:] == pytest.approx((0.02 / (MEAN_STD * prior.spacing)) ** 2)
     assert lam[3 : flat - 8] == pytest.approx((0.02 / DIRECTIONAL_STD) ** 2)
     assert state.surface.shape == (len(prior.points), flat)
-    assert state.gaussians.sh[:, 1:].any() == (means == "free")
+    assert state.gaussians.sh[:, 1:].any()
     frozen = run_nbv(files[0], out.parent / "frozen", **options(files, "frozen", budget=0)).state
     assert frozen.steps[0]["coverage"] == state.steps[0]["coverage"]
-    moved = state.gaussians.means - prior.points
-    assert np.abs(moved).max() > 1e-3
-    sideways = moved - (moved * facing).sum(1, keepdims=True) * facing
-    assert (np.abs(sideways).max() < 1e-6) == (means == "normal")
+    assert np.abs(state.gaussians.means - prior.points).max() > 1e-3
 
 
 def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, monkeypatch):
-    means, out, state = whole
+    out, state = whole
     real, calls = scene_module.fit, []
 
     def struck(*arguments):
@@ -214,38 +195,38 @@ def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, mon
 
     monkeypatch.setattr(scene_module, "fit", struck)
     with pytest.raises(KeyboardInterrupt):
-        run_nbv(files[0], tmp_path / "run", **options(files, means))
+        run_nbv(files[0], tmp_path / "run", **options(files, "free"))
     resumed = resume_nbv(tmp_path / "run").state
     assert resumed.taken == state.taken
     assert resumed.gaussians == state.gaussians
     assert (tmp_path / "run/gaussians.ply").read_bytes() == (out / "gaussians.ply").read_bytes()
 
 
-@pytest.mark.parametrize("policy", ["block-d", "i-optimal", "coverage", "directional-d"])
+@pytest.mark.parametrize("policy", ["d-optimal", "coverage", "directional-d"])
 def test_policies_choose_with_learned_means(files, tmp_path, policy):
     state = run_nbv(
-        files[0], tmp_path / "run", **options(files, "normal", budget=1, policy=policy)
+        files[0], tmp_path / "run", **options(files, "free", budget=1, policy=policy)
     ).state
     assert len(state.taken) == 4
     assert np.isfinite(state.steps[1]["score"])
 
 
 def test_means_that_changed_since_the_start_are_one_line(whole, tmp_path, capsys):
-    means, out, _ = whole
+    out, _ = whole
     run = shutil.copytree(out, tmp_path / "run")
     train = run_folder.open_run(run).settings.train.model_dump(mode="json")
-    change_settings(run, train=train | {"means": "free" if means == "normal" else "frozen"})
+    change_settings(run, train=train | {"means": "frozen"})
     said = refused(capsys, ["nbv", "--resume", run], run)
     assert f"settings.train.means has changed since {run} was started; restore it" in said
 
 
 def test_diagnostics_and_viewer_read_such_a_run(files, whole):
-    means, out, state = whole
+    out, state = whole
     written = diagnose(out, [load_dataset(files[0]).frames[0].name])
     assert out / "diagnostics/information.ply" in written
     found = read_subject(out)
     assert set(found.scalars) == set(SCALARS)
-    lam = run_folder.open_run(out).settings.regularisation(groups(DEGREE[means], means))
+    lam = run_folder.open_run(out).settings.regularisation(groups(1, "free"))
     assert found.scalars["information"] == pytest.approx(0.5 * np.log1p(state.H / lam).sum(1))
     for name in LEARNED:
         assert getattr(found.gaussians, name).shape == getattr(state.gaussians, name).shape

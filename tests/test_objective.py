@@ -11,7 +11,7 @@ from mgs.fit.fitting import fit
 from mgs.fit.objective import objective
 from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians, learned
-from mgs.splat import as_drjit, reference
+from mgs.splat import MEANS, as_drjit, reference
 from studies.bench import surface_camera, surface_gaussians
 
 N = 60
@@ -22,7 +22,6 @@ LAM = {"colour": 0.02, "scale": 0.05, "rotation": 0.1, "opacity": 0.01, "mean": 
     scope="module",
     params=[
         ("frozen", 0.0, True),
-        ("normal", 0.0, True),
         ("free", 0.0, True),
         ("frozen", 0.3, False),
         ("free", 2.0, True),
@@ -43,10 +42,9 @@ def case(request):
         ),
         linear=linear,
     )
-    normals = rng.standard_normal((N, 3))
-    directions = reference.mean_directions(N, means, normals)
-    offsets = 0.02 * rng.standard_normal(directions.shape[:2])
-    model.means = (start.means + (offsets[..., None] * directions).sum(1)).astype(np.float32)
+    offsets = 0.02 * rng.standard_normal((N, MEANS[means]))
+    if means == "free":
+        model.means = (start.means + offsets).astype(np.float32)
     first = surface_camera(start, 24, 20)
     distance = np.linalg.norm(first.position)
     cameras = [
@@ -62,15 +60,12 @@ def case(request):
         np.dstack([model.linear_rgb(t[..., :3]), w, t[..., 3:]])
         for t, w in zip(truths, weights, strict=True)
     ]
-    goal = objective(
-        model, cameras, targets, start, LAM, means=means, normals=normals, alpha_weight=alpha_weight
-    )
-    columns = np.split(np.arange(11 + directions.shape[1]), (3, 6, 10, 11))
+    how = {"means": means, "alpha_weight": alpha_weight}
+    goal = objective(model, cameras, targets, start, LAM, **how)
+    columns = np.split(np.arange(11 + MEANS[means]), (3, 6, 10, 11))
     rows = []
     for camera in cameras:
-        J = reference.jacobian(
-            model, camera, means=means, normals=normals, alpha_weight=alpha_weight
-        )
+        J = reference.jacobian(model, camera, **how)
         rows.append(np.concatenate([J[..., c].reshape(20 * 24 * channels, -1) for c in columns], 1))
     images = [reference.render(model, camera) for camera in cameras]
     images = [np.dstack([i["rgb"], i["alpha"]])[..., :channels] for i in images]

@@ -10,7 +10,7 @@ from mgs.camera import Camera, look_at
 from mgs.errors import InputError
 from mgs.fit.fitting import COLOUR_MIN, fit
 from mgs.fit.optimisers import ADAM_EPSILON
-from mgs.fit.settings import RATES, TrainSettings
+from mgs.fit.settings import TrainSettings
 from mgs.fit.stopping import LOSS_FLOOR, StopReason, stop_reason
 from mgs.gaussians import LEARNED, Gaussians
 from mgs.splat import ListCache, fisher, render
@@ -267,7 +267,6 @@ def test_a_start_of_another_shape_is_refused(truth, cameras, targets):
         ({"density": "dreams"}, "fixed, adaptive"),
         ({"density": "adaptive"}, "free means"),
         ({"means": "free"}, "no rate of mean"),
-        ({"means": "normal", "rates": RATES | {"mean": 1.0}}, "needs normals"),
     ],
 )
 def test_unusable_settings_are_refused(truth, values, words):

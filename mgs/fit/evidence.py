@@ -39,7 +39,7 @@ from mgs.policy.criteria import LEARN_LOSS, lam_by_kind
 from mgs.policy.poses import azimuths
 from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of, without_gain
-from mgs.prior.initial import initial_gaussians, initial_normals, pixel_on
+from mgs.prior.initial import initial_gaussians, pixel_on
 from mgs.splat import ListCache, as_drjit, groups
 
 DIRECTIONAL = "directional"
@@ -58,15 +58,13 @@ class Images:
 
     targets: of each view, [H,W,4] with the weights of the pixels, or [H,W,5] with alpha after them
     (`mgs.fit.fitting.fit`). start(views): the Gaussians before training, of degree 0, in the
-    colours of these views (indices). order: [V] indices of the views by azimuth. normals: [N,3],
-    needed only where means move along them.
+    colours of these views (indices). order: [V] indices of the views by azimuth.
     """
 
     cameras: Sequence[Camera]
     targets: Sequence[np.ndarray]
     start: Callable[[Sequence[int]], Gaussians]
     order: Sequence[int]
-    normals: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -127,7 +125,7 @@ def last_images(
     around = azimuths(positions, turn @ prior.points.mean(axis=0))
     order = np.argsort(around, kind="stable").tolist()
     targets = Deferred(range(len(frames)), target)
-    return Images(cameras, targets, start, order, initial_normals(prior))
+    return Images(cameras, targets, start, order)
 
 
 def kinds(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
@@ -289,7 +287,6 @@ def objective_of(
         lam_by_kind(regularisation(settings, degree), groups(degree, train.means)),
         cache,
         train.means,
-        images.normals,
         train.alpha_weight,
     )
 
@@ -321,8 +318,7 @@ def fitted(
         cache=cache,
         start=start,
         lam=lam_by_kind(regularisation(settings, degree), groups(degree, train.means)),
-        normals=images.normals,
-        learns=None if kept is None else _masks(kept, start.sh.shape[1], train.means),
+        learns=None if kept is None else _masks(kept, start.sh.shape[1]),
     )
     if found.stop_reason == StopReason.DIVERGED:
         raise InputError(
@@ -332,10 +328,10 @@ def fitted(
     return found.gaussians
 
 
-def _masks(kept: Mapping[str, Mask], coefficients: int, means: str) -> dict[str, np.ndarray]:
+def _masks(kept: Mapping[str, Mask], coefficients: int) -> dict[str, np.ndarray]:
     """Masks of `LeanModel.learned` that broadcast to the learned arrays."""
-    flat = ("opacity", "mean") if means == "normal" else ("opacity",)  # arrays of shape [N]
-    masks = {kind: mask if kind in flat else mask[:, None] for kind, mask in kept.items()}
+    # Opacities have shape [N], all others more dimensions.
+    masks = {kind: mask if kind == "opacity" else mask[:, None] for kind, mask in kept.items()}
     directional = masks.pop(DIRECTIONAL, None)
     colour = [masks["colour"]]
     if directional is not None:

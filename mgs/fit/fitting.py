@@ -110,15 +110,11 @@ def _step(
     step, moved, kept = mi.Float(t), {}, []
     for name, buffer, rate, known in zip(prior.lam, buffers, rates, information, strict=True):
         value, slope = dr.detach(getattr(copy, name)), dr.grad(getattr(copy, name))
-        offset = prior.along(name, value - getattr(prior.start, name))
+        offset = value - getattr(prior.start, name)
         pull = prior.lam[name] * prior.share
-        gradient = prior.along(name, slope) + mi.TensorXf(pull * offset.array, offset.shape)
+        gradient = slope + mi.TensorXf(pull * offset.array, offset.shape)
         loss += weighted_squares(pull, offset.array) / len(view.target)
-        along_normal = offset.shape != value.shape
-        found, after = OPTIMISERS[optimiser].step(
-            offset if along_normal else value, gradient, known, buffer, rate, step
-        )
-        moved[name] = value + prior.across(name, found - offset) if along_normal else found
+        moved[name], after = OPTIMISERS[optimiser].step(value, gradient, known, buffer, rate, step)
         kept.append(after)
     if slopes:
         slopes = [total + new for total, new in zip(slopes, view.slopes(shift), strict=True)]
@@ -134,7 +130,6 @@ def fit(
     cache: ListCache | None = None,
     start: Gaussians | None = None,
     lam: Mapping[str, float | np.ndarray] | None = None,
-    normals: np.ndarray | None = None,
     learns: Mapping[str, np.ndarray] | None = None,
 ) -> Fit:
     """Fit Gaussians to images by lowering Phi (`mgs.fit.objective`). The result depends on the
@@ -149,14 +144,12 @@ def fit(
     lam: the prior's information about each kind of parameter (`mgs.gaussians.learned`), (pixel
         value / unit of the parameter)^2: a number, or except for means an array that broadcasts to
         the parameter's shape. Default 0.
-    normals: directions of means that move along them [N,3], of any length but 0.
     learns: masks of the Gaussians that learn a kind of parameter, broadcast to its shape ([N],
         [N,1] or, for colours, [N,K,1]). The others keep their values, except colours below
         COLOUR_MIN. Default: all learn.
 
     Raises InputError if a parameter is not finite, optimiser or loss are unknown, `start` has
-    another shape, means are to move without normals or without a rate, or a required alpha is
-    missing.
+    another shape, means are to move without a rate, or a required alpha is missing.
     """
     settings = settings or TrainSettings()
     optimiser = row_named(OPTIMISERS, settings.optimiser, "optimiser")
@@ -168,7 +161,7 @@ def fit(
         raise InputError(
             f"train.rates: has no rate of {missing[0]}, which is learned; give one, metres"
         )
-    model, how = as_drjit(gaussians), (settings.means, normals, settings.alpha_weight)
+    model, how = as_drjit(gaussians), (settings.means, settings.alpha_weight)
     goal = objective(gaussians, cameras, targets, start, lam, cache, *how, settings.loss)
     buffers = [
         [dr.zeros(mi.TensorXf, offset.shape) for _ in range(optimiser.buffers)]

@@ -19,8 +19,6 @@ Alpha may be a fourth channel with noise sigma_alpha. Its squared differences th
 alpha_weight = (sigma / sigma_alpha)^2 times. The criteria ignore alpha.
 
 Means are frozen by default, as in the paper. Means that are "free" are parameters like the others.
-Means that move along the "normal" have one parameter per Gaussian: the offset from the start along
-a given normal, metres.
 """
 
 from __future__ import annotations
@@ -40,14 +38,13 @@ from mgs.gaussians import Gaussians, learned
 from mgs.memory import IMAGE_BYTES, Deferred, adopted, kept_within, padded
 from mgs.splat import ListCache, as_drjit, fisher, groups
 from mgs.splat.blocks import BlockLists
-from mgs.splat.information import unit_normals
-from mgs.splat.projection import camera_array, project, projected, rows_as_vectors
+from mgs.splat.projection import camera_array, project, projected
 from mgs.splat.recording import frozen, one_at_a_time
 from mgs.splat.rendering import composite_channels, splats_and_lists
 
 Vector = list[Any]
 """One number per learned parameter: a TensorXf of the shape of each array of
-`mgs.gaussians.learned`; [N] for means that move along their normals."""
+`mgs.gaussians.learned`."""
 
 
 @dataclass
@@ -164,36 +161,16 @@ class ParameterPrior:
 
     lam: of each learned array, a Float of one number or one per parameter.
     share: 1 / number of images, Float: the part of the prior that belongs to one image.
-    normals: TensorXf [N,3], if means move along them.
     """
 
     start: Gaussians
     lam: dict[str, Any]
     share: Any
-    normals: Any = None
 
     @property
     def means(self) -> str:
         """A name in `mgs.splat.MEANS`."""
-        if "means" not in self.lam:
-            return "frozen"
-        return "free" if self.normals is None else "normal"
-
-    def along(self, name: str, vectors: Any) -> Any:
-        """Project displacements of the means on their normals, [N,3] -> [N]. Other parameters, and
-        free means, stay as they are."""
-        if name != "means" or self.normals is None:
-            return vectors
-        vectors_3d, normals = (rows_as_vectors(v, mi.Vector3f) for v in (vectors, self.normals))
-        return mi.TensorXf(dr.dot(vectors_3d, normals), vectors.shape[:1])
-
-    def across(self, name: str, offsets: Any) -> Any:
-        """Map offsets along the normals to 3D displacements, [N] -> [N,3]. Other parameters, and
-        free means, stay as they are."""
-        if name != "means" or self.normals is None:
-            return offsets
-        displacements = rows_as_vectors(self.normals, mi.Vector3f) * offsets.array
-        return mi.TensorXf(dr.ravel(displacements), self.normals.shape)
+        return "free" if "means" in self.lam else "frozen"
 
 
 @dataclass(frozen=True)
@@ -273,10 +250,7 @@ class Objective:
     def _information(self, model: Gaussians, photo: Photo) -> Vector:
         """Exact Fisher information of one image."""
         means, weight = self.prior.means, self.alpha_weight
-        normals = np.asarray(self.prior.normals) if means == "normal" else None
-        found = fisher(
-            model, photo.camera, cache=self.cache, means=means, normals=normals, alpha_weight=weight
-        )
+        found = fisher(model, photo.camera, cache=self.cache, means=means, alpha_weight=weight)
         columns = zip(self.offsets(model), groups(model.sh_degree, means).values(), strict=True)
         return [mi.TensorXf(padded(found[:, c]).reshape(d.shape)) for (d, _), c in columns]
 
@@ -289,8 +263,8 @@ class Objective:
         """(offset from the start, lam) of each learned array."""
         prior = self.prior
         return [
-            (prior.along(n, getattr(model, n) - getattr(prior.start, n)), lam)
-            for n, lam in prior.lam.items()
+            (getattr(model, name) - getattr(prior.start, name), lam)
+            for name, lam in prior.lam.items()
         ]
 
 
@@ -302,19 +276,17 @@ def objective(
     lam: Mapping[str, float | np.ndarray] | None = None,
     cache: ListCache | None = None,
     means: str = "frozen",
-    normals: np.ndarray | None = None,
     alpha_weight: float = 0.0,
     error: str = "squared",
 ) -> Objective:
     """The objective of `mgs.fit.fitting.fit`, from the same arguments and settings.
 
-    error: a name in LOSSES. Raises InputError if it is unknown, the start or the normals do not fit
-    the Gaussians, or `means` is not a name in `mgs.splat.MEANS`. A target without alpha, where
+    error: a name in LOSSES. Raises InputError if it is unknown, the start does not fit the
+    Gaussians, or `means` is not a name in `mgs.splat.MEANS`. A target without alpha, where
     alpha has a weight, raises it when it is read.
     """
     groups(gaussians.sh_degree, means)  # raises if the name is unknown
     row_named(LOSSES, error, "loss")
-    unit = unit_normals(len(gaussians), normals) if means == "normal" else None
     if len(cameras) != len(targets):
         raise ValueError(f"there are {len(cameras)} cameras, but {len(targets)} targets")
 
@@ -335,9 +307,8 @@ def objective(
         name: filled((lam or {}).get(kind, 0.0), getattr(start, name).shape)
         for name, kind in learned(means).items()
     }
-    directions = None if unit is None else mi.TensorXf(padded(unit))
     share = dr.opaque(mi.Float, 1 / max(len(photos), 1))
-    prior = ParameterPrior(start, values, share, directions)
+    prior = ParameterPrior(start, values, share)
     return Objective(photos, prior, cache or ListCache(), alpha_weight, error)
 
 
@@ -400,4 +371,4 @@ def _image_gradient(model: Gaussians, prior: ParameterPrior, view: View) -> Vect
 
 def _gradients(copy: Gaussians, prior: ParameterPrior) -> Vector:
     """Gradients of a copy made by `with_gradients`, by learned parameter."""
-    return [prior.along(name, dr.grad(getattr(copy, name))) for name in prior.lam]
+    return [dr.grad(getattr(copy, name)) for name in prior.lam]

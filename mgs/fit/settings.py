@@ -57,8 +57,8 @@ class TrainSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
-    means: Literal["frozen", "normal", "free"] = "frozen"
-    """How means move: frozen, as in the paper; normal, along the prior's normals; or free."""
+    means: Literal["frozen", "free"] = "frozen"
+    """Whether means are frozen, as in the paper, or free."""
     density: str = "fixed"
     """Density control of free means: fixed, or adaptive (add and remove as 3DGS)."""
     most_gaussians: Annotated[int, Field(ge=1, le=2**25)] = 200_000

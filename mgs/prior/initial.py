@@ -188,11 +188,6 @@ def pixel_on(prior: Prior, cameras: Sequence[Camera]) -> float:
     return float(np.percentile(sizes, CLOSEST)) if sizes else 0.0
 
 
-def initial_normals(prior: Prior) -> np.ndarray:
-    """Unit normals [N + backed,3] of the Gaussians of `initial_gaussians`."""
-    return np.concatenate([prior.normals, prior.normals[: prior.backed]])
-
-
 def _with_backing(surface: Gaussians, prior: Prior) -> Gaussians:
     """The surface's Gaussians, then those behind the first `prior.backed`."""
     count = prior.backed

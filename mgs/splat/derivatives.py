@@ -56,7 +56,7 @@ class Geometry:
 
 @dataclass
 class ByMean:
-    """Derivatives by a displacement of the mean along some direction, per metre.
+    """Derivatives by one coordinate of the mean, per metre.
 
     log_alpha: of ln alpha, a polynomial.
     colour: of r, g, b of the splat; empty for SH degree 0.
@@ -165,22 +165,6 @@ def by_means(gaussians: Gaussians, camera: Any) -> list[ByMean]:
         polynomial = log_alpha_tangent(tangents, splats)
         columns.append(ByMean(polynomial, tangents.colour if gaussians.sh_degree else []))
     return columns
-
-
-def along_normals(columns: list[ByMean], normals: np.ndarray) -> ByMean:
-    """Derivatives along unit normals, float64 [N,3], from those by x, y, z.
-
-    Combined in double: rounding a normal that points to the camera would turn it to the side, where
-    a small splat is up to thousands of times as sensitive.
-    """
-    parts = [mi.Float64(padded(part, np.float64)) for part in normals.T]
-    polynomial = {
-        powers: sum(n * c.log_alpha[powers] for n, c in zip(parts, columns, strict=True))
-        for powers in POWERS
-    }
-    by_axis = zip(*(c.colour for c in columns), strict=True)
-    colour = [sum(n * g for n, g in zip(parts, channel, strict=True)) for channel in by_axis]
-    return ByMean(polynomial, colour)
 
 
 def weighted_sum(p: Polynomial, moments: Polynomial) -> Any:

@@ -4,7 +4,7 @@ A pixel is the rendered value plus noise of variance 1. The information is then 
 Jacobian J of the rgb image, all pixels and channels, by the parameters.
 
 A Gaussian has P = 3K + 8 columns: 3K spherical-harmonic coefficients (coefficient by coefficient,
-r g b in each), 3 log-scales, 4 of the quaternion, 1 opacity logit; then 0, 1 or 3 of the mean
+r g b in each), 3 log-scales, 4 of the quaternion, 1 opacity logit; then 0 or 3 of the mean
 (`MEANS`). Symbols: docs/notation.md.
 """
 
@@ -27,7 +27,6 @@ from mgs.splat import kernels
 from mgs.splat.derivatives import (
     ByMean,
     Moments,
-    along_normals,
     by_means,
     geometry,
     mean_product,
@@ -40,9 +39,8 @@ from mgs.splat.recording import frozen, one_at_a_time
 from mgs.splat.rendering import ListCache, as_colour, as_drjit, render, splats_and_lists
 from mgs.splat.walking import pack, packet_count, sums_by_splat
 
-MEANS = {"frozen": 0, "normal": 1, "free": 3}
-"""Number of columns of the means: frozen; moving along a given normal (offset, metres); free
-(x, y, z in the world, metres)."""
+MEANS = {"frozen": 0, "free": 3}
+"""Number of columns of the means: frozen, or free (x, y, z in the world, metres)."""
 
 ALPHA_WEIGHT_MAX = 1e12
 """Largest (sigma_rgb / sigma_alpha)^2, (linear RGB)^2. Beyond it, sums over pixels might leave
@@ -81,7 +79,6 @@ def fisher(
     background: Any = (0.0, 0.0, 0.0),
     cache: ListCache | None = None,
     means: str = "frozen",
-    normals: Any = None,
     alpha_weight: float = 0.0,
     **options: Any,
 ) -> np.ndarray:
@@ -95,16 +92,13 @@ def fisher(
 
     - gaussians, background, cache: as in `render`.
     - estimator: a name in `ESTIMATORS`. options: `probes` and `seed` of `hutchinson`.
-    - means: "frozen", "normal" or "free": 0, 1 or 3 columns of the means, after the others.
-    - normals: directions for means="normal" [N,3], world, of any length but 0. They are given, not
-      taken from the Gaussians' axes, because those turn during a fit, and information summed over
-      views must be about the same direction.
+    - means: "frozen" or "free": 0 or 3 columns of the means, after the others.
     - alpha_weight: (sigma_rgb / sigma_alpha)^2, up to 1e12, if a pixel's alpha is observed beside
       its colour; 0: it is not.
 
     Raises InputError for an unknown estimator; as `render`; for blocks of 2^31 numbers or more, or
-    too large for the memory; for unusable means, normals or alpha_weight, or an estimator that does
-    not support them; and with means for too many pairs (`MAX_SUMS`).
+    too large for the memory; for unusable means or alpha_weight, or an estimator that does not
+    support them; and with means for too many pairs (`MAX_SUMS`).
     """
     compute = row_named(ESTIMATORS, estimator, "estimator")
     if dr.grad_enabled(camera.traced):
@@ -123,8 +117,7 @@ def fisher(
                 f"fisher: the estimator {estimator!r} supports neither means nor alpha; "
                 f"use {' or '.join(EXACT)}"
             )
-        unit = unit_normals(n, normals) if means == "normal" else None
-        options |= {"means": means, "normals": unit, "alpha_weight": alpha_weight}
+        options |= {"means": means, "alpha_weight": alpha_weight}
     if n == 0:
         return np.zeros((0, size, size) if estimator == "block" else (0, size), np.float32)
     if estimator == "block":
@@ -142,25 +135,6 @@ def fisher(
     return compute(as_drjit(gaussians), camera, background, cache, **options)
 
 
-def unit_normals(n: int, normals: Any) -> np.ndarray:
-    """Normals of length 1, float64 [N,3]. Raises InputError if they are missing or unusable."""
-    if normals is None:
-        raise InputError(
-            "fisher: means='normal' needs normals [N,3], the direction in which each mean may move"
-        )
-    values = np.asarray(normals, np.float64)
-    if values.shape != (n, 3):
-        raise InputError(f"fisher: normals have shape {values.shape}, expected {(n, 3)}")
-    length = np.linalg.norm(values, axis=1, keepdims=True)
-    bad = ~(np.isfinite(length) & (length > 0))
-    if bad.any():
-        raise InputError(
-            "fisher: a normal is zero, NaN or infinite, "
-            f"first at Gaussian {np.argmax(bad)}; repair it"
-        )
-    return values / length
-
-
 def _sums(
     gaussians: Gaussians,
     camera: Camera,
@@ -168,11 +142,10 @@ def _sums(
     cache: ListCache | None,
     block: bool,
     means: str,
-    normals: np.ndarray | None,
     alpha_weight: float,
 ) -> tuple[Moments, Any, Any, list[ByMean]]:
     """Sums of `kernels.fisher`, the camera and splats for `geometry`, and derivatives by the means.
-    means, normals, alpha_weight: as in `exact`."""
+    means, alpha_weight: as in `fisher`."""
     device = camera_array(camera.seen_from(gaussians.origin))
     splats, lists, packed = splats_and_lists(gaussians, camera, cache)
     # The derivative by a mean has a part by colour above degree 0: w g_c, hence w s_c sums.
@@ -203,10 +176,7 @@ def _sums(
         dict(zip(squared, sums, strict=False)),
         [dict(zip(mixed, channel, strict=False)) for channel in channels],
     )
-    by_mean = by_means(gaussians, device) if moving else []
-    if normals is not None:
-        by_mean = [along_normals(by_mean, normals)]
-    return moments, device, splats, by_mean
+    return moments, device, splats, by_means(gaussians, device) if moving else []
 
 
 def exact(
@@ -215,16 +185,15 @@ def exact(
     background: Any,
     cache: ListCache | None,
     means: str = "frozen",
-    normals: np.ndarray | None = None,
     alpha_weight: float = 0.0,
 ) -> np.ndarray:
     """Exact diagonal of J^T J, in one pass over the image: ten sums per splat, no Jacobian.
 
     With means it takes 16 sums, or 34 above SH degree 0. means, alpha_weight: as in `fisher`.
-    normals: float64 [N,3] of length 1 for means="normal", else None.
     """
-    how = means, normals, alpha_weight
-    sums, device, splats, by_mean = _sums(gaussians, camera, background, cache, False, *how)
+    sums, device, splats, by_mean = _sums(
+        gaussians, camera, background, cache, False, means, alpha_weight
+    )
     parts = dr.detach((gaussians, device, splats))
     size = 3 * gaussians.sh.shape[1] + 8 + len(by_mean)
     return np.asarray(_diagonal(*parts, sums, by_mean))[:, :size]
@@ -252,13 +221,13 @@ def block(
     background: Any,
     cache: ListCache | None,
     means: str = "frozen",
-    normals: np.ndarray | None = None,
     alpha_weight: float = 0.0,
 ) -> np.ndarray:
     """Exact diagonal blocks of J^T J [N,P,P], in one pass over the image: 22 sums per splat, with
-    means 34. means, normals, alpha_weight: as in `exact`."""
-    how = means, normals, alpha_weight
-    sums, device, splats, by_mean = _sums(gaussians, camera, background, cache, True, *how)
+    means 34. means, alpha_weight: as in `fisher`."""
+    sums, device, splats, by_mean = _sums(
+        gaussians, camera, background, cache, True, means, alpha_weight
+    )
     g = geometry(gaussians, device, splats)
     dr.eval(g, by_mean)  # several kernels may write the blocks
     colour = [(basis, c) for basis in g.basis for c in range(3)]

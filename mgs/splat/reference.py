@@ -214,13 +214,13 @@ def _moved(gaussians: Gaussians, name: str, step: np.ndarray) -> Gaussians:
 
 
 def _projection_jacobian(
-    gaussians: Gaussians, camera: Camera, directions: np.ndarray, step: float = 1e-5
+    gaussians: Gaussians, camera: Camera, means: bool, step: float = 1e-5
 ) -> tuple[np.ndarray, ...]:
-    """Central differences of `project` by the 3 log-scales, the 4 entries of the quaternion and the
-    means along `directions` [N,m,3], metres: of means2d [N,7+m,2], cov2d [N,7+m,2,2], colours
+    """Central differences of `project` by the 3 log-scales, the 4 entries of the quaternion and, if
+    `means`, x, y, z of the mean, so m is 0 or 3: of means2d [N,7+m,2], cov2d [N,7+m,2,2], colours
     [N,7+m,3] and the logarithm of the compensations [N,7+m]."""
     moves = [("log_scales", row) for row in np.eye(3)] + [("quats", row) for row in np.eye(4)]
-    moves += [("means", direction) for direction in directions.transpose(1, 0, 2)]
+    moves += [("means", row) for row in np.eye(3) if means]
     # Central differences of everything a pixel depends on, for each column.
     derivatives = []
     for name, direction in moves:
@@ -237,27 +237,18 @@ def _projection_jacobian(
     return tuple(np.stack(columns, 1) for columns in zip(*derivatives, strict=True))
 
 
-def mean_directions(n: int, means: str = "frozen", normals: np.ndarray | None = None) -> np.ndarray:
-    """Directions [N,m,3] of the columns of the means. means, normals: as in `mgs.splat.fisher`."""
-    if means == "normal":
-        unit = np.asarray(normals, np.float64)
-        return (unit / np.linalg.norm(unit, axis=1, keepdims=True))[:, None, :]
-    return np.tile(np.eye(3)[: {"frozen": 0, "free": 3}[means]], (n, 1, 1))
-
-
 def jacobian(
     gaussians: Gaussians,
     camera: Camera,
     background: Any = (0.0, 0.0, 0.0),
     means: str = "frozen",
-    normals: np.ndarray | None = None,
     alpha_weight: float = 0.0,
 ) -> np.ndarray:
     """Dense Jacobian of the rgb image [H*W, 3, N, P]. For toy scenes only.
 
-    Columns: those of `mgs.gaussians.LEARNED`, then 0, 1 or 3 of the means. means, normals,
-    alpha_weight: as in `mgs.splat.fisher`. With an alpha_weight there are four channels, the last
-    one alpha times its square root, composited as a colour that all Gaussians share.
+    Columns: those of `mgs.gaussians.LEARNED`, then 0 or 3 of the means. means, alpha_weight: as in
+    `mgs.splat.fisher`. With an alpha_weight there are four channels, the last one alpha times its
+    square root, composited as a colour that all Gaussians share.
     """
     projected = project(gaussians, camera)
     order, alpha, T, clipped = composite(projected, camera)
@@ -276,9 +267,8 @@ def jacobian(
     # S: the pixel minus all down to and including this splat.
     behind = image[:, None, :] - np.cumsum(contribution, 1)
     pixels = _pixels(camera)
-    moves = mean_directions(n, means, normals)
     transparency = expit(-np.asarray(gaussians.logit_opacities, np.float64))
-    d_means2d, d_cov2d, d_colours, d_log = _projection_jacobian(gaussians, camera, moves)
+    d_means2d, d_cov2d, d_colours, d_log = _projection_jacobian(gaussians, camera, means == "free")
     J = np.zeros((len(pixels), 3 + extra, n, 3 * K + 1 + d_cov2d.shape[1]))
     for i, j in enumerate(order):
         drawn = np.flatnonzero(alpha[:, i])  # on other pixels the splat changes nothing

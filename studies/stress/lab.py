@@ -20,7 +20,7 @@ from mgs.gaussians import Gaussians
 from mgs.policy.criteria import MEAN_STD, PRIOR_STD, Score, d_optimal, lam_by_kind, regularisation
 from mgs.policy.poses import seed_views
 from mgs.prior.build import Prior, load_prior
-from mgs.prior.initial import initial_gaussians, initial_normals, pixel_on
+from mgs.prior.initial import initial_gaussians, pixel_on
 from mgs.splat import ListCache, fisher, groups
 from studies.case import Case, Rock, Size, judge
 from studies.output import Panel
@@ -190,7 +190,6 @@ class Lab:
             self.cache,
             start,
             lam,
-            initial_normals(self.prior),
         )
 
     def information(

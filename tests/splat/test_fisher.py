@@ -55,13 +55,9 @@ def scale_of(blocks) -> np.ndarray:
     return np.sqrt(diagonal(blocks)[:, :, None] * diagonal(blocks)[:, None, :])
 
 
-def assert_right(
-    g, camera, background=BACKGROUND, means="frozen", alpha_weight=0.0, normals=None
-) -> None:
-    """Both exact estimators against brute force. normals: by default random directions."""
-    if normals is None:
-        normals = 10 * np.random.default_rng(5).normal(size=(len(g), 3))
-    options = {"means": means, "normals": normals, "alpha_weight": alpha_weight}
+def assert_right(g, camera, background=BACKGROUND, means="frozen", alpha_weight=0.0) -> None:
+    """Both exact estimators against brute force."""
+    options = {"means": means, "alpha_weight": alpha_weight}
     expected = reference.fisher_block(g, camera, background, **options)
     exact = fisher(g, camera, "exact", background, **options)
     block = fisher(g, camera, "block", background, **options)
@@ -80,7 +76,7 @@ def assert_right(
 
 
 FROZEN = product([0, 1, 2, 3], ["frozen"], [True, False])
-MOVING = product([0, 1, 3], ["normal", "free"], [True])
+MOVING = product([0, 1, 3], ["free"], [True])
 
 
 @pytest.mark.parametrize(("degree", "means", "antialiased"), [*FROZEN, *MOVING])
@@ -126,20 +122,18 @@ def test_images_of_several_tiles(means):
     background=st.tuples(*[st.floats(0, 1)] * 3),
     eye=st.tuples(st.floats(0, 6.28), st.floats(-2, 2)),
     means=st.sampled_from(list(MEANS)),
-    to_camera=st.booleans(),
     weight=st.sampled_from([0, 1e-3, 1, 100]),
     antialiased=st.booleans(),
 )
 def test_exact_and_block_for_any_scene(
-    seed, degree, scale, stretch, logit, background, eye, means, to_camera, weight, antialiased
+    seed, degree, scale, stretch, logit, background, eye, means, weight, antialiased
 ):
-    """Normals that point to the camera are the hardest. eye: azimuth and height."""
+    """eye: azimuth and height."""
     azimuth, height = eye
     camera = make_camera(eye=(2 * np.cos(azimuth), 2 * np.sin(azimuth), height))
     style = {"log_scales": (scale - stretch, scale), "logits": (logit - 4, logit)}
     g = calm(lambda s: make_clamped(s, degree, antialiased=antialiased, **style), camera, seed)
-    normals = camera.position - g.means if to_camera else None
-    assert_right(g, camera, background, means, weight, normals)
+    assert_right(g, camera, background, means, weight)
 
 
 def test_clamped_scale_carries_no_information():
@@ -223,7 +217,7 @@ def test_groups_tile_the_columns_and_means_come_last(degree, means):
     starts, stops = ([getattr(p, end) for p in parts.values()] for end in ("start", "stop"))
     assert starts == [0, *stops[:-1]]
     none = make_gaussians(0, 1, degree)
-    empty = fisher(none, make_camera(), "block", means=means, normals=np.zeros((0, 3)))
+    empty = fisher(none, make_camera(), "block", means=means)
     assert empty.shape == (0, stops[-1], stops[-1])
 
 
@@ -248,10 +242,7 @@ def test_unseen_means_and_clamped_alphas_carry_no_information():
         ({"estimator": "magic"}, r"estimator 'magic': unknown; choose one of .*exact"),
         ({"estimator": "hutchinson", "probes": 0}, "probes 0 must be a whole number from 1 up"),
         ({"estimator": "hutchinson", "probes": 1.5}, "probes 1.5 must be a whole number"),
-        ({"means": "fixed"}, "means 'fixed': unknown; choose one of frozen, normal, free"),
-        ({"means": "normal"}, r"fisher: means='normal' needs normals \[N,3\]"),
-        ({"means": "normal", "normals": np.ones((4, 3))}, r"normals have shape \(4, 3\), expected"),
-        ({"means": "normal", "normals": np.eye(5, 3)}, "normal is zero, .* first at Gaussian 3"),
+        ({"means": "fixed"}, "means 'fixed': unknown; choose one of frozen, free"),
         ({"alpha_weight": -0.1}, r"fisher: alpha_weight -0\.1 must be from 0 to 1e[+]12"),
         ({"estimator": "hutchinson", "means": "free"}, "'hutchinson' supports neither means"),
     ],
