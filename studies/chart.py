@@ -159,7 +159,7 @@ def factors(size: ChartSize) -> dict[str, list[Point]]:
             replace(fit, density=d, passes=p) for d in size.densities for p in size.passes
         ],
         "policy": [replace(run, policy=name) for name in ("d-optimal", *size.policies)],
-        "estimator": [replace(run, estimator=e) for e in ("hutchinson", "loss-gradient")],
+        "estimator": [replace(run, estimator="loss-gradient")],
         "number and passes": [
             replace(run, density=d, passes=p, warm_passes=LATER_PASSES[p])
             for d in size.densities[-3:]

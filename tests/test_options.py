@@ -59,7 +59,7 @@ OPTIONS = {
         "--policy best",
         "--seeds 13",
         "--set train.means=loose",
-        "--set train.means=free --set estimator=hutchinson",
+        "--set train.means=free --set estimator=loss-gradient",
         "--set train.means=free --policy paper",
         "--set flight.length=9",
         "--set flight.no_fly=4",

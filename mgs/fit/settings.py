@@ -103,7 +103,7 @@ class ModelSettings(BaseModel):
     seed: Annotated[int, Field(ge=0)] = 0
     """Seed of all random draws."""
     estimator: str = "exact"
-    """Estimator of the Fisher information: exact, hutchinson, or loss-gradient (the paper's)."""
+    """Estimator of the Fisher information: exact, or loss-gradient (the paper's)."""
     lam: Annotated[float, Field(ge=1e-30, le=1e30, allow_inf_nan=False)] | None = None
     """One lambda for all parameters, as in the paper. Default: (pixel noise / prior std)^2."""
     pixel_noise: Scale = PIXEL_NOISE

@@ -21,8 +21,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.errors import InputError, row_named
 from mgs.gaussians import LEARNED, Gaussians
-from mgs.memory import check_room, padded
-from mgs.seeds import derive_seed
+from mgs.memory import check_room
 from mgs.splat import kernels
 from mgs.splat.derivatives import (
     ByMean,
@@ -80,7 +79,6 @@ def fisher(
     cache: ListCache | None = None,
     means: str = "frozen",
     alpha_weight: float = 0.0,
-    **options: Any,
 ) -> np.ndarray:
     """Fisher information of one view about each Gaussian: float32 [N,P], or [N,P,P] for the
     estimator `block`.
@@ -91,7 +89,7 @@ def fisher(
     larger one (padded rows).
 
     - gaussians, background, cache: as in `render`.
-    - estimator: a name in `ESTIMATORS`. options: `probes` and `seed` of `hutchinson`.
+    - estimator: a name in `ESTIMATORS`.
     - means: "frozen" or "free": 0 or 3 columns of the means, after the others.
     - alpha_weight: (sigma_rgb / sigma_alpha)^2, up to 1e12, if a pixel's alpha is observed beside
       its colour; 0: it is not.
@@ -111,13 +109,14 @@ def fisher(
         raise InputError(
             f"fisher: alpha_weight {alpha_weight} must be from 0 to {ALPHA_WEIGHT_MAX:.0e}"
         )
+    options: dict[str, Any] = {}
     if MEANS[means] or alpha_weight:
         if estimator not in EXACT:
             raise InputError(
                 f"fisher: the estimator {estimator!r} supports neither means nor alpha; "
                 f"use {' or '.join(EXACT)}"
             )
-        options |= {"means": means, "alpha_weight": alpha_weight}
+        options = {"means": means, "alpha_weight": alpha_weight}
     if n == 0:
         return np.zeros((0, size, size) if estimator == "block" else (0, size), np.float32)
     if estimator == "block":
@@ -271,54 +270,6 @@ def block(
     return rows[:, : size * size].reshape(-1, size, size)
 
 
-def _gradient(
-    gaussians: Gaussians,
-    image_gradient: Any,
-    camera: Camera,
-    background: Any,
-    cache: ListCache | None,
-) -> np.ndarray:
-    """J^T z of an image z [N,P], by `dr.backward`. image_gradient(rgb) returns z, TensorXf
-    [H,W,3]."""
-    with dr.resume_grad():
-        learned = {name: dr.copy(dr.detach(getattr(gaussians, name))) for name in LEARNED}
-        dr.enable_grad(list(learned.values()))
-        model = replace(gaussians, means=dr.detach(gaussians.means), **learned)
-        # Gradient of <rgb, z>, with z constant: J^T z.
-        rgb = render(model, camera, background, cache).rgb
-        dr.backward_from(dr.sum(rgb * image_gradient(dr.detach(rgb)), axis=None))
-        gradients = [np.asarray(dr.grad(value)) for value in learned.values()]
-    return np.concatenate([g.reshape(len(gaussians), -1) for g in gradients], axis=1)
-
-
-def hutchinson(
-    gaussians: Gaussians,
-    camera: Camera,
-    background: Any,
-    cache: ListCache | None,
-    probes: int = 8,
-    seed: int = 0,
-) -> np.ndarray:
-    """Mean of (J^T z)^2 over `probes` images z of independent +1 and -1, an unbiased estimate of
-    diag(J^T J) (Hutchinson 1990).
-
-    The probes of a camera are drawn from `seed` and the camera. If views shared them, errors of
-    neighbouring views would be alike and would add up. Raises InputError for less than one probe.
-    """
-    if int(probes) != probes or probes < 1:
-        raise InputError(f"hutchinson: probes {probes} must be a whole number from 1 up")
-    cache = cache or ListCache()
-    total = np.zeros((len(gaussians), 0), np.float64)
-    for probe in range(int(probes)):
-        rng = np.random.default_rng(derive_seed(seed, f"hutchinson/{camera.key.hex()}/{probe}"))
-        z = rng.choice(np.array([-1, 1], np.float32), (camera.height, camera.width, 3))
-        image = mi.TensorXf(padded(z))
-        gradient = _gradient(gaussians, lambda _, image=image: image, camera, background, cache)
-        squared = gradient.astype(np.float64) ** 2
-        total = squared if probe == 0 else total + squared
-    return (total / probes).astype(np.float32)
-
-
 def loss_gradient(
     gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None
 ) -> np.ndarray:
@@ -329,11 +280,16 @@ def loss_gradient(
     (rgb - 0.5)^2. The result is not diag(J^T J): gradients of different pixels cancel before they
     are squared.
     """
-
-    def image_gradient(rgb: Any) -> Any:
-        return (rgb - 0.5) * (2 / len(rgb.array))
-
-    return _gradient(gaussians, image_gradient, camera, background, cache) ** 2
+    with dr.resume_grad():
+        learned = {name: dr.copy(dr.detach(getattr(gaussians, name))) for name in LEARNED}
+        dr.enable_grad(list(learned.values()))
+        model = replace(gaussians, means=dr.detach(gaussians.means), **learned)
+        rgb = render(model, camera, background, cache).rgb
+        # J^T z with z = dL/drgb, held constant.
+        z = (dr.detach(rgb) - 0.5) * (2 / len(rgb.array))
+        dr.backward_from(dr.sum(rgb * z, axis=None))
+        gradients = [np.asarray(dr.grad(value)) for value in learned.values()]
+    return np.concatenate([g.reshape(len(gaussians), -1) for g in gradients], axis=1) ** 2
 
 
 SMALLEST = 1.2e-38
@@ -363,8 +319,7 @@ def _interleaved(columns: dict[int, Any], size: int, n: int) -> Any:
 ESTIMATORS: dict[str, Callable[..., np.ndarray]] = {
     "exact": exact,
     "block": block,
-    "hutchinson": hutchinson,
     "loss-gradient": loss_gradient,
 }
-"""Estimators by name: (gaussians with Dr.Jit fields, camera, background, cache, **options) ->
-NumPy [N,P], or [N,P,P] for `block`. A program may add its own (docs/howto/estimator.md)."""
+"""Estimators by name: (gaussians with Dr.Jit fields, camera, background, cache) -> NumPy [N,P],
+or [N,P,P] for `block`. A program may add its own (docs/howto/estimator.md)."""

@@ -10,9 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mgs.errors import InputError
-from mgs.splat import MEANS, ListCache, fisher, groups, information, reference, render
-from mgs.splat.information import hutchinson
-from mgs.splat.rendering import as_drjit
+from mgs.splat import MEANS, fisher, groups, information, reference, render
 
 from .scenes import (
     calm,
@@ -146,41 +144,6 @@ def test_clamped_scale_carries_no_information():
     assert (block[[3, 5]] == 0).all()
 
 
-def test_hutchinson_converges_as_one_over_sqrt_k():
-    """The expected squared error of the mean of k probes is 2 (H^2 - sum J^4) / k."""
-    camera, style = make_camera((21, 14), focal=24), {"log_scales": (-3.5, -1.0), "logits": (-2, 3)}
-    g = calm(lambda seed: make_gaussians(16, seed, **style), camera, 3)
-    J2 = reference.jacobian(g, camera, BACKGROUND).reshape(-1, 16, 11) ** 2
-    H = J2.sum(0)
-    variance = 2 * (H**2 - (J2**2).sum(0))
-    seen = (H / H.max()) > 1e-9
-    ks = (4, 16, 64, 256)
-    cache, errors = ListCache(), []
-    for k in ks:
-        estimate = hutchinson(as_drjit(g), camera, BACKGROUND, cache, probes=k, seed=1)
-        errors.append(np.sqrt(((estimate - H)[seen] ** 2 / variance[seen]).mean()))
-    slope = np.polyfit(np.log(ks), np.log(errors), 1)[0]
-    print("k", ks, "rms error / sigma", [f"{e:.3f}" for e in errors], f"slope {slope:.3f}")
-    assert abs(slope + 0.5) < 0.08
-    assert np.all(np.abs(np.sqrt(ks) * errors - 1) < 0.35)
-
-
-def test_probes_of_hutchinson_are_independent_from_view_to_view():
-    """Errors of 16 neighbouring views average out in their sum."""
-    g = make_gaussians(16, 3, log_scales=(-3.5, -1.0), logits=(-2, 3))
-    cameras = [make_camera((21, 14), focal=24, eye=(2.0, 0.4 + 1e-3 * i, 1.1)) for i in range(16)]
-    exact = [fisher(g, camera) for camera in cameras]
-    estimate = [fisher(g, camera, "hutchinson", probes=1) for camera in cameras]
-
-    def error(a, b):
-        return np.linalg.norm(a - b) / np.linalg.norm(b)
-
-    each = np.mean([error(a, b) for a, b in zip(estimate, exact, strict=True)])
-    assert error(np.sum(estimate, 0), np.sum(exact, 0)) < 0.5 * each
-    again = fisher(g, cameras[3], "hutchinson", probes=1)
-    np.testing.assert_array_equal(again, estimate[3])
-
-
 def test_gradient_estimators_work_where_gradients_are_suspended():
     camera, g = make_camera(), make_gaussians(16, 6)
     with dr.suspend_grad():
@@ -240,11 +203,9 @@ def test_unseen_means_and_clamped_alphas_carry_no_information():
     ("options", "message"),
     [
         ({"estimator": "magic"}, r"estimator 'magic': unknown; choose one of .*exact"),
-        ({"estimator": "hutchinson", "probes": 0}, "probes 0 must be a whole number from 1 up"),
-        ({"estimator": "hutchinson", "probes": 1.5}, "probes 1.5 must be a whole number"),
         ({"means": "fixed"}, "means 'fixed': unknown; choose one of frozen, free"),
         ({"alpha_weight": -0.1}, r"fisher: alpha_weight -0\.1 must be from 0 to 1e[+]12"),
-        ({"estimator": "hutchinson", "means": "free"}, "'hutchinson' supports neither means"),
+        ({"estimator": "loss-gradient", "means": "free"}, "'loss-gradient' supports neither means"),
     ],
 )
 def test_unusable_options_are_one_line(options, message):
