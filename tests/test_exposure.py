@@ -173,6 +173,12 @@ def test_a_fit_with_gains_is_nearly_as_good_as_one_of_constant_exposure(runs):
     assert corrected["with"] > corrected["constant"] - 0.5
     assert corrected["without"] < corrected["constant"] - 1.5
     assert held_out["with"]["psnr_mask"] < corrected["with"] - 1  # what is not corrected says so
+    for name, (_, out) in runs.items():
+        table = markdown_table(table_numbers([out]))
+        assert ("exposure fitted (dB)" in table) == (name == "with")
+    measured = runs["with"][0].steps[-1]
+    assert measured["held_out_psnr_mask_corrected"] == pytest.approx(corrected["with"], abs=1e-3)
+    assert not any("corrected" in key for key in runs["constant"][0].steps[-1])
 
 
 def test_the_alarm_of_exposure_is_silent_where_gains_explain_it(runs):
