@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from program import command, steps, study, table_numbers
-from refusals import listing, occupied, refused
+from refusals import listing, refused
 
 from mgs.data.check import check_dataset
 from mgs.data.dataset import FILES, load_dataset
@@ -19,7 +19,6 @@ from mgs.errors import InputError
 from mgs.prior.build import build_prior, prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
 from mgs.reports.tables import table_columns
-from mgs.run import nbv
 from mgs.run.inputs import prior_digest
 from mgs.synth import arena, rendering
 from mgs.synth.capture import capture_of
@@ -92,13 +91,6 @@ def captured(poses, prior, root):
 def fresh(poses, tmp_path):
     """A copy of the poses, for this test alone."""
     return load_dataset(shutil.copytree(poses.root, tmp_path / "poses"))
-
-
-@pytest.fixture
-def small(monkeypatch):
-    """Makes the dataset of `--capture` small."""
-    monkeypatch.setitem(rendering.PRESETS, nbv.CAPTURE_PRESET, TINY)
-    monkeypatch.setattr(nbv, "CAPTURE_TEST_VIEWS", 1)
 
 
 def files(frame) -> list[Path]:
@@ -271,23 +263,15 @@ def test_every_command_that_reads_a_run_reads_this_one(captured, tmp_path, capsy
     assert {name for name, role in roles.items() if role == "candidate"} == never
 
 
-def test_one_command_does_all_of_it(small, tmp_path, capsys):
-    """Poses, survey, prior and run in the run's folder, which can be resumed."""
-    scene, run = tmp_path / "mine.toml", tmp_path / "run"
-    scene.write_text(TOML)
-    command("nbv", "--capture", scene, "--out", run, "--gaussians", 300, *RUN, "--budget", 1)
-    assert sorted(there(load_dataset(run / "dataset"))) == sorted(taken(run))
-    settings = json.loads((run / "config.json").read_text())["settings"]
-    assert settings["dataset"] == str((run / "dataset").resolve())
+def test_a_run_builds_its_prior_from_the_survey(fresh, tmp_path, capsys):
+    """Without the images of the candidates."""
+    run = tmp_path / "run"
+    command("nbv", fresh.root, "--out", run, "--gaussians", 300, *RUN, "--budget", 1)
+    assert sorted(there(fresh)) == sorted(taken(run))
     assert json.loads((run / "prior/prior.json").read_text())["from"] == "depth"
     said = capsys.readouterr().out
-    assert "test views (1)" in said
     assert "training views (4)" in said
     assert "held" not in said
-    leftover = run / f"dataset/images/.kf_0009.{2**30}-01234567.part.png"  # no process has this id
-    leftover.write_bytes(b"left by a kill")
-    command("nbv", "--resume", run)
-    assert not leftover.exists()
 
 
 def test_a_survey_with_noise_of_an_on_demand_dataset(poses, tmp_path):
@@ -297,15 +281,6 @@ def test_a_survey_with_noise_of_an_on_demand_dataset(poses, tmp_path):
     assert (tmp_path / "prior/prior.json").is_file()
     assert there(load_dataset(tmp_path / "survey"))
     assert not (tmp_path / "survey/images").exists()
-
-
-def test_bad_options_are_refused(small, tmp_path, capsys):
-    """With one line, before anything is made."""
-    begin = ["nbv", "--capture", "boulder", "--seeds", 3]
-    line = refused(capsys, [*begin, "--budget", 6, "--out", tmp_path / "out"], tmp_path)
-    assert "has 5 candidates, fewer" in line
-    line = refused(capsys, [*begin, "--out", occupied(tmp_path / "full")], tmp_path)
-    assert "is there already" in line
 
 
 def test_commands_say_which_image_an_on_demand_dataset_lacks(fresh, tmp_path, capsys):

@@ -31,20 +31,17 @@ PROGRAM = """
 from mgs import runtime
 runtime.start()
 from mgs.cli.app import main
-from mgs.run.nbv import CAPTURE_PRESET
-from mgs.synth import arena, rendering
+from mgs.synth import arena
 arena.ROWS, arena.TEXELS = 60, 64
-rendering.PRESETS[CAPTURE_PRESET] = rendering.RenderPreset(64, 48, 8, 2)
 main()
 """
-"""mgs, with a coarse ground and few pixels."""
+"""mgs, with a coarse ground."""
 
 TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 20\n"
 UNEQUAL = rb'"(commit|\w*seconds\w*)":\s*(\{[^}]*\}|"[^"]*"|[-+.\de]+)'
 LOOP = "--seeds 2 --budget 2 --set train.passes=3 --seed 1"
 COMMANDS = {
     "nbv": f"nbv {{data}} --prior {{prior}} --out {{out}} {LOOP} --set evaluate_every=1",
-    "capture": f"nbv --capture {{scene}} --gaussians 150 --out {{out}} {LOOP}",
     "synth-orbit": "synth-orbit {out} --scene {scene} --frames 6 --size 64x48 --spp 2",
     "import": "import {data} --mesh {data}/rock.glb --out {out}",
     "refit": "simplify {out} --method refit",

@@ -402,8 +402,3 @@ def test_a_refused_picture_gets_the_next_number_whatever_lies_beside_it(tmp_path
         (tmp_path / name).touch()
     live._set_aside(tmp_path / "kf.png")
     assert (tmp_path / "kf.refused-3.png").is_file()
-
-
-def test_a_scene_and_live_capture_exclude_each_other(tmp_path):
-    with pytest.raises(InputError, match=r"renders images, and .* awaits them"):
-        mgs.run_nbv(None, tmp_path / "run", capture="boulder", live=lambda pose, out: None)

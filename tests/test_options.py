@@ -43,7 +43,6 @@ OPTIONS = {
         "--resume {run} --budget 9",
         "--resume {run} --policy random",
         "{data} --prior {prior} --out {run}",
-        "{data} --capture boulder --out {out}",
     ],
     "nbv {data} --prior {prior} --seeds 3 --budget 1 --out {out}": [
         "--set estimator=block",

@@ -91,13 +91,6 @@ def nbv(
             metavar="RUN",
         ),
     ] = None,
-    capture: Annotated[
-        str | None,
-        option(
-            "Scene (name or .toml) in place of DATASET; each view is rendered when it is chosen.",
-            metavar="SCENE",
-        ),
-    ] = None,
     capture_command: Annotated[
         str | None,
         option(
@@ -136,16 +129,15 @@ def nbv(
     if in_file(own) and policy is None:
         raise InputError(f"{config}: its policy is a program, {own}; to run it, add --policy {own}")
     values |= given(policy=policy, budget=budget, seeds=seeds, batch=batch, seed=seed)
-    dataset = dataset or (None if capture else values.get("dataset"))
+    dataset = dataset or values.get("dataset")
     if gaussians is None:
         prior = prior or values.get("prior")
-    if (dataset is None) == (capture is None) or out is None:
-        raise InputError("nbv: give a DATASET or --capture SCENE, and --out RUN; or --resume RUN")
+    if dataset is None or out is None:
+        raise InputError("nbv: give a DATASET and --out RUN; or --resume RUN")
     run = start_and_print(
         dataset,
         out,
         console,
-        capture=capture,
         live=live,
         prior=prior,
         gaussians=parse_gaussians(gaussians),
@@ -190,7 +182,7 @@ def refuse_others(context: typer.Context, resume: Path, values: dict[str, Any]) 
 
 
 def start_and_print(
-    dataset: Path | None,
+    dataset: Path,
     out: Path,
     console: Terminal,
     start: Callable[..., Run] | None = None,
@@ -205,7 +197,7 @@ def start_and_print(
     with progress_bar("starting", console) as progress:
         run = (start or start_run)(dataset, out, progress=progress, **settings)
     found = run.settings.prior
-    if settings.get("prior") is None and dataset and found.parent == dataset.resolve():
+    if settings.get("prior") is None and found.parent == dataset.resolve():
         console.print(f"prior: {found}", soft_wrap=True)
     if run.settings.flight.no_fly or run.settings.flight.clearance is not None:
         may = allowed(scene_of(run), run.settings)

@@ -65,7 +65,7 @@ FILES = [
 """Names in the folder of a run, with what commands add to it."""
 
 DATASET = "dataset"
-"""Folder of a run that holds its dataset, where the run captures images (`mgs nbv --capture`)."""
+"""Folder of a run that holds its dataset, where its pictures are taken (`mgs.run.live`)."""
 
 
 class Run:

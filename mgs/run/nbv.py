@@ -42,14 +42,6 @@ from mgs.run.state import Checkpoint
 from mgs.run.transports import Transport
 from mgs.scene import Scene, State, information
 from mgs.splat.constants import NEAR
-from mgs.synth.scene_file import load_scene_file
-
-CAPTURE_PRESET = "quick"
-"""Row of `mgs.synth.rendering.PRESETS`: size and number of the images that a run captures."""
-
-CAPTURE_TEST_VIEWS = 12
-"""Test views of a run that captures its images, which has no held-out views."""
-
 
 FREE_PASSES = 30
 """Passes of a fit of free means to all images. A chosen constant."""
@@ -67,7 +59,7 @@ of free means to all images. Chosen constants."""
 
 
 def run_nbv(
-    dataset: str | Path | Dataset | None,
+    dataset: str | Path | Dataset,
     out: str | Path,
     *,
     on_step: Callable[[Checkpoint], None] = lambda state: None,
@@ -112,10 +104,9 @@ def nbv(
 
 
 def start_run(
-    dataset: str | Path | Dataset | None,
+    dataset: str | Path | Dataset,
     out: str | Path,
     *,
-    capture: str | Path | None = None,
     live: Live | Transport | None = None,
     prior: str | Path | Prior | None = None,
     gaussians: int | Literal["auto"] | None = None,
@@ -127,8 +118,6 @@ def start_run(
 ) -> Run:
     """Check all inputs, find or build the prior, and write config.json of a new run folder `out`.
 
-    - capture: a scene, by name or TOML file, in place of a dataset. The run renders an image only
-      when its view is chosen, and has its own OUT/dataset with CAPTURE_TEST_VIEWS.
     - live: takes the pictures of poses without an image: a `Live`, or a function(pose file, picture
       file) (docs/howto/on-site.md). They are kept in OUT/dataset.
     - prior: a folder, or a Prior, which is copied into the run. Default: DATASET/prior if it
@@ -147,22 +136,17 @@ def start_run(
     to the prior to draw it.
     """
     out = Path(out)
-    if (dataset is None) == (capture is None):
-        raise InputError("nbv: give either a DATASET or `capture` SCENE")
-    if capture is not None and live is not None:
-        raise InputError("nbv: `capture` renders images, and live capture awaits them; give one")
     if holds_run(out) and not force:
         raise InputError(f"{out}: a run {THERE}; `mgs nbv --resume {out}` continues it")
-    given = dataset if isinstance(dataset, Dataset) else None
-    root = given.root if given else out / DATASET if dataset is None else Path(str(dataset))
+    root = dataset.root if isinstance(dataset, Dataset) else Path(dataset)
     if prior is not None and gaussians is not None:
         raise InputError("nbv: `gaussians` builds a prior; leave it out, or leave out `prior`")
     if (prior, gaussians, source) == (None,) * 3 and (root / "prior/prior.json").is_file():
         prior = root / "prior"
-    loaded = given
-    if given is None and capture is None:
+    loaded = dataset
+    if not isinstance(loaded, Dataset):
         loaded = load_dataset(root, to_capture=live is not None)
-    if live is not None and not (loaded and loaded.on_demand):
+    if live is not None and not loaded.on_demand:
         raise InputError(f"{root}: all its images exist; leave out live capture")
     images = root if live is None else out / DATASET
     where = Path(prior) if isinstance(prior, str | Path) else out / "prior"
@@ -170,27 +154,24 @@ def start_run(
     named = name_of(policy) if isinstance(policy, str) or callable(policy) else policy
     automatic = settings.get("budget") == "auto"
     if automatic:
-        if loaded is None or live is not None:
+        if live is not None:
             raise InputError("budget auto: needs the images of the seeds; give a number")
         settings = settings | {"budget": 1}
-    outlined = not loaded or loaded.outlined
-    weight = ALPHA_WEIGHT if outlined else 0.0
+    weight = ALPHA_WEIGHT if loaded.outlined else 0.0
     wanted = with_defaults(settings | {"policy": named}, weight)
     known = validated(
         NbvSettings, {"dataset": images.resolve(), "prior": where.resolve(), **wanted}
     )
-    count = len(loaded) if loaded else _candidates(capture)
-    complete = _resolved(known, count, "budget" in settings)
+    complete = _resolved(known, len(loaded), "budget" in settings)
     rule = policy_of(policy)  # a user's policy fails here, before there is a folder
-    check_settings(complete, count)
+    check_settings(complete, len(loaded))
     found = load_prior(prior) if isinstance(prior, str | Path) else prior
-    read = [path for path in (root if capture is None else None, prior) if isinstance(path, Path)]
+    read = [path for path in (root, prior) if isinstance(path, Path)]
     with atomic_folder(out, Ours(FILES, read) if holds_run(out) else None) as unfinished:
-        frames = loaded or _poses(unfinished / DATASET, str(capture), complete.seed, progress)
-        built = found or _built_prior(frames, gaussians, source, complete.seed, progress)
+        built = found or _built_prior(loaded, gaussians, source, complete.seed, progress)
         if not isinstance(prior, str | Path):
             save_prior(unfinished / "prior", built)
-        _check_near(built, frames, where)
+        _check_near(built, loaded, where)
         if built.numbers.get("from") == "random" and complete.train.means != "free":
             free = "let means be free (`train.means`), or give depth, points or masks"
             raise InputError(f"{where}: starts at random points, not on a surface; {free}")
@@ -201,12 +182,12 @@ def start_run(
             )
         complete = complete.with_spacing(built.spacing, loose)
         if complete.flies or complete.flight.no_fly or complete.flight.clearance is not None:
-            check_seeds(Scene(frames, built, complete), complete)
+            check_seeds(Scene(loaded, built, complete), complete)
         if automatic:
-            complete = _automatic(Scene(frames, built, complete), complete, rule, progress)
+            complete = _automatic(Scene(loaded, built, complete), complete, rule, progress)
         if live is not None:
-            begin(unfinished / DATASET, frames, built)
-        start(unfinished, complete, frames)
+            begin(unfinished / DATASET, loaded, built)
+        start(unfinished, complete, loaded)
         if not isinstance(policy, str):
             (unfinished / POLICY_SOURCE).write_text(source_of(policy), encoding="utf-8")
     return Run(out, complete, loaded if live is None else None, found, policy)
@@ -299,28 +280,6 @@ def _check_near(prior: Prior, dataset: Dataset, where: Path) -> None:
             f"than {NEAR} is drawn; import the data with `unit`, the metres in a length of 1, "
             "and build the prior again"
         )
-
-
-def _candidates(scene: str | Path | None) -> int:
-    """Number of poses of a captured scene. Raises InputError as `load_scene_file`."""
-    load_scene_file(str(scene))
-    runtime.start()
-    from mgs.synth.rendering import PRESETS
-
-    return PRESETS[CAPTURE_PRESET].frames
-
-
-def _poses(folder: Path, scene: str, seed: int, progress: Progress) -> Dataset:
-    """Write the on-demand dataset of a run that captures a scene."""
-    from mgs.synth.rendering import synth_orbit  # needs the variant that `_candidates` sets
-
-    def rendered(done: int, total: int) -> None:
-        progress("rendering test views", done, total)
-
-    views = CAPTURE_TEST_VIEWS
-    return synth_orbit(
-        folder, scene, CAPTURE_PRESET, seed, progress=rendered, test_views=views, on_demand=True
-    )
 
 
 def resume_nbv(
