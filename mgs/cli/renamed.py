@@ -59,7 +59,7 @@ OPTIONS = {
         "--safe-distance": "safe_distance",
     },
     "prior": SEED | {"--from": "--source"},
-    "synth-orbit": SEED | {"--scale": "--preset"},
+    "synth-orbit": SEED,
     "survey": SEED,
     "demo": SEED,
 }

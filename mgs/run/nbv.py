@@ -151,23 +151,21 @@ def start_run(
     images = root if live is None else out / DATASET
     where = Path(prior) if isinstance(prior, str | Path) else out / "prior"
     policy = settings.get("policy", NbvSettings.model_fields["policy"].default)
-    named = name_of(policy) if isinstance(policy, str) or callable(policy) else policy
+    policy_name = name_of(policy) if isinstance(policy, str) or callable(policy) else policy
     automatic = settings.get("budget") == "auto"
     if automatic:
         if live is not None:
             raise InputError("budget auto: needs the images of the seeds; give a number")
         settings = settings | {"budget": 1}
     weight = ALPHA_WEIGHT if loaded.outlined else 0.0
-    wanted = with_defaults(settings | {"policy": named}, weight)
-    known = validated(
-        NbvSettings, {"dataset": images.resolve(), "prior": where.resolve(), **wanted}
-    )
-    complete = _resolved(known, len(loaded), "budget" in settings)
+    paths = {"dataset": images.resolve(), "prior": where.resolve()}
+    values = paths | with_defaults(settings | {"policy": policy_name}, weight)
+    complete = _resolved(validated(NbvSettings, values), len(loaded), "budget" in settings)
     rule = policy_of(policy)  # a user's policy fails here, before there is a folder
     check_settings(complete, len(loaded))
     found = load_prior(prior) if isinstance(prior, str | Path) else prior
-    read = [path for path in (root, prior) if isinstance(path, Path)]
-    with atomic_folder(out, Ours(FILES, read) if holds_run(out) else None) as unfinished:
+    inputs = [path for path in (root, prior) if isinstance(path, Path)]
+    with atomic_folder(out, Ours(FILES, inputs) if holds_run(out) else None) as unfinished:
         built = found or _built_prior(loaded, gaussians, source, complete.seed, progress)
         if not isinstance(prior, str | Path):
             save_prior(unfinished / "prior", built)
