@@ -408,3 +408,17 @@ def test_a_travel_cost_is_weighed_against_the_gain_of_every_pose(loaded, tmp_pat
         1 + np.linalg.norm(positions[views] - here, axis=1) / 1e-3
     )
     assert choose(scene, state, policy, near)[0] == views[int(worth.argmax())]
+
+
+def test_a_flight_records_what_its_tour_is_worth(loaded, tmp_path):
+    """Its share is of any set of as many views, whatever the way."""
+    scene, after, mission, chosen = flown(
+        loaded, tmp_path / "run", "directional-d", flight={"length": 30.0}
+    )
+    recorded = steps(tmp_path / "run")[0]["certificate"]
+    assert recorded["views"] == len(chosen) > 0
+    views = flight.free(scene, after([]), mission)
+    made = POLICIES["directional-d"].relaxation(scene, after([]), views)
+    gain = made.gain([views.index(i) for i in chosen])
+    largest = max(made.gain(some) for some in combinations(range(len(views)), len(chosen)))
+    assert recorded["share"] <= gain / largest * (1 + 1e-9)

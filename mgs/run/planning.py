@@ -130,13 +130,16 @@ def certificate(
 def planned_certificate(
     scene: Scene, state: State, policy: Policy, mission: Mission
 ) -> Certificate | None:
-    """`certificate` of all views that a run plans to take; None where it plans no set of views."""
-    plan = getattr(policy, "plan", None)
-    limited = mission.travel is not None or mission.flies or mission.nearest is not None
-    if plan is None or limited or views_left(state, mission) <= 0:
+    """`certificate` of all views that a run plans to take, also as a tour; None where it plans no
+    set of views."""
+    plan, left = getattr(policy, "plan", None), views_left(state, mission)
+    if plan is None or mission.travel is not None or mission.nearest is not None or left <= 0:
         return None
     views = free(scene, state, mission)
-    planned = plan(scene, state, views, views_left(state, mission), None)
+    if mission.flies:
+        planned = planned_flight(scene, state, policy, mission)
+    else:
+        planned = plan(scene, state, views, left, None)
     return certificate(scene, state, policy, planned, views)
 
 
