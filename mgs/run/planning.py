@@ -16,8 +16,9 @@ from mgs.run.policies import Policy
 from mgs.run.settings import Mission
 from mgs.scene import Scene, State, with_view
 
-CERTIFY_NODES = 20
-"""Nodes of the branch and bound of a certificate, which take seconds. A chosen constant."""
+CERTIFY_NODES, CERTIFY_PAIRS = 20, 15_000_000
+"""Most nodes of the branch and bound of a certificate, and of nodes times pairs of a candidate and a
+Gaussian: seconds of work. Chosen constants."""
 
 
 def rated(
@@ -123,8 +124,10 @@ def certificate(
         return None
     report(Stage.SCORE, 0, 1)
     made = relaxation(scene, state, views)
-    places = [views.index(i) for i in plan]
-    return made and certify(made, places, policy.name, CERTIFY_NODES)
+    if made is None:
+        return None
+    nodes = min(CERTIFY_NODES, CERTIFY_PAIRS // (len(views) * len(made.base)))
+    return certify(made, [views.index(i) for i in plan], policy.name, nodes)
 
 
 def planned_certificate(
