@@ -17,8 +17,8 @@ from mgs.run.settings import Mission
 from mgs.scene import Scene, State, with_view
 
 CERTIFY_NODES, CERTIFY_PAIRS = 20, 15_000_000
-"""Most nodes of the branch and bound of a certificate, and of nodes times pairs of a candidate and a
-Gaussian: seconds of work. Chosen constants."""
+"""Most nodes of the branch and bound of a certificate, and most nodes times pairs of a candidate
+and a Gaussian: seconds of work. Chosen constants."""
 
 
 def rated(
