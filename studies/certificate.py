@@ -41,13 +41,8 @@ NODES, DRAWS, SETS, SIZE = 40, 20, 40, 8
 """Nodes of branch and bound; random sets by the criterion; random sets that are fitted, and their
 size."""
 
-KINDS = {
-    "bound": "no set can have more",
-    "plan": "plan",
-    "farthest": "farthest poses",
-    "random": "random (mean)",
-}
-"""Keys of the curve and their names."""
+KINDS = ("bound", "plan", "farthest", "random")
+"""Keys of the curve."""
 
 
 def cells_of(size: SetupSize, rocks: Iterable[Rock]) -> list[Cell]:
@@ -218,11 +213,11 @@ def text_of(rows: Sequence[Row]) -> str:
 def curve_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
     """Rows of the curve: rock, scene, views, kind (of KINDS), percent of the gain of all."""
     return [
-        dict(cell.about) | {"views": row["views"], "kind": name, "percent": 100 * row[key]}
+        dict(cell.about) | {"views": row["views"], "kind": kind, "percent": 100 * row[kind]}
         for cell in cells
         if cell.about
         for row in results[cell.name]["curve"]
-        for key, name in KINDS.items()
+        for kind in KINDS
     ]
 
 
