@@ -22,8 +22,16 @@ for candidate in ${PYTHON:-python3 python3.13 python3.12 python3.11}; do
 done
 [ -n "$python" ] || stop "no Python 3.11 or newer found; install one (apt-get install python3 python3-venv), or: make PYTHON=/path/to/python3.11"
 
-# libLLVM first: the check needs only Python, and without libLLVM no download is of use.
-find_llvm() { "$python" -c 'from mgs.runtime import find_libllvm; print(find_libllvm())' 2>"$log"; }
+# libLLVM first: the check needs only Python, and without libLLVM no download is of use. The package
+# itself needs another one (mgs/__init__.py), so its folder alone stands in for it.
+find_llvm() {
+    "$python" -c '
+import sys, types
+sys.modules["mgs"] = types.ModuleType("mgs")
+sys.modules["mgs"].__path__ = ["mgs"]
+from mgs.runtime import find_libllvm
+print(find_libllvm())' 2>"$log"
+}
 if ! llvm=$(find_llvm); then
     reason=$(tail -n 1 "$log" | sed 's/^[A-Za-z.]*InputError: //')
     [ -z "${DRJIT_LIBLLVM_PATH:-}" ] && can_apt || stop "$reason"
