@@ -102,7 +102,7 @@ def view_maps(
 
 
 def picture(maps: dict[str, np.ndarray]) -> np.ndarray:
-    """Render of `view_maps`, sRGB in [0,1] [H,W,3]."""
+    """Render of `view_maps` [H,W,3], sRGB in 0 to 1."""
     return srgb_from_linear(np.stack([maps[channel] for channel in "RGB"], axis=-1))
 
 
