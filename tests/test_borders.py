@@ -1,4 +1,4 @@
-"""What a stranger's folder or file may not do: write elsewhere, nest without end, run."""
+"""A stranger's folder or file cannot write elsewhere, nest without end, or run."""
 
 import os
 from pathlib import Path

@@ -307,7 +307,7 @@ def test_the_command_converts_and_keeps_what_is_there(tmp_path, capsys):
 
 
 def test_the_export_of_a_run_fits_its_colours_again(dataset, prior, tmp_path, capsys):
-    """What is printed is measured; alone, colours are converted, and what that changes is said."""
+    """The printed PSNR is measured; for a file alone the loss by conversion is printed."""
     settings = {"prior": prior, "seeds": 4, "budget": 0, "train": {"passes": 10, "space": "linear"}}
     run = mgs.run_nbv(dataset, tmp_path / "run", **settings)
     command("export", tmp_path / "run", "--to", "ply", "--out", tmp_path / "fitted.ply")

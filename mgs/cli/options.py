@@ -130,7 +130,7 @@ def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any
 
 
 def given(**options: Any) -> dict[str, Any]:
-    """Those options that are not None."""
+    """Keep the options that are not None."""
     return {name: value for name, value in options.items() if value is not None}
 
 

@@ -292,7 +292,7 @@ def _newton_step(H: Floats, slope: Floats, x: Floats, lo: Floats, hi: Floats) ->
 
 @dataclass(frozen=True)
 class Certificate:
-    """What a plan of k of C candidates is worth, by a criterion; it says nothing about PSNR.
+    """Worth of a plan of k of C candidates by a criterion; it says nothing about PSNR.
 
     criterion: name of the policy. views, candidates: k and C.
     share: gain of the plan over the bound of any k. fewer: bound of any k - 1 over that gain; None

@@ -117,8 +117,10 @@ def planned_flight(scene: Scene, state: State, policy: Policy, mission: Mission)
 def certificate(
     scene: Scene, state: State, policy: Policy, plan: Sequence[int], views: Sequence[int]
 ) -> Certificate | None:
-    """What a plan of some of `views` is worth by the policy's criterion; None where the policy has
-    no `relaxation`, or the plan has no view or all of them."""
+    """Certify a plan of some of `views` by the policy's criterion.
+
+    Returns None where the policy has no `relaxation`, or the plan has no view or all of them.
+    """
     relaxation = getattr(policy, "relaxation", None)
     if relaxation is None or not 0 < len(plan) < len(views):
         return None

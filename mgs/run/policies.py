@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 class Policy(Protocol):
-    """What the loop needs of a policy; optional attributes are those of the module's docstring."""
+    """Interface that the loop needs; the module's docstring lists optional attributes."""
 
     @property
     def name(self) -> str: ...
@@ -137,7 +137,7 @@ class Coverage:
 
 @dataclass(frozen=True)
 class Directional:
-    """What a view says about colour in all directions (`mgs.policy.directional`).
+    """Directional optimality: information about colour in all directions, D or I.
 
     degree: of the spherical harmonics. tau: share of the prior's standard deviation that degrees
     above 0 have. over_dome: I-optimality over a dome of poses; else D-optimality, nats.
