@@ -10,6 +10,7 @@ import struct
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from mgs.data.up import PLUS_Z, Up
 from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, parsing, reading
 from mgs.gaussians import ARRAYS, Gaussians
+from mgs.rotation import QUAT_MIN
 from mgs.splat.constants import LOG_SCALE_RANGE
 from mgs.splat_gltf import read_glb, up_of_glb, write_glb
 from mgs.splat_places import mirrored
@@ -62,8 +64,9 @@ OTHERS = {
 def load_gaussians(path: str | Path) -> Gaussians:
     """Read Gaussians from a PLY in the layout of 3DGS, a compressed PLY, a GLB, or an SPZ.
 
-    Colours are unchanged. Infinite logits of opacity are cut to finite ones, and flat Gaussians get
-    the least thickness. Those with a NaN or another infinite number are left out, with a Notice.
+    Colours are unchanged. Infinite logits of opacity are cut to finite ones, flat Gaussians get the
+    least thickness, and quaternions of a length under QUAT_MIN, which would mean the identity, are
+    made longer. Those with a NaN or another infinite number are left out, with a Notice.
     Raises InputError if the file is missing, damaged or of another format, or if a package that it
     needs is missing.
     """
@@ -72,8 +75,11 @@ def load_gaussians(path: str | Path) -> Gaussians:
     g = read(path)
     g.check_shapes(path)
     flat, logits = np.isneginf(g.log_scales), np.clip(g.logit_opacities, -UNBOUNDED, UNBOUNDED)
+    longest = np.abs(g.quats).max(axis=1, keepdims=True, initial=0)
+    short = (longest > 0) & (longest <= QUAT_MIN)
     g = replace(
         g,
+        quats=np.where(short, g.quats / np.where(short, longest, np.float32(1)), g.quats),
         log_scales=np.where(flat, np.float32(LOG_SCALE_RANGE[0]), g.log_scales),
         logit_opacities=np.where(np.isinf(g.logit_opacities), logits, g.logit_opacities),
     )
@@ -154,16 +160,10 @@ def _axes(number: int) -> tuple[int, int, int]:
     return (1 if number & 1 else -1, -1 if number & 2 else 1, 1 if number & 4 else -1)
 
 
-def _spz_marks(path: Path) -> tuple[bool, int]:
-    """Whether an SPZ is antialiased, and the number of its axes. Raises InputError for version 1,
-    and errors of many types for a damaged file."""
-    data = path.read_bytes()
-    data = gzip.decompress(data) if data.startswith(SPZ_MAGIC[0]) else data
+def _spz_marks(data: bytes) -> tuple[bool, int]:
+    """Whether the contents of an SPZ are antialiased, and the number of their axes. Raises errors
+    of many types for damaged ones."""
     _, version, n, degree, _, flags, _, end = SPZ_HEADER.unpack_from(data)
-    if version == 1:
-        raise InputError(
-            f"{path}: is an SPZ of version 1, which mgs does not read; use a later one"
-        )
     start, axes = 32, RUB
     if version < 4:
         start = 16 + n * ((20 if version == 3 else 19) + 3 * ((degree + 1) ** 2 - 1))
@@ -178,14 +178,26 @@ def _spz_marks(path: Path) -> tuple[bool, int]:
 
 
 def _read_spz(path: Path) -> Gaussians:
-    """Read an SPZ of version 2 to 4 and turn it to the axes of 3DGS files.
+    """Read an SPZ of version 1 to 4 and turn it to the axes of 3DGS files.
 
-    Raises InputError if it is damaged.
+    Version 1 is version 2 with positions of float16, which the codec does not read. Raises
+    InputError if it is damaged.
     """
     codec = _spz_codec(path)
-    with reading(path), parsing(path, "SPZ", "export it again"):
-        antialiased, axes = _spz_marks(path)
-        found = codec.read_spz(str(path))
+    with reading(path), parsing(path, "SPZ", "export it again"), NamedTemporaryFile() as copy:
+        data = path.read_bytes()
+        data = gzip.decompress(data) if data.startswith(SPZ_MAGIC[0]) else data
+        magic, version, n = SPZ_HEADER.unpack_from(data)[:3]
+        if version == 1:
+            halves = np.frombuffer(data, "<f2", 3 * n, 16).reshape(n, 3).astype(np.float32)
+            head = data[8:13] + b"\1" + data[14:16]  # with fractional bits, which the codec checks
+            data = struct.pack("<4sI", magic, 2) + head + bytes(9 * n) + data[16 + 6 * n :]
+            copy.write(gzip.compress(data, 1))
+            copy.flush()
+        antialiased, axes = _spz_marks(data)
+        found = codec.read_spz(copy.name if version == 1 else str(path))
+        if version == 1:
+            found["means"] = halves
         parts = [found["sh0"][:, None, :]]
         if found["shN"] is not None and found["shN"].size:
             parts.append(found["shN"])

@@ -263,6 +263,38 @@ def test_an_spz_that_names_its_axes(tmp_path):
     assert np.abs(load_gaussians(path).means - model.means).max() < 1e-6
 
 
+def test_short_quaternions_are_rotations(tmp_path):
+    model = gaussians(0)
+    write_ply(tmp_path / "x.ply", replace(model, quats=model.quats * np.float32(1e-20)))
+    read = load_gaussians(tmp_path / "x.ply")
+    np.testing.assert_allclose(covariances(read), covariances(model), atol=1e-6)
+
+
+def test_an_spz_of_version_1_has_positions_of_float16(tmp_path):
+    """Its encoder: the streams in their order, after the published description."""
+    pytest.importorskip("gsply_cpp")
+    model = mirrored(gaussians(1, n=9), (1, -1, -1))
+    units = model.quats / np.linalg.norm(model.quats, axis=1, keepdims=True)
+    units = np.where(units[:, :1] < 0, -units, units)
+    levels = [
+        255 * model.opacities,
+        255 * (0.15 * model.sh[:, 0] + 0.5),
+        16 * (model.log_scales + 10),
+        127.5 * units[:, 1:] + 127.5,
+        128 * model.sh[:, 1:] + 128,
+    ]
+    steps = [np.clip(np.round(level), 0, 255).astype(np.uint8).tobytes() for level in levels]
+    head = struct.pack("<4sIIBBBB", b"NGSP", 1, 9, 1, 0, 1, 0)
+    data = head + model.means.astype("<f2").tobytes() + b"".join(steps)
+    (tmp_path / "x.spz").write_bytes(gzip.compress(data))
+    read = mirrored(load_gaussians(tmp_path / "x.spz"), (1, -1, -1))
+    assert read.antialiased
+    np.testing.assert_array_equal(read.means, model.means.astype(np.float16))
+    np.testing.assert_allclose(read.log_scales, model.log_scales, atol=1 / 32 + 1e-6)
+    np.testing.assert_allclose(read.sh[:, 1:], model.sh[:, 1:], atol=1 / 256 + 1e-6)
+    np.testing.assert_allclose(covariances(read), covariances(model), rtol=0.2, atol=0.01)
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".glb"])
 def test_what_playcanvas_makes_of_a_model_is_the_same_model(tmp_path, suffix):
     program = shutil.which("splat-transform")
@@ -346,7 +378,10 @@ BAD = {
         "its Gaussians are compressed (KHR_spz)",
     ),
     "cut.spz": (gzip.compress(b"NGSP\3\0\0\0\xff\xff\0\0"), "not a readable SPZ"),
-    "old.spz": (gzip.compress(struct.pack("<4sIIBBBB4x", b"NGSP", 1, 0, 0, 12, 0, 0)), "version 1"),
+    "old.spz": (
+        gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 1, 9, 0, 12, 0, 0)),
+        "readable SPZ",
+    ),
     "few.spz": (
         gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 10**9, 3, 12, 0, 0) + b"\0" * 99),
         "not a readable SPZ",

@@ -150,6 +150,18 @@ def test_the_hull_of_a_convex_body_seen_from_all_sides_is_that_body(tmp_path, mo
     assert 0 < away.max() < 1.5 * 3.0 / 90  # pixels
 
 
+def test_the_hull_keeps_each_piece_inside_the_masks(tmp_path, monkeypatch):
+    """A cap above a stone: neither is dropped."""
+    monkeypatch.setattr(hull, "COARSE", 32)
+    low, high = np.array([0, 0, 0.2]), np.array([0.1, 0, 0.9])
+    rocks = [(low, np.array([0.4, 0.3, 0.15])), (high, np.array([0.3, 0.3, 0.1]))]
+    dataset = synthetic.write_dataset(tmp_path, synthetic.orbit_cameras(16, 128, 96), rocks)
+    found = visual_hull(dataset.frames)
+    assert found.numbers["hull_fills_least"] > 0.9
+    pieces = trimesh.Trimesh(found.mesh.vertices, found.mesh.faces).split()
+    assert sorted(round(piece.centroid[2], 1) for piece in pieces) == [0.2, 0.9]
+
+
 def test_masks_that_do_not_fit_are_one_line_that_names_a_frame(tmp_path):
     dataset = floating(tmp_path / "d", lattice(12))
     for where, words in ((slice(5), "share no point in space"), (slice(36, 40), "carve away most")):

@@ -131,18 +131,17 @@ def import_data(
     if mesh is not None and mesh.suffix.lower() in GLTF:
         console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
     poses = agreement(result.frames)
+    if found.fit and (poses is None or found.fit.problem):
+        poses = found.fit
     for note in [*found.notes, *_advice(found, result)]:
         notes.print(f"mgs: {note}", soft_wrap=True)
-    if poses and poses.problem:
-        notes.print(
-            f"mgs: the poses {poses.problem} (points matched in neighbouring pictures are "
-            f"{poses.error:.1f} pixels from where the poses put them)",
-            soft_wrap=True,
-        )
-    world = f"up {_numbers(upward)}, {reason}"
     fits = "poses not compared with the pictures, which share too few points"
     if poses:
-        fits = f"poses fit the pictures to {poses.error:.2f} pixels ({poses.matches:,} matches)"
+        error = "" if poses.error is None else f": reprojection error {poses.error:.2f} pixels"
+        fits = f"poses compared by {poses.evidence}{error}"
+        if poses.problem:
+            notes.print(f"mgs: the poses {poses.problem} ({fits})", soft_wrap=True)
+    world = f"up {_numbers(upward)}, {reason}"
     _print_summary(console, found, tests, result, f"{fits}; {world}")
     console.print(f"{out} is finished already" if finished else f"wrote {out}", soft_wrap=True)
 
@@ -202,4 +201,4 @@ def _print_summary(
 
 
 def _numbers(vector: Sequence[float]) -> str:
-    return f"({', '.join(f'{value:.10g}' for value in np.round(vector, 4))})"
+    return f"({', '.join(f'{value:.10g}' for value in np.round(vector, 4) + 0.0)})"

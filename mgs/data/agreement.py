@@ -1,8 +1,9 @@
-"""Check of poses against pictures: the epipolar error of points matched between neighbours."""
+"""Check of poses against pictures: points matched between neighbours, their depth, or only whether
+the cameras look at one place."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
+from mgs.data.visibility import in_image, nearest_point
 
 PAIRS = 12
 """Most pairs of neighbours that are compared."""
@@ -33,66 +35,201 @@ SOUND = 0.25
 MENDED = 0.25
 """Error under another convention over that under ours, below which that convention is named."""
 
+ZOOMS = np.exp(np.linspace(np.log(0.4), np.log(2.5), 61))
+"""Factors on the focal length that are tried."""
+
+HIDDEN = 1.05
+"""Depth of a point over that of the picture, beyond which the point is taken as hidden."""
+
+LEAST_SEEN = 0.05
+"""Least share of the points of a depth image that a neighbour must see for their comparison."""
+
+PARALLEL = 0.02
+"""Least mean squared sine between the optical axes and their mean direction. Cameras that look the
+same way do not show where they look."""
+
+SEEN, UNSEEN = 0.9, 0.5
+"""Share of the cameras in whose picture the place is that most look at: least of right poses, and
+most of wrong ones."""
+
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """From OpenGL's camera axes to OpenCV's, and back."""
 
 BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 """From a body's axes (x forward, y left, z up) to OpenCV's."""
 
-CONVENTIONS = {
-    "have the camera axes of OpenCV in place of OpenGL's, or the reverse": lambda W: FLIP @ W,
-    "are the inverse: world-to-camera in place of camera-to-world, or the reverse": np.linalg.inv,
-    "are the inverse, and have the camera axes of OpenCV in place of OpenGL's": (
-        lambda W: FLIP @ np.linalg.inv(W)
-    ),
-    "are of a body whose x axis points forward, not of the camera": lambda W: BODY @ W,
-    "are of mirrored pictures": lambda W: np.diag([-1.0, 1, 1, 1]) @ W,
-}
-"""Mistakes in what poses mean -> world-to-camera without them, from ours."""
+Convention = Callable[[np.ndarray], np.ndarray]
+
+INVERSE = "are the inverse: world-to-camera in place of camera-to-world, or the reverse"
+
+CONVENTIONS: tuple[tuple[str, Convention], ...] = (
+    ("have the camera axes of OpenCV in place of OpenGL's, or the reverse", lambda W: FLIP @ W),
+    (INVERSE, np.linalg.inv),
+    (INVERSE, lambda W: FLIP @ np.linalg.inv(W)),
+    ("are of a body whose x axis points forward, not of the camera", lambda W: BODY @ W),
+    ("are of mirrored pictures", lambda W: np.diag([-1.0, 1, 1, 1]) @ W),
+)
+"""Mistakes in what poses mean, and world-to-camera without them, from ours."""
+
+Error = Callable[[Convention, float], float]
+"""error(convention, zoom): pixels, where poses and focal lengths are changed by these."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Epipolar error, pixels, of `matches` points matched in `pairs` pairs of pictures: the median
-    of a pair, and the quantile SOUND of the pairs.
+    """How well poses and pictures fit.
 
-    problem: what is wrong with the poses, empty if they fit.
+    error: median of a pair of neighbours, and the quantile SOUND of the pairs, pixels; None where
+    only the directions of the cameras could be compared. evidence: what was compared. problem: what
+    is wrong with the poses, empty if they fit.
     """
 
-    error: float
-    matches: int
-    pairs: int
+    error: float | None
+    evidence: str
     problem: str = ""
 
 
 def agreement(frames: Sequence[Frame]) -> Agreement | None:
-    """Compare poses with what pictures of neighbours in time show; None with too few matches."""
+    """Compare poses with what pictures of neighbours in time show: points matched in them, else
+    their depth, else the place that all cameras look at. None where nothing can be compared."""
     first = np.unique(np.linspace(0, max(len(frames) - 2, 0), PAIRS).astype(int))
-    found = []
-    for k in first if len(frames) > 1 else ():
-        one, other = frames[k], frames[k + 1]
-        points = _matches(one, other)
-        if points is not None:
-            found.append((one.camera, other.camera, *points))
-    if len(found) < LEAST_PAIRS:
+    pairs = [(frames[k], frames[k + 1]) for k in first if len(frames) > 1]
+    matched = [
+        (one.camera, other.camera, *points)
+        for one, other in pairs
+        if (points := _matches(one, other)) is not None
+    ]
+    width = frames[0].camera.width
+    if len(matched) >= LEAST_PAIRS:
+        count = sum(len(points) for _, _, points, _ in matched)
+
+        def by_matches(convention: Convention, zoom: float) -> float:
+            each = [np.median(_epipolar_error(*pair, convention, zoom)) for pair in matched]
+            return float(np.quantile(each, SOUND, method="higher"))
+
+        return _judged(by_matches, f"{count:,} points matched in neighbouring pictures", width)
+    if all(frame.depth_path for pair in pairs for frame in pair) and pairs:
+        measured = [(one, one.depth(), other, other.depth()) for one, other in pairs]
+
+        def by_depth(convention: Convention, zoom: float) -> float:
+            each = [_depth_error(*pair, convention, zoom) for pair in measured]
+            return float(np.quantile(each, 0.5, method="lower"))
+
+        found = _judged(
+            by_depth, f"the depth of {len(pairs)} pairs of neighbouring pictures", width
+        )
+        if found:
+            return found
+    return _directions([frame.camera for frame in frames])
+
+
+def observed(seen: Sequence[tuple[Camera, np.ndarray, np.ndarray]]) -> Agreement | None:
+    """Compare triangulated points [N,3] with the pixels [N,2] where pictures show them, in cameras
+    without distortion; None without points."""
+    count = sum(len(points) for _, points, _ in seen)
+    if not count:
         return None
 
-    def error(convention: object = None) -> float:
-        every = [np.median(_epipolar_error(*pair, convention)) for pair in found]
-        return float(np.quantile(every, SOUND))
+    def error(convention: Convention, zoom: float) -> float:
+        found = []
+        for camera, points, pixels in seen:
+            place, _, z = _projected(points, camera, convention(camera.world_to_camera), zoom)
+            found.append(np.where(z > 0, np.linalg.norm(place - pixels, axis=1), np.inf))
+        return float(np.median(np.concatenate(found)))
 
-    ours, width = error(), frames[0].camera.width
-    count = sum(len(points) for _, _, points, _ in found)
+    return _judged(error, f"{count:,} places where pictures show its points", seen[0][0].width)
+
+
+def _judged(error: Error, evidence: str, width: int) -> Agreement | None:
+    """Agreement by an error; what mends it, a convention or a focal length, is named. None if
+    the error is infinite and nothing mends it."""
+    ours = error(_same, 1.0)
     if ours < 1:
-        return Agreement(ours, count, len(found))
-    errors = {name: error(convention) for name, convention in CONVENTIONS.items()}
-    best = min(errors, key=lambda name: errors[name])
+        return Agreement(ours, evidence)
+    least, name = min((error(convention, 1.0), name) for name, convention in CONVENTIONS)
+    if least < MENDED * ours:
+        return Agreement(ours if np.isfinite(ours) else None, evidence, name)
+    if not np.isfinite(ours):
+        return None
+    zooms = [error(_same, zoom) for zoom in ZOOMS]
+    zoom = float(ZOOMS[int(np.argmin(zooms))])
+    if min(zooms) < MENDED * ours:
+        return Agreement(
+            ours, evidence, f"fit a focal length {zoom:.2f} times as long: correct the focal length"
+        )
     problem = ""
-    if errors[best] < MENDED * ours:
-        problem = best
-    elif ours > WRONG * width:
+    if ours > WRONG * width:
         problem = "do not belong to these pictures: check their order, their names and the lens"
-    return Agreement(ours, count, len(found), problem)
+    return Agreement(ours, evidence, problem)
+
+
+def _same(world_to_camera: np.ndarray) -> np.ndarray:
+    return world_to_camera
+
+
+def _directions(cameras: Sequence[Camera]) -> Agreement | None:
+    """Name the convention under which all cameras look at one place, if they do not now; None if
+    they do, and if it cannot be told."""
+    if len(cameras) < 3 or _seen(cameras, _same) > UNSEEN:
+        return None
+    for name, convention in CONVENTIONS:
+        if _seen(cameras, convention) >= SEEN:
+            return Agreement(None, "the directions of the cameras", name)
+    return None
+
+
+def _seen(cameras: Sequence[Camera], convention: Convention) -> float:
+    """Share of cameras in whose picture the point nearest to all optical axes is; 0 if they are
+    PARALLEL."""
+    poses = [convention(camera.world_to_camera) for camera in cameras]
+    axes = np.stack([pose[2, :3] for pose in poses])
+    mean = axes.mean(0)
+    if 1 - mean @ mean < PARALLEL:
+        return 0.0
+    eyes = [-pose[:3, :3].T @ pose[:3, 3] for pose in poses]
+    point = nearest_point(eyes, list(axes))
+    each = zip(cameras, poses, strict=True)
+    return float(np.mean([_projected(point[None], *one)[1].any() for one in each]))
+
+
+def _projected(
+    points: np.ndarray, camera: Camera, pose: np.ndarray, zoom: float = 1.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels [N,2] of points [N,3] in a camera with another pose and focal length, whether they lie
+    in its picture [N], and their depth [N]."""
+    x, y, z = pose[:3, :3] @ points.T + pose[:3, 3:]
+    K = camera.K
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = np.stack([zoom * K[0, 0] * x / z + K[0, 2], zoom * K[1, 1] * y / z + K[1, 2]], 1)
+    return pixels, in_image(camera, pixels, z), z
+
+
+def _depth_error(
+    one: Frame,
+    near: np.ndarray,
+    other: Frame,
+    far: np.ndarray,
+    convention: Convention,
+    zoom: float,
+) -> float:
+    """Median difference, as pixels at this depth, between the depth `far` of a frame and that of
+    the points which `one` sees at depth `near`, less those that are hidden; inf if too few are
+    seen."""
+    poses = [convention(frame.camera.world_to_camera) for frame in (one, other)]
+    step = max(1, int(np.sqrt(near.size / 20_000)))
+    row, column = np.nonzero(near[::step, ::step])
+    depth, camera = near[::step, ::step][row, column], one.camera
+    x = (step * column + 0.5 - camera.K[0, 2]) / (zoom * camera.K[0, 0]) * depth
+    y = (step * row + 0.5 - camera.K[1, 2]) / (zoom * camera.K[1, 1]) * depth
+    back = np.linalg.inv(poses[0])
+    points = np.stack([x, y, depth], 1) @ back[:3, :3].T + back[:3, 3]
+    pixels, inside, z = _projected(points, other.camera, poses[1], zoom)
+    column, row = pixels[inside].astype(int).T
+    z, depth = z[inside], far[row, column]
+    usable = (depth > 0) & (z < HIDDEN * depth)
+    if usable.sum() < max(LEAST_SEEN * len(points), 1):
+        return np.inf
+    return float(np.median(zoom * other.camera.K[0, 0] * np.abs(1 - depth[usable] / z[usable])))
 
 
 def _matches(one: Frame, other: Frame) -> tuple[np.ndarray, np.ndarray] | None:
@@ -124,19 +261,26 @@ def _matches(one: Frame, other: Frame) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _epipolar_error(
-    one: Camera, other: Camera, a: np.ndarray, b: np.ndarray, convention: object
+    one: Camera, other: Camera, a: np.ndarray, b: np.ndarray, convention: Convention, zoom: float
 ) -> np.ndarray:
     """Distance, pixels [N], of points matched in two pictures from the epipolar lines of each other
-    (Sampson's approximation)."""
-    poses = [camera.world_to_camera for camera in (one, other)]
-    if callable(convention):
-        poses = [convention(pose) for pose in poses]
+    (Sampson's approximation); inf where another convention puts them behind the cameras."""
+    poses = [convention(camera.world_to_camera) for camera in (one, other)]
     relative = poses[1] @ np.linalg.inv(poses[0])
     x, y, z = relative[:3, 3]
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    F = np.linalg.inv(other.K).T @ cross @ relative[:3, :3] @ np.linalg.inv(one.K)
+    scale = np.diag([1 / zoom, 1 / zoom, 1])  # of rays, by the focal length
+    rays, others = (scale @ np.linalg.inv(camera.K) for camera in (one, other))
+    F = others.T @ cross @ relative[:3, :3] @ rays
     a, b = (np.column_stack([points, np.ones(len(points))]) for points in (a, b))
     Fa, Fb = a @ F.T, b @ F
     value = np.abs((b * Fa).sum(1))
+    # Points on both rays: depth x R a + t = depth' x b. Epipolar lines do not tell the sign.
+    behind = np.zeros(len(a), bool)
+    if convention is not _same:
+        ahead, across = a @ (relative[:3, :3] @ rays).T, b @ others.T
+        across, base = np.cross(across, ahead), np.cross(across, [x, y, z])
+        depth = -(across * base).sum(1) / np.maximum((across**2).sum(1), 1e-30)
+        behind = (depth < 0) | (depth * ahead[:, 2] + z < 0)
     slope = np.sqrt((Fa[:, :2] ** 2).sum(1) + (Fb[:, :2] ** 2).sum(1))
-    return np.asarray(value / np.maximum(slope, 1e-30))
+    return np.where(behind, np.inf, value / np.maximum(slope, 1e-30))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from mgs.camera import Camera
+from mgs.data.agreement import observed
 from mgs.data.clouds import SparseCloud
 from mgs.data.dataset import FRAME_INTERVAL
 from mgs.data.lens import Lens
@@ -26,6 +27,9 @@ RECORDS = {
 }
 """Binary file -> bytes of a record, whether a name follows, format of the count of the list that
 follows ("": none of this kind), and bytes of each of its items (COLMAP's output formats)."""
+
+COMPARED = 20
+"""About the number of pictures whose points are compared with their poses."""
 
 
 def _is_whole(path: Path) -> bool:
@@ -111,7 +115,22 @@ def read_colmap(source: Path, models: list[Path], images: Path) -> Source:
         camera, lens = _camera(f"{model}: image {name!r}", image)
         path = images / PureWindowsPath(name) if not (images / name).exists() else images / name
         shots.append(Shot(frame_name(name), camera, lens, FRAME_INTERVAL * index, path))
-    return Source("COLMAP", shots, notes=tuple(notes), sparse=_cloud(reconstruction))
+    some = ordered[:: max(1, len(ordered) // COMPARED)]
+    fit = observed([_observed(image, reconstruction) for image in some])
+    return Source("COLMAP", shots, notes=tuple(notes), sparse=_cloud(reconstruction), fit=fit)
+
+
+def _observed(image: Any, reconstruction: Any) -> tuple[Camera, np.ndarray, np.ndarray]:
+    """Camera of an image without distortion, and points [N,3] with the pixels [N,2] of which they
+    were triangulated."""
+    marks = [mark for mark in image.points2D if mark.has_point3D()]
+    points = [reconstruction.points3D[mark.point3D_id].xyz for mark in marks]
+    rays = image.camera.cam_from_img(np.reshape([mark.xy for mark in marks], (-1, 2)))
+    pose = np.eye(4)
+    pose[:3] = image.cam_from_world().matrix()
+    K = np.diag([image.camera.mean_focal_length()] * 2 + [1.0])
+    size = image.camera.width, image.camera.height
+    return Camera(K, *size, pose), np.reshape(points, (-1, 3)), K[0, 0] * np.reshape(rays, (-1, 2))
 
 
 def _image_count(model: Path) -> int:

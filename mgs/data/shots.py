@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mgs.camera import Camera
+from mgs.data.agreement import Agreement
 from mgs.data.clouds import SparseCloud
 from mgs.data.lens import Lens
 from mgs.data.up import PLUS_Z, Up, degrees_between, up_of_cameras
@@ -56,7 +57,8 @@ class Source:
     left_out: number of listed images that are not imported, by reason. notes: lines for the user.
     sparse: triangulated points. up, unit ("m" or "unit"): None if the source does not say.
     no_cloud: file of points that the source names and that does not exist. tests: names of the
-    shots that the source sets apart. origin: what was subtracted from all positions.
+    shots that the source sets apart. origin: what was subtracted from all positions. fit: how well
+    poses and points fit.
     """
 
     kind: str
@@ -69,6 +71,7 @@ class Source:
     no_cloud: Path | None = None
     tests: frozenset[str] = frozenset()
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    fit: Agreement | None = None
 
     def in_metres(self, unit: float) -> Source:
         """Scale cameras and points by `unit` metres. Raises InputError unless it is positive."""

@@ -87,3 +87,12 @@ def in_mask(points: np.ndarray, frame: Frame) -> np.ndarray:
     column = np.clip(np.floor(pixels[:, 0]), 0, frame.camera.width - 1).astype(int)
     row = np.clip(np.floor(pixels[:, 1]), 0, frame.camera.height - 1).astype(int)
     return frame.mask()[row, column]
+
+
+def nearest_point(positions: Sequence[np.ndarray], directions: Sequence[np.ndarray]) -> np.ndarray:
+    """Point [3] nearest to lines in the least-squares sense. positions, directions (unit): [3]."""
+    A, b = np.zeros((3, 3)), np.zeros(3)
+    for position, direction in zip(positions, directions, strict=True):
+        across = np.eye(3) - np.outer(direction, direction)
+        A, b = A + across, b + across @ position
+    return np.linalg.lstsq(A, b, rcond=1e-9)[0]

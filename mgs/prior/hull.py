@@ -1,4 +1,4 @@
-"""The visual hull: the largest body inside the masks of all frames (Laurentini 1994), by carving.
+"""The visual hull: what lies inside the masks of all frames (Laurentini 1994), by carving.
 
 A point has a value per frame: its projection's distance inside the mask's outline, times the size
 of a pixel there. The least value is positive inside the hull; marching cubes find its surface.
@@ -17,10 +17,9 @@ from mgs.camera import Camera
 from mgs.data.frames import Frame
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh
-from mgs.data.visibility import in_image
+from mgs.data.visibility import in_image, nearest_point
 from mgs.errors import InputError
 from mgs.prior.surface import Surface
-from mgs.survey.fusion import nearest_point
 
 COARSE, REFINEMENTS = 48, 2
 """Cells along an edge of the first grid, and its refinements by two near the surface."""
@@ -42,6 +41,10 @@ LEAST_VIEWS = 3
 
 AGREEMENT = 0.8
 """Least median share of a mask that the hull must fill; above 0.95 where masks and poses fit."""
+
+LEAST_PIECE = 0.02
+"""Least volume of a piece of the hull over that of the largest. Smaller ones are specks, of masks
+that are not exact."""
 
 FEW = 0.1
 """Share of the frames that see a point of the object and may carve it by mistake."""
@@ -76,7 +79,7 @@ def visual_hull(
         field[tuple(near.T)] = _inside(views, lo + edge / cells * near, NEAR_SURFACE * edge / cells)
     cell = edge / cells
     smooth = np.clip(gaussian_filter(field, 1.0), field - cell / 2, field + cell / 2)
-    solid = np.pad(_largest(smooth), 1, constant_values=-cell)
+    solid = np.pad(_without_specks(smooth), 1, constant_values=-cell)
     vertices, faces, _, _ = marching_cubes(solid, 0.0, gradient_direction="ascent")
     vertices = lo + cell * (vertices.astype(np.float64) - 1)
     mesh = Mesh(vertices, faces.astype(np.int64), np.ones(len(faces), bool))
@@ -196,12 +199,13 @@ def _refined(field: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(fine)
 
 
-def _largest(field: np.ndarray) -> np.ndarray:
-    """The field, made negative outside its largest connected positive piece."""
+def _without_specks(field: np.ndarray) -> np.ndarray:
+    """The field, made negative in connected positive pieces under LEAST_PIECE."""
     pieces, _ = label(field > 0)
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0
-    return np.where((pieces == sizes.argmax()) | (field <= 0), field, -np.abs(field))
+    specks = np.append(True, sizes[1:] < LEAST_PIECE * sizes.max())
+    return np.where(specks[pieces], -np.abs(field), field)
 
 
 def _checked_agreement(

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from mgs.data.frames import Frame
+from mgs.data.visibility import nearest_point
 from mgs.errors import InputError
 from mgs.survey.depth_sensor import depth_noise, filter_depth
 
@@ -64,15 +65,6 @@ def focus(frames: Sequence[Frame]) -> Focus:
     positions = [camera.position for camera in cameras]
     point = nearest_point(positions, [camera.world_to_camera[2, :3] for camera in cameras])
     return Focus(point, float(np.median([np.linalg.norm(eye - point) for eye in positions])))
-
-
-def nearest_point(positions: Sequence[np.ndarray], directions: Sequence[np.ndarray]) -> np.ndarray:
-    """Point [3] nearest to lines in the least-squares sense. positions, directions (unit): [3]."""
-    A, b = np.zeros((3, 3)), np.zeros(3)
-    for position, direction in zip(positions, directions, strict=True):
-        across = np.eye(3) - np.outer(direction, direction)
-        A, b = A + across, b + across @ position
-    return np.linalg.lstsq(A, b, rcond=1e-9)[0]
 
 
 def usable_depth(depth: np.ndarray, size: int = 3) -> np.ndarray:
