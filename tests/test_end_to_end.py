@@ -153,7 +153,7 @@ def test_demo_shows_the_table_and_the_pictures_and_can_be_repeated(tmp_path, cap
     monkeypatch.setattr("mgs.reports.diagnostics.VIEWS", 1)
     command("demo", out)
     shown = capsys.readouterr().out
-    lines = shown.splitlines()
+    lines = shown[shown.index("4/4") :].splitlines()
     assert shown.count("test views (2): PSNR") == len(policies)
     table = json.loads((out / "report/table.json").read_text())
     for row in table:

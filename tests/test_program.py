@@ -115,4 +115,4 @@ def test_no_command_has_many_options():
     commands = typer.main.get_command(app).commands
     for name in COMMANDS:
         options = [p for p in commands[name].params if p.param_type_name == "option"]
-        assert len(options) <= (17 if name == "nbv" else 15), name
+        assert len(options) <= 15, name

@@ -15,7 +15,6 @@ import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
-from inspect import cleandoc
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +23,8 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from mgs import __version__
+from mgs.__main__ import from_interrupt
+from mgs.cli.options import Row, describe
 from mgs.cli.renamed import renewed
 from mgs.errors import InputError, Notice, missing, printable
 
@@ -68,16 +69,10 @@ RESUMABLE = ("synth-orbit", "import", "demo")
 """Commands that continue where they stopped when they are given again."""
 
 
-def _help(docstring: str | None) -> str:
-    """Join the lines of each paragraph, so that the terminal breaks them."""
-    paragraphs = cleandoc(docstring or "").split("\n\n")
-    return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
-
-
 class _Command(TyperCommand):
     """A command; the help of one with --set ends with a table of the settings."""
 
-    keys: Sequence[tuple[str, str, str]] = ()
+    keys: Sequence[Row] = ()
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Print the help of the command."""
@@ -102,11 +97,9 @@ class _Commands(Mapping[str, Any]):
         file, function = COMMANDS[name][0].split(".")
         called = getattr(import_module(f"mgs.cli.{file}"), function)
         alone = typer.Typer(add_completion=False)
-        alone.command(name, cls=_Command, help=_help(called.__doc__))(called)
+        alone.command(name, cls=_Command)(called)
         command: Any = typer.main.get_command(alone)
-        keys = getattr(called, "keys", ())
-        own = {parameter.name for parameter in command.params} | {"dataset", "prior"}
-        command.keys = [row for row in keys if row[0].removeprefix("train.") not in own]
+        describe(command, called.__doc__, getattr(called, "keys", ()))
         return command
 
 
@@ -178,7 +171,7 @@ def main(arguments: list[str] | None = None) -> None:
         lacks = missing(error.name) if isinstance(error, ModuleNotFoundError) else ""
         if lacks:
             raise _stop(lacks, 2) from None
-        if not _from_interrupt(error):
+        if not from_interrupt(error):
             raise
         code = INTERRUPTED
     if code == INTERRUPTED:  # typer turns Ctrl-C into this exit code and prints nothing
@@ -202,21 +195,13 @@ def _hint(arguments: Sequence[str]) -> str:
     runs = [after for option, after in pairwise(options) if option in ("--out", "--resume")]
     if command not in ("nbv", "fit") or not runs or not (Path(runs[-1]) / "config.json").is_file():
         return ""
-    live = [pair for pair in pairwise(options) if _of_capture(*pair)]
-    again = [part for pair in live for part in pair]
+    again = [
+        part  # what a run with live capture needs again
+        for option, value in pairwise(options)
+        if option.startswith("--capture-") or (option, value[:8]) == ("--set", "capture.")
+        for part in (option, value)
+    ]
     return f"; continue with: mgs nbv {shlex.join(['--resume', runs[-1], *again])}"
-
-
-def _of_capture(option: str, value: str) -> bool:
-    """Whether an option is about live capture, which a run that is resumed needs again."""
-    return option.startswith("--capture-") or (option == "--set" and value.startswith("capture."))
-
-
-def _from_interrupt(error: BaseException | None) -> bool:
-    """Whether Ctrl-C caused an exception: during a call, Dr.Jit raises one of its own."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
 
 
 def _system_error(error: OSError) -> str:
@@ -226,8 +211,7 @@ def _system_error(error: OSError) -> str:
     if error.filename is None:
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    shown = name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}..."
-    return f"{shown}: {error.strerror}; {CURES[error.errno or 0]}"
+    return f"{name[:LONGEST_NAME]}: {error.strerror}; {CURES[error.errno or 0]}"
 
 
 def _stop(message: str, code: int) -> SystemExit:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from mgs.cli.options import argument, option
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
@@ -14,14 +13,9 @@ from mgs.files import working_in
 
 
 def dataset(
-    action: Annotated[
-        Literal["check", "masks"],
-        argument("check or masks: see above."),
-    ],
-    path: Annotated[Path, argument("Folder of the dataset.")],
-    prior: Annotated[
-        Path | None, option("For masks: folder of the prior. Default: DATASET/prior.")
-    ] = None,
+    action: Literal["check", "masks"],
+    path: Path,
+    prior: Path | None = None,
 ) -> None:
     """Check a dataset, or make masks for one that has none.
 
@@ -31,6 +25,10 @@ def dataset(
 
     `mgs dataset masks DATASET` projects the prior's mesh into every image and writes masks/. Look
     at masks.png, which shows them, before you use them.
+
+    - action: check or masks: see above.
+    - path: Folder of the dataset.
+    - prior: For masks: folder of the prior. Default: DATASET/prior.
     """
     if action == "masks":
         _make_masks(path, prior or path / "prior")

@@ -5,48 +5,28 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from mgs.cli.nbv import resume_and_print, start_and_print
-from mgs.cli.options import (
-    DatasetFolder,
-    Force,
-    Gaussians,
-    Settings,
-    given,
-    merged,
-    option,
-    parse_gaussians,
-    parse_settings,
-    setting,
-    with_keys,
-)
-from mgs.run.settings import NbvSettings
+import typer
 
-PASSES = " Default: 30 with adaptive density or free means from photographs, else 10."
-MEANS = " Default: free from photographs or with adaptive density, else frozen."
-SH = " Default: 3 with adaptive density, 1 with free means from photographs, else 0."
-DENSITY = " Default: fixed. The defaults of adaptive are all those of 3DGS."
-LOSS = " Default: squared with frozen means, l1-dssim with free ones from photographs."
-"""Help of the settings that `mgs.run.nbv.start_fit` decides by the prior."""
+from mgs.cli.nbv import resume_and_print, start_and_print
+from mgs.cli.options import Settings, given, merged, parse_gaussians, parse_settings, with_keys
+from mgs.run.settings import NbvSettings
 
 
 @with_keys(NbvSettings, "train", "sh", "exposure", "pixel_noise", "prior_std", "seed")
 def fit(
-    dataset: DatasetFolder,
-    out: Annotated[Path, option("New folder for the run.")],
-    prior: Annotated[
-        Path | None,
-        option("Folder of `mgs prior`. Default: DATASET/prior, or one built in the run."),
-    ] = None,
-    gaussians: Gaussians = None,
-    passes: Annotated[int | None, setting(NbvSettings, "train.passes", PASSES)] = None,
-    means: Annotated[str | None, setting(NbvSettings, "train.means", MEANS)] = None,
-    sh: Annotated[int | None, setting(NbvSettings, "sh", SH)] = None,
-    density: Annotated[str | None, setting(NbvSettings, "train.density", DENSITY)] = None,
-    loss: Annotated[str | None, setting(NbvSettings, "train.loss", LOSS)] = None,
-    exposure: Annotated[bool | None, setting(NbvSettings, "exposure")] = None,
-    seed: Annotated[int | None, setting(NbvSettings, "seed")] = None,
+    dataset: Path,
+    out: Annotated[Path, typer.Option()],
+    prior: Path | None = None,
+    gaussians: str | None = None,
+    passes: int | None = None,
+    means: str | None = None,
+    sh: int | None = None,
+    density: str | None = None,
+    loss: str | None = None,
+    exposure: bool | None = None,
+    seed: int | None = None,
     settings: Settings = None,
-    force: Force = False,
+    force: bool = False,
 ) -> None:
     """Fit a model to all images of a dataset, and measure it.
 
@@ -55,6 +35,13 @@ def fit(
     colours have degree 0. Photographs without masks are fitted whole, unless --prior is given. Test
     views are never fitted. The output is a run folder like that of `mgs nbv`, so all commands for
     runs accept it.
+
+    - out: New folder for the run.
+    - passes: Default: 30 with adaptive density or free means from photographs, else 10.
+    - means: Default: free from photographs or with adaptive density, else frozen.
+    - sh: Default: 3 with adaptive density, 1 with free means from photographs, else 0.
+    - density: Default: fixed. The defaults of adaptive are all those of 3DGS.
+    - loss: Default: squared with frozen means, l1-dssim with free ones from photographs.
     """
     from mgs.cli.terminal import Terminal
     from mgs.run.nbv import start_fit

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+import typer
 
-from mgs.cli.options import Force, argument, option, parse_up
+from mgs.cli.options import parse_up
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
@@ -32,62 +33,19 @@ FILES = ("import.json", "transforms.json", "images", "depth", "masks", "rock", "
 
 
 def import_data(
-    source: Annotated[
-        Path,
-        argument(
-            "A transforms.json or a folder with one, a COLMAP model (sparse/0), ROS bag, Metashape "
-            "XML, or a folder of TUM RGB-D, Open3D or RTAB-Map."
-        ),
-    ],
-    out: Annotated[Path, option("Folder to write: new, empty, or left by an interrupted import.")],
-    images: Annotated[
-        Path | None,
-        option("Folder of the images (default: SOURCE/images), or topic of a bag."),
-    ] = None,
-    keyframes: Annotated[
-        str,
-        option("Of a recording, import frames at least this time or distance apart: 0.5s or 0.2m."),
-    ] = "0.5s",
-    masks: Annotated[
-        Path | None, option("Folder of masks, named like the images; the rock is white.")
-    ] = None,
-    mesh: Annotated[
-        Path | None,
-        option(
-            "Mesh of the rock, world coordinates; masks are its projections. "
-            "GLB is converted from +Y up to +Z up."
-        ),
-    ] = None,
-    downscale: Annotated[
-        int,
-        option("Average blocks of K x K pixels; 4 suits 12 megapixels.", min=1, metavar="K"),
-    ] = 1,
-    up: Annotated[
-        str,
-        option("Up direction: X,Y,Z in the source's world, or auto: from how cameras were held."),
-    ] = "auto",
-    unit: Annotated[
-        float | None,
-        option("Metres per unit of length of the source. Default: as the source says, if it does."),
-    ] = None,
-    test_every: Annotated[
-        int | None,
-        option(
-            "Make the first and every further Nth image, by name, a test view; 8 is usual.",
-            min=2,
-            metavar="N",
-        ),
-    ] = None,
-    pose: Annotated[
-        str | None,
-        option(
-            "Topic of a bag's poses of the camera, or of the body that carries it.", metavar="TOPIC"
-        ),
-    ] = None,
-    split: Annotated[
-        str, option("Split of NeRF-synthetic data to import: train, val or test.")
-    ] = "train",
-    force: Force = False,
+    source: Path,
+    out: Annotated[Path, typer.Option()],
+    images: Path | None = None,
+    keyframes: str = "0.5s",
+    masks: Path | None = None,
+    mesh: Path | None = None,
+    downscale: Annotated[int, typer.Option(min=1)] = 1,
+    up: str = "auto",
+    unit: float | None = None,
+    test_every: Annotated[int | None, typer.Option(min=2)] = None,
+    pose: str | None = None,
+    split: str = "train",
+    force: bool = False,
 ) -> None:
     """Make a dataset from your own data: cameras and images, with depth and masks if there are any.
     Lens distortion is undone.
@@ -95,6 +53,21 @@ def import_data(
     Masks come from --masks, else from --mesh, the source's own mask files, or the images' alpha.
     Partial alpha is kept in rock/, images of the rock alone. Points that came with the cameras are
     kept in sparse.ply for `mgs prior`. The same command continues an interrupted import.
+
+    - source: A transforms.json or a folder with one, a COLMAP model (sparse/0), ROS bag, Metashape
+      XML, or a folder of TUM RGB-D, Open3D or RTAB-Map.
+    - out: Folder to write: new, empty, or left by an interrupted import.
+    - images: Folder of the images (default: SOURCE/images), or topic of a bag.
+    - keyframes: Of a recording, import frames at least this time or distance apart: 0.5s or 0.2m.
+    - masks: Folder of masks, named like the images; the rock is white.
+    - mesh: Mesh of the rock, world coordinates; masks are its projections. GLB is converted from +Y
+      up to +Z up.
+    - downscale K: Average blocks of K x K pixels; 4 suits 12 megapixels.
+    - up: Up direction: X,Y,Z in the source's world, or auto: from how cameras were held.
+    - unit: Metres per unit of length of the source. Default: as the source says, if it does.
+    - test_every N: Make the first and every further Nth image, by name, a test view; 8 is usual.
+    - pose TOPIC: Topic of a bag's poses of the camera, or of the body that carries it.
+    - split: Split of NeRF-synthetic data to import: train, val or test.
     """
     from mgs.data.agreement import agreement
     from mgs.data.bags import is_bag

@@ -6,8 +6,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import typer
+
 from mgs import runtime
-from mgs.cli.options import Force, Runs, argument, given, option
+from mgs.cli.options import given
 from mgs.cli.printing import print_quality
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal, echo
@@ -15,21 +17,20 @@ from mgs.errors import InputError
 from mgs.files import below, check_new_file, folder_locked, working_in
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
 
+NOISE = (
+    "Of prune: allowed change of the training images, rms of a pixel, linear RGB. "
+    f"Default: {PRUNE_NOISE}."
+)
+LOSS = f"Of refit: allowed rise of the objective, dB. Default: {LEARN_LOSS}."
+
 if TYPE_CHECKING:
     from mgs.reports.simplify import PrunedRun, RefittedRun
 
 
 def evaluate(
-    subjects: Annotated[
-        list[Path],
-        argument("Folders that `mgs nbv` wrote, or PLY, GLB, SPZ.", metavar="RUN|SPLATS..."),
-    ],
-    dataset: Annotated[
-        Path | None, option("Dataset for a file. Default: that of the run whose folder holds it.")
-    ] = None,
-    pictures: Annotated[
-        bool, option("Write truth, render and difference of each view to RUN/renders.")
-    ] = True,
+    subjects: list[Path],
+    dataset: Path | None = None,
+    pictures: bool = True,
 ) -> None:
     """Measure PSNR and SSIM of models on test views, all views and held-out views; write
     RUN/metrics.json, and renders beside the truth.
@@ -39,6 +40,10 @@ def evaluate(
     are up to date are kept. The truth is the rock on black. PSNR and SSIM are over the full frame,
     and masked to the pixels of the rock. metrics.json also has the errors of alpha and depth, where
     the dataset has their truth.
+
+    - subjects RUN|SPLATS...: Folders that `mgs nbv` wrote, or PLY, GLB, SPZ.
+    - dataset: Dataset for a file. Default: that of the run whose folder holds it.
+    - pictures: Write truth, render and difference of each view to RUN/renders.
     """
     from mgs.reports.evaluation import evaluate as measured
     from mgs.reports.simplify import PRUNED, REFITTED
@@ -85,12 +90,9 @@ def _measured_run(
 
 
 def diagnose(
-    runs: Runs,
-    views: Annotated[
-        str | None,
-        option("Frames to draw, as kf_0003,kf_0010. Default: a few held-out ones."),
-    ] = None,
-    force: Force = False,
+    runs: list[Path],
+    views: str | None = None,
+    force: bool = False,
 ) -> None:
     """Draw maps of the Fisher information and the uncertainty of a run's model, for views and for
     Gaussians.
@@ -99,6 +101,8 @@ def diagnose(
     fisher.scale, fisher.rotation, fisher.opacity, information, uncertainty and unobserved, and a
     PNG that shows them; and information.ply, a point for each Gaussian, coloured by its
     information.
+
+    - views: Frames to draw, as kf_0003,kf_0010. Default: a few held-out ones.
     """
     from mgs.reports.diagnostics import diagnose as mapped
     from mgs.run.folder import open_run
@@ -120,37 +124,13 @@ def diagnose(
 
 
 def simplify(
-    runs: Runs,
-    method: Annotated[
-        Literal["prune", "refit"],
-        option("prune: fewer Gaussians, no new fit; refit: fewer parameters, fitted again."),
-    ] = "prune",
-    noise: Annotated[
-        float | None,
-        option(
-            "Of prune: allowed change of the training images, rms of a pixel, linear RGB. "
-            f"Default: {PRUNE_NOISE}."
-        ),
-    ] = None,
-    learn: Annotated[
-        str | None,
-        option(
-            "Of refit: auto (default), each Gaussian learns the kinds of parameters that the "
-            "evidence supports; all: all kinds."
-        ),
-    ] = None,
-    sh: Annotated[
-        str | None,
-        option("Of refit: SH degree 0, or auto (default): 1 if it predicts left-out views better."),
-    ] = None,
-    loss: Annotated[
-        float | None,
-        option(
-            "Of refit: allowed rise of the objective from parameters not learned, dB. "
-            f"Default: {LEARN_LOSS}."
-        ),
-    ] = None,
-    force: Force = False,
+    runs: list[Path],
+    method: Literal["prune", "refit"] = "prune",
+    noise: Annotated[float | None, typer.Option(help=NOISE)] = None,
+    learn: str | None = None,
+    sh: str | None = None,
+    loss: Annotated[float | None, typer.Option(help=LOSS)] = None,
+    force: bool = False,
 ) -> None:
     """Make the model of a run smaller; write RUN/gaussians_pruned.ply or gaussians_refitted.ply.
 
@@ -162,6 +142,11 @@ def simplify(
     degree. Parameters that are not learned keep the prior's values, and are marked in the file.
 
     No test view is used, and the run itself is not changed.
+
+    - method: prune: fewer Gaussians, no new fit; refit: fewer parameters, fitted again.
+    - learn: Of refit: auto (default), each Gaussian learns the kinds of parameters that the
+      evidence supports; all: all kinds.
+    - sh: Of refit: SH degree 0, or auto (default): 1 if it predicts left-out views better.
     """
     from mgs.reports.simplify import PRUNED, REFITTED, prune_run, refit_run
     from mgs.run.folder import open_run

@@ -9,19 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from pydantic import BaseModel, ConfigDict, Field
 
-from mgs.cli.options import (
-    Config,
-    Force,
-    Gaussians,
-    Settings,
-    argument,
-    given,
-    merged,
-    option,
-    parse_settings,
-    setting,
-    with_keys,
-)
+from mgs.cli.options import Settings, given, merged, parse_settings, with_keys
 from mgs.run.policies import POLICIES
 from mgs.run.policy_file import in_file
 from mgs.run.settings import NbvSettings, Positive, settings_in, validated
@@ -35,7 +23,7 @@ if TYPE_CHECKING:
 TYPED = "COMMANDLINE"
 """Name of the source of options that were given, not left at their default."""
 
-NAMES = f" Names (docs/nbv.md): {', '.join(POLICIES)}."
+NAMES = f"Names (docs/nbv.md): {', '.join(POLICIES)}."
 
 
 class Capture(BaseModel):
@@ -61,49 +49,21 @@ class _Keys(NbvSettings):
 @with_keys(_Keys)
 def nbv(
     context: typer.Context,
-    dataset: Annotated[
-        Path | None, argument("Dataset folder (transforms.json). Not needed with --resume.")
-    ] = None,
-    out: Annotated[Path | None, option("New folder for the run.")] = None,
-    prior: Annotated[
-        Path | None,
-        option("Folder of `mgs prior`. Default: DATASET/prior, or one built in the run."),
-    ] = None,
-    gaussians: Gaussians = None,
-    policy: Annotated[str | None, setting(NbvSettings, "policy", NAMES)] = None,
-    budget: Annotated[
-        str | None,
-        setting(
-            NbvSettings,
-            "budget",
-            " auto: as few as have the share `enough` of the gain of all candidates.",
-            "N|auto",
-        ),
-    ] = None,
-    seeds: Annotated[int | None, setting(NbvSettings, "seeds")] = None,
-    batch: Annotated[int | None, setting(NbvSettings, "batch")] = None,
-    seed: Annotated[int | None, setting(NbvSettings, "seed")] = None,
-    resume: Annotated[
-        Path | None,
-        option(
-            "Continue this run with the settings of its config.json. Give --policy FILE.py and "
-            "options of live capture again.",
-            metavar="RUN",
-        ),
-    ] = None,
-    capture_command: Annotated[
-        str | None,
-        option(
-            "Program that takes a picture: 'CMD {pose} {out}' reads a JSON file, writes a PNG.",
-            metavar="COMMAND",
-        ),
-    ] = None,
-    capture_folder: Annotated[
-        Path | None, option("Folder to which poses are written; pictures are awaited there.")
-    ] = None,
+    dataset: Annotated[Path | None, typer.Argument()] = None,
+    out: Path | None = None,
+    prior: Path | None = None,
+    gaussians: str | None = None,
+    policy: Annotated[str | None, typer.Option(help=NAMES)] = None,
+    budget: str | None = None,
+    seeds: int | None = None,
+    batch: int | None = None,
+    seed: int | None = None,
+    resume: Path | None = None,
+    capture_command: str | None = None,
+    capture_folder: Path | None = None,
     settings: Settings = None,
-    config: Config = None,
-    force: Force = False,
+    config: Path | None = None,
+    force: bool = False,
 ) -> None:
     """Choose the next best views: fit to a few seed views, choose a view, read its image, fit
     again.
@@ -111,6 +71,15 @@ def nbv(
     Ends when the budget is spent, or earlier by a `stop_` setting or a limit of the flight. Writes
     config.json, steps.jsonl (a line for each view), checkpoint.npz, gaussians.ply and metrics.json
     into the run folder. An interrupted run continues with --resume and chooses the same views.
+
+    - dataset: Dataset folder (transforms.json). Not needed with --resume.
+    - out: New folder for the run.
+    - budget N|auto: auto: as few as have the share `enough` of the gain of all candidates.
+    - resume RUN: Continue this run with the settings of its config.json. Give --policy FILE.py and
+      options of live capture again.
+    - capture_command COMMAND: Program that takes a picture: 'CMD {pose} {out}' reads a JSON file,
+      writes a PNG.
+    - capture_folder: Folder to which poses are written; pictures are awaited there.
     """
     from mgs.cli.options import parse_gaussians
     from mgs.cli.terminal import Terminal
@@ -209,7 +178,7 @@ def start_and_print(
 def resume_and_print(
     run: Path | Run,
     console: Terminal,
-    policy: str | None = None,
+    policy: Annotated[str | None, typer.Option(help=NAMES)] = None,
     pictures: bool = False,
     live: Live | None = None,
 ) -> None:

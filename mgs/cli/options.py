@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
+from inspect import cleandoc
 from typing import Annotated, Any, Literal, TypeVar
 
 import typer
@@ -15,48 +16,67 @@ from mgs.errors import InputError
 Command = TypeVar("Command", bound=Callable[..., None])
 
 
-def option(text: str, *flags: str, **more: Any) -> Any:
-    """A `typer.Option` with this help."""
-    return typer.Option(*flags, help=text, **more)
+SHARED = """Options of several commands.
+
+- runs RUN...: Folders that `mgs nbv` wrote.
+- dataset: Dataset folder (transforms.json).
+- prior: Folder of `mgs prior`. Default: DATASET/prior, or one built in the run.
+- gaussians N|auto: Build a prior of this many Gaussians in the run folder.
+- seed: Seed of all random draws: the same seed gives the same result.
+- settings KEY=VALUE: Any setting of the table below; repeatable.
+- config FILE.toml: File of settings with these keys, or the config.json of a run. Options override
+  it.
+- force: Replace an existing output.
+"""
+"""Help of options that several commands share."""
+
+PLACES = ("dataset", "prior")
+"""Settings that are folders, which commands take as arguments."""
+
+Row = tuple[str, str, str]
+"""Key, default and description of a setting."""
+
+Settings = Annotated[list[str] | None, typer.Option("--set")]
+Seed = Annotated[int, typer.Option(min=0)]
+Count = Annotated[int | None, typer.Option(min=1)]
 
 
-def argument(text: str, **more: Any) -> Any:
-    """A `typer.Argument` with this help."""
-    return typer.Argument(help=text, **more)
+def describe(command: Any, docstring: str, keys: Sequence[Row]) -> None:
+    """Set the help of a command and its options from the docstring of its function.
+
+    The list at its end has an item `- NAME METAVAR: help` for each option that is not in SHARED.
+    Where an option is a setting (keys: rows of `keys_of`), the text of the setting and its default
+    come first. A switch that is off by default has no form that turns it off. `keys` of the command
+    are the settings that are no option.
+    """
+    shared, settings = _items(SHARED)[1], {key.removeprefix("train."): row for key, *row in keys}
+    command.help, items = _items(docstring)
+    for parameter in command.params:
+        name = parameter.name
+        metavar, text = (shared | items).get(name, ("", parameter.help))
+        if name in settings and name not in PLACES:
+            default, of_setting = settings[name]
+            text = of_setting if name in shared else f"{of_setting} {text or ''}".strip()
+            text += f" Default: {default}." if default and "Default" not in text else ""
+        parameter.help, parameter.metavar = text, metavar or parameter.metavar
+        if "Default" in (text or ""):
+            parameter.show_default = False
+        if parameter.default is False:
+            parameter.secondary_opts = []
+    own = {*PLACES, *(parameter.name for parameter in command.params)}
+    command.keys = [row for row in keys if row[0].removeprefix("train.") not in own]
 
 
-def setting(model: type[BaseModel], key: str, more: str = "", metavar: str | None = None) -> Any:
-    """The option of a setting; its help is the docstring of the field, its default and `more`."""
-    name, default, text = next(row for row in keys_of(model) if row[0] == key)
-    flag = "--" + name.rpartition(".")[2].replace("_", "-")
-    shown = f" Default: {default}." if default and "Default" not in text + more else ""
-    return typer.Option(flag, help=f"{text}{shown}{more}", show_default=False, metavar=metavar)
+def _items(docstring: str) -> tuple[str, dict[str, tuple[str, str]]]:
+    """Text of a docstring, a line for each paragraph, and name -> (metavar, help) of its list."""
+    text, *items = re.split(r"\n\n?- ", cleandoc(docstring))
+    heads = [" ".join(item.split()).partition(": ") for item in items]
+    parts = [(*head.partition(" ")[::2], words) for head, _, words in heads]
+    paragraphs = [" ".join(paragraph.split()) for paragraph in text.split("\n\n")]
+    return "\n\n".join(paragraphs), {name: (metavar, words) for name, metavar, words in parts}
 
 
-Runs = Annotated[list[Path], argument("Folders that `mgs nbv` wrote.", metavar="RUN...")]
-DatasetFolder = Annotated[Path, argument("Dataset folder (transforms.json).")]
-Seed = Annotated[
-    int, option("Seed of all random draws: the same seed gives the same result.", min=0)
-]
-Force = Annotated[bool, option("Replace an existing output.", "--force")]
-Gaussians = Annotated[
-    str | None,
-    option("Build a prior of this many Gaussians in the run folder.", metavar="N|auto"),
-]
-Settings = Annotated[
-    list[str] | None,
-    option("Any setting of the table below; repeatable.", "--set", metavar="KEY=VALUE"),
-]
-Config = Annotated[
-    Path | None,
-    option(
-        "File of settings with these keys, or the config.json of a run. Options override it.",
-        metavar="FILE.toml",
-    ),
-]
-
-
-def keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str, str]]:
+def keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[Row]:
     """Key, default and description of each setting; keys of a model within it have a dot."""
     for name, field in model.model_fields.items():
         default, text = field.default, " ".join((field.description or "").split())

@@ -8,8 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
+import typer
+
 from mgs import runtime
-from mgs.cli.options import Force, argument, option
+from mgs.cli.options import Count
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import echo
 from mgs.errors import InputError
@@ -17,60 +19,33 @@ from mgs.files import check_new_folder, folder_locked
 
 
 def render(
-    subject: Annotated[
-        Path,
-        argument(
-            "Folder that `mgs nbv` wrote, or Gaussians of mgs or others: 3DGS PLY (binary, ascii, "
-            "compressed), GLB or SPZ.",
-            metavar="RUN|SPLATS",
-        ),
-    ],
-    out: Annotated[Path, option("Folder to write.")],
-    cameras: Annotated[
-        Path | None,
-        option(
-            "transforms.json (nerfstudio), or the dataset folder that holds it. Default: the run's."
-        ),
-    ] = None,
-    width: Annotated[
-        int | None,
-        option("Width in pixels; the height follows. Default: the cameras' own.", min=1),
-    ] = None,
-    colour_space: Annotated[
-        Literal["auto", "linear", "srgb"],
-        option(
-            "Space in which the colours are blended: mgs trains in linear RGB, most other tools in "
-            "sRGB. auto: what the file says, else srgb."
-        ),
-    ] = "auto",
-    antialiased: Annotated[
-        bool | None,
-        option(
-            "Whether Gaussians that are smaller than a pixel are fainter. Default: what the file "
-            "says, else not.",
-            "--antialiased/--no-antialiased",
-        ),
-    ] = None,
-    background: Annotated[
-        tuple[float, float, float],
-        option(
-            "Colour behind the Gaussians, sRGB, each from 0 to 1.",
-            metavar="R G B",
-            show_default="black",
-        ),
-    ] = (0.0, 0.0, 0.0),
-    exr: Annotated[
-        bool,
-        option(
-            "Write an EXR too: linear R G B, opacity A, z-depth Z in metres (0: none).", "--exr"
-        ),
-    ] = False,
-    force: Force = False,
+    subject: Path,
+    out: Annotated[Path, typer.Option()],
+    cameras: Path | None = None,
+    width: Count = None,
+    colour_space: Literal["auto", "linear", "srgb"] = "auto",
+    antialiased: bool | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    exr: bool = False,
+    force: bool = False,
 ) -> None:
     """Draw a run's model, or Gaussians from a file, through every camera of a transforms.json. The
     images it lists need not exist.
 
     Writes one PNG for each camera, with the name of the camera's image.
+
+    - subject RUN|SPLATS: Folder that `mgs nbv` wrote, or Gaussians of mgs or others: 3DGS PLY
+      (binary, ascii, compressed), GLB or SPZ.
+    - out: Folder to write.
+    - cameras: transforms.json (nerfstudio), or the dataset folder that holds it. Default: the
+      run's.
+    - width: Width in pixels; the height follows. Default: the cameras' own.
+    - colour_space: Space in which the colours are blended: mgs trains in linear RGB, most other
+      tools in sRGB. auto: what the file says, else srgb.
+    - antialiased: Whether Gaussians that are smaller than a pixel are fainter. Default: what the
+      file says, else not.
+    - background R G B: Colour behind the Gaussians, sRGB, each from 0 to 1. Default: black.
+    - exr: Write an EXR too: linear R G B, opacity A, z-depth Z in metres (0: none).
     """
     from mgs.data.dataset import load_cameras, load_origin
     from mgs.reports.exporting import read_model
@@ -104,18 +79,10 @@ def render(
 
 
 def view(
-    subject: Annotated[
-        Path,
-        argument("Folder that `mgs nbv` wrote, or a PLY, GLB or SPZ.", metavar="RUN|SPLATS"),
-    ],
-    port: Annotated[int, option("Port to serve on; 0: any free one.", min=0, max=65535)] = 8080,
-    host: Annotated[
-        str,
-        option("Address to serve on. With any but 127.0.0.1, other machines can reach the page."),
-    ] = "127.0.0.1",
-    follow: Annotated[
-        bool, option("Show every new step of a run in progress.", "--follow")
-    ] = False,
+    subject: Path,
+    port: Annotated[int, typer.Option(min=0, max=65535)] = 8080,
+    host: str = "127.0.0.1",
+    follow: bool = False,
 ) -> None:
     """Show a run or a model in the browser: Gaussians, mesh and cameras, turned by mouse, keyboard
     or touch.
@@ -123,6 +90,11 @@ def view(
     While the camera moves, the browser draws the Gaussians, without view-dependent colour. When it
     rests, mgs renders the exact image. Layers: colour, alpha, depth; for a run also information,
     uncertainty and unobserved. A click on a camera shows its image and its numbers. Ctrl-C ends it.
+
+    - subject RUN|SPLATS: Folder that `mgs nbv` wrote, or a PLY, GLB or SPZ.
+    - port: Port to serve on; 0: any free one.
+    - host: Address to serve on. With any but 127.0.0.1, other machines can reach the page.
+    - follow: Show every new step of a run in progress.
     """
     from mgs.view.server import Viewer
 

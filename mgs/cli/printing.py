@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich import box
-from rich.table import Column, Table
+from rich.table import Table
 
 from mgs.cli.terminal import Terminal
 
@@ -41,12 +41,6 @@ MEASURED = {
 """Metrics of steps.jsonl -> headings; a table of steps shows the first two that there are."""
 
 
-def fits(console: Terminal, table: Table) -> bool:
-    """Whether a table fits the width of the console without breaking a cell."""
-    unlimited = console.options.update(max_width=1 << 16)
-    return console.measure(table, options=unlimited).maximum <= console.width
-
-
 def settings_table(keys: Sequence[tuple[str, str, str]]) -> Table:
     """Table of settings: key, default and description of each."""
     table = Table("--set KEY=VALUE", "", box=box.SIMPLE_HEAD, pad_edge=False)
@@ -57,23 +51,7 @@ def settings_table(keys: Sequence[tuple[str, str, str]]) -> Table:
 
 
 def print_quality(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print the rows of `mgs.reports.tables.comparison_rows` as a table, for 80 columns.
-
-    Names that do not fit beside the numbers are printed below, by the number of their row.
-    """
-    names = [row["policy"] for row in rows]
-    whole = _quality("policy", names, rows)
-    if fits(console, whole):
-        console.print(whole)
-        return
-    numbers = [str(number) for number in range(1, len(rows) + 1)]
-    console.print(_quality("run", numbers, rows))
-    for number, name in zip(numbers, names, strict=True):
-        console.print(f"{number}: {name}", soft_wrap=True)
-
-
-def _quality(heading: str, first: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> Table:
-    """The table of `print_quality`. heading, first: its first column."""
+    """Print the rows of `mgs.reports.tables.comparison_rows` as a table, for 80 columns."""
     from mgs.reports.tables import has_held_out, table_cell
 
     tested, new = any("test.psnr" in row for row in rows), has_held_out(rows)
@@ -81,12 +59,12 @@ def _quality(heading: str, first: Sequence[str], rows: Sequence[Mapping[str, Any
     keys = ["images", *metrics, "coverage"]
     caption = "n: images; PSNR in dB, coverage in %"
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=caption)
-    table.add_column(heading, no_wrap=True)
+    table.add_column("policy", overflow="fold")
     for key in keys:
         table.add_column(_heading(key, new), justify="right", no_wrap=True)
-    for name, row in zip(first, rows, strict=True):
-        table.add_row(name, *(table_cell(key, row.get(key)) for key in keys))
-    return table
+    for row in rows:
+        table.add_row(row["policy"], *(table_cell(key, row.get(key)) for key in keys))
+    console.print(table)
 
 
 def _heading(key: str, new: bool) -> str:
@@ -114,11 +92,13 @@ def print_run(out: Path, state: Checkpoint, metrics: dict[str, Any], console: Te
 
 
 def _print_steps(steps: Sequence[Mapping[str, Any]], console: Terminal) -> None:
-    """Print the steps of a run as a table. Names that are too wide have a table of their own."""
+    """Print the steps of a run as a table."""
     measured = _measured(steps)
-    fitted = [MEASURED[key] for key in measured] or ["loss", "stopped"]
-    columns = ("step", "image", "score", "coverage", "passes", *fitted, "seconds")
-    rows = []
+    columns = ["step", "image", "score", "coverage", "passes"]
+    columns += [MEASURED[key] for key in measured] or ["loss", "stopped"]
+    table = Table(box=None)
+    for heading in (*columns, "seconds"):
+        table.add_column(heading, no_wrap=heading != "image", overflow="fold")
     for line in steps:
         names = [line["name"]] if line["name"] else line["seed_names"]
         score = "" if line["score"] is None else f"{line['score']:.4g}"
@@ -128,22 +108,8 @@ def _print_steps(steps: Sequence[Mapping[str, Any]], console: Terminal) -> None:
         if measured:
             fit[1:] = [f"{line[key]:.2f}" if key in line else "" for key in measured]
         coverage, seconds = f"{100 * line['coverage']:.2f} %", sum(line["seconds"].values())
-        row = (str(line["step"]), "\n".join(names), score, coverage, *fit, f"{seconds:.1f}")
-        rows.append(row)
-
-    def table(*shown: int) -> Table:
-        headings = (Column(columns[i], no_wrap=i != 1, overflow="fold") for i in shown)
-        made = Table(*headings, box=None)
-        for row in rows:
-            made.add_row(*(row[i] for i in shown))
-        return made
-
-    whole = table(*range(len(columns)))
-    if fits(console, whole):
-        console.print(whole)
-    else:
-        console.print(table(0, *range(2, len(columns))))
-        console.print(table(0, 1))
+        table.add_row(str(line["step"]), "\n".join(names), score, coverage, *fit, f"{seconds:.1f}")
+    console.print(table)
 
 
 def _measured(steps: Sequence[Mapping[str, Any]]) -> list[str]:

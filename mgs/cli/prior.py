@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.table import Table
 
-from mgs.cli.options import DatasetFolder, Force, Seed, option, parse_gaussians, parse_up
+from mgs.cli.options import Seed, parse_gaussians, parse_up
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
@@ -40,50 +40,18 @@ WHY = {
 
 
 def prior(
-    dataset: DatasetFolder,
-    out: Annotated[
-        Path | None, option("Folder to write, new or empty. Default: DATASET/prior.")
-    ] = None,
-    gaussians: Annotated[
-        str | None,
-        option(
-            "Number of Gaussians, on the surface and behind it. "
-            "Default: auto, as many as the closest camera resolves.",
-            metavar="N|auto",
-        ),
-    ] = None,
-    spacing: Annotated[
-        float | None,
-        option("Distance between samples, in the dataset's unit; in place of --gaussians."),
-    ] = None,
-    source: Annotated[
-        str | None,
-        option(
-            "Source of the surface: depth, points, hull (of the masks), mesh (--mesh) or random. "
-            "Default: the first of depth, points and hull that the dataset has, else random.",
-        ),
-    ] = None,
-    points: Annotated[
-        Path | None, option("PLY file of points for --source points, world coordinates.")
-    ] = None,
-    up: Annotated[
-        str | None,
-        option("Up direction: X,Y,Z, or auto: the ground's normal. Default: as the dataset says."),
-    ] = None,
-    mesh: Annotated[
-        Path | None,
-        option("Mesh to sample, world coordinates. GLB is converted from +Y up to +Z up."),
-    ] = None,
-    backing: Annotated[
-        float,
-        option("Gaussians behind the surface for each on it, to keep it opaque; in the paper 0."),
-    ] = 0.5,
-    poisson_depth: Annotated[
-        int | None,
-        option("Octree depth of the Poisson surface, 3 to 12. Default: from the cloud's density."),
-    ] = None,
+    dataset: Path,
+    out: Path | None = None,
+    gaussians: str | None = None,
+    spacing: float | None = None,
+    source: str | None = None,
+    points: Path | None = None,
+    up: str | None = None,
+    mesh: Path | None = None,
+    backing: float = 0.5,
+    poisson_depth: int | None = None,
     seed: Seed = 0,
-    force: Force = False,
+    force: bool = False,
 ) -> None:
     """Build the prior: a mesh of the rock, and points sampled on it, where the Gaussians start.
 
@@ -92,6 +60,19 @@ def prior(
     inside the masks or above the ground. From a hull: take the largest body inside all masks. Then
     spread samples evenly over the faces that some frame sees. Writes mesh.ply, points.ply,
     prior.json and prior.png.
+
+    - out: Folder to write, new or empty. Default: DATASET/prior.
+    - gaussians N|auto: Number of Gaussians, on the surface and behind it. Default: auto, as many as
+      the closest camera resolves.
+    - spacing: Distance between samples, in the dataset's unit; in place of --gaussians.
+    - source: Source of the surface: depth, points, hull (of the masks), mesh (--mesh) or random.
+      Default: the first of depth, points and hull that the dataset has, else random.
+    - points: PLY file of points for --source points, world coordinates.
+    - up: Up direction: X,Y,Z, or auto: the ground's normal. Default: as the dataset says.
+    - mesh: Mesh to sample, world coordinates. GLB is converted from +Y up to +Z up.
+    - backing: Gaussians behind the surface for each on it, to keep it opaque; in the paper 0.
+    - poisson_depth: Octree depth of the Poisson surface, 3 to 12. Default: from the cloud's
+      density.
     """
     from mgs.data.check import taken_frames
     from mgs.data.dataset import load_dataset

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Literal
 
 from mgs import runtime
-from mgs.cli.options import Force, argument, option
 from mgs.cli.printing import print_quality
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal, echo
@@ -16,22 +15,11 @@ from mgs.files import check_new_file, folder_locked
 
 
 def report(
-    runs: Annotated[list[Path], argument("Run folders, or folders of them; all of one dataset.")],
-    out: Annotated[
-        Path | None,
-        option(
-            "Folder for the figures and the table.",
-            show_default="report; with --html none",
-        ),
-    ] = None,
-    figures: Annotated[
-        str | None, option("Format of the figures.", metavar="png|pdf|svg", show_default="png")
-    ] = None,
-    html: Annotated[
-        Path | None,
-        option("Interactive HTML page to write; one file that opens without a network."),
-    ] = None,
-    force: Force = False,
+    runs: list[Path],
+    out: Path | None = None,
+    figures: Literal["png", "pdf", "svg"] | None = None,
+    html: Path | None = None,
+    force: bool = False,
 ) -> None:
     """Compare runs: draw the orbit, information gain, coverage, PSNR against images and one test
     view, and make a table.
@@ -41,11 +29,12 @@ def report(
     nothing is computed again.
 
     The page of --html takes unfinished runs, too, and draws the model that the run folder holds.
-    """
-    from mgs.plotting import FORMATS
 
-    if figures not in (None, *FORMATS):
-        raise InputError(f"--figures {figures}: unknown; choose one of {', '.join(FORMATS)}")
+    - runs: Run folders, or folders of them; all of one dataset.
+    - out: Folder for the figures and the table. Default: report; with --html none.
+    - figures: Format of the figures. Default: png.
+    - html: Interactive HTML page to write; one file that opens without a network.
+    """
     if figures and html is not None and out is None:
         raise InputError(f"--figures {figures}: --html alone writes no figures; give --out, too")
     if html is not None:

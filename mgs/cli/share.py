@@ -7,7 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from mgs.cli.options import Force, Runs, argument, option
+import typer
+
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import echo
 from mgs.errors import InputError
@@ -18,40 +19,27 @@ if TYPE_CHECKING:
 
 
 def export(
-    models: Annotated[
-        list[Path],
-        argument("Folders that `mgs nbv` wrote, or PLY, GLB, SPZ.", metavar="RUN|SPLATS..."),
-    ],
-    to: Annotated[
-        Literal["glb", "spz", "ply", "compressed-ply", "nerfstudio", "colmap"],
-        option(
-            "glb: glTF with KHR_gaussian_splatting; spz: needs gsply; compressed-ply: 4 times "
-            "smaller than ply. nerfstudio, colmap: the run's views, a folder to train on."
-        ),
-    ] = "glb",
-    out: Annotated[
-        Path | None, option("File to write. Default: export.* in the run; for a file, beside it.")
-    ] = None,
-    colour_space: Annotated[
-        Literal["srgb", "linear"],
-        option(
-            "Colours to write: sRGB, as viewers expect, or linear RGB, as they were fitted. Those "
-            "of a linear run are fitted once more, blended in sRGB."
-        ),
-    ] = "srgb",
-    sh: Annotated[
-        int | None,
-        option("Raise the SH degree, for programs that read degree 3 only.", min=0, max=3),
-    ] = None,
-    views: Annotated[
-        Literal["taken", "all"], option("Views of nerfstudio and colmap: those taken, or all.")
-    ] = "taken",
-    force: Force = False,
+    models: list[Path],
+    to: Literal["glb", "spz", "ply", "compressed-ply", "nerfstudio", "colmap"] = "glb",
+    out: Path | None = None,
+    colour_space: Literal["srgb", "linear"] = "srgb",
+    sh: Annotated[int | None, typer.Option(min=0, max=3)] = None,
+    views: Literal["taken", "all"] = "taken",
+    force: bool = False,
 ) -> None:
     """Write a model for other programs: viewers, game engines, web pages; or the views that a run
     chose, for programs that train on them: cameras, images, masks, depth and points.
 
     All formats can also be read, so the command converts between them, too.
+
+    - models RUN|SPLATS...: Folders that `mgs nbv` wrote, or PLY, GLB, SPZ.
+    - to: glb: glTF with KHR_gaussian_splatting; spz: needs gsply; compressed-ply: 4 times smaller
+      than ply. nerfstudio, colmap: the run's views, a folder to train on.
+    - out: File to write. Default: export.* in the run; for a file, beside it.
+    - colour_space: Colours to write: sRGB, as viewers expect, or linear RGB, as they were fitted.
+      Those of a linear run are fitted once more, blended in sRGB.
+    - sh: Raise the SH degree, for programs that read degree 3 only.
+    - views: Views of nerfstudio and colmap: those taken, or all.
     """
     from mgs.reports.exporting import read_model, to_y_up
     from mgs.splat_files import FORMATS, write_gaussians
@@ -135,46 +123,28 @@ def _targets(
 
 
 def video(
-    runs: Runs,
-    out: Annotated[
-        Path | None,
-        option("File to write: .mp4 (needs imageio-ffmpeg), .gif or .png. Default: RUN/video.mp4."),
-    ] = None,
-    path: Annotated[
-        Literal["turntable", "spiral", "cameras"] | None,
-        option(
-            "Camera path: a circle (default), two turns that rise and fall, or through the "
-            "dataset's cameras."
-        ),
-    ] = None,
-    beside: Annotated[
-        Literal["truth", "uncertainty"] | None,
-        option(
-            "Second picture: the true images, at the dataset's own views, or the map of what is "
-            "unknown."
-        ),
-    ] = None,
-    story: Annotated[
-        bool,
-        option("Show the model after each view of the run; repeats the fits.", "--story"),
-    ] = False,
-    seconds: Annotated[
-        float | None,
-        option(
-            "Length, seconds. Default: 8, or 1 per view with --story or --beside truth.",
-            min=0.1,
-            max=3600,
-        ),
-    ] = None,
-    fps: Annotated[
-        int | None, option("Frames per second along a path. Default: 25.", min=1, max=60)
-    ] = None,
-    width: Annotated[
-        int | None, option("Width of a picture in pixels. Default: the cameras' own.", min=16)
-    ] = None,
-    force: Force = False,
+    runs: list[Path],
+    out: Path | None = None,
+    path: Literal["turntable", "spiral", "cameras"] | None = None,
+    beside: Literal["truth", "uncertainty"] | None = None,
+    story: bool = False,
+    seconds: Annotated[float | None, typer.Option(min=0.1, max=3600)] = None,
+    fps: Annotated[int | None, typer.Option(min=1, max=60)] = None,
+    width: Annotated[int | None, typer.Option(min=16)] = None,
+    force: bool = False,
 ) -> None:
-    """Make a video of each run: a camera path around its model, or the model view by view."""
+    """Make a video of each run: a camera path around its model, or the model view by view.
+
+    - out: File to write: .mp4 (needs imageio-ffmpeg), .gif or .png. Default: RUN/video.mp4.
+    - path: Camera path: a circle (default), two turns that rise and fall, or through the dataset's
+      cameras.
+    - beside: Second picture: the true images, at the dataset's own views, or the map of what is
+      unknown.
+    - story: Show the model after each view of the run; repeats the fits.
+    - seconds: Length, seconds. Default: 8, or 1 per view with --story or --beside truth.
+    - fps: Frames per second along a path. Default: 25.
+    - width: Width of a picture in pixels. Default: the cameras' own.
+    """
     from mgs import runtime
     from mgs.reports.story import story_frames
     from mgs.reports.video import check_film, path_frames, write_film

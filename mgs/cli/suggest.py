@@ -11,22 +11,12 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from rich.table import Table
 
 from mgs import runtime
-from mgs.cli.options import (
-    Force,
-    Settings,
-    argument,
-    given,
-    option,
-    parse_gaussians,
-    parse_settings,
-    setting,
-    with_keys,
-)
+from mgs.cli.options import Count, Settings, given, parse_gaussians, parse_settings, with_keys
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
-from mgs.run.settings import ENOUGH, FlightLimits, NbvSettings, Positive, validated
+from mgs.run.settings import ENOUGH, FlightLimits, Positive, validated
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -78,44 +68,18 @@ class Candidates(BaseModel):
 
 @with_keys(Candidates)
 def suggest(
-    source: Annotated[Path, argument("Dataset folder, or folder of a run.", metavar="DATASET|RUN")],
-    poses: Annotated[
-        Path | None,
-        option("Candidates: a transforms.json without images, or a CSV with columns x,y,z."),
-    ] = None,
-    dome: Annotated[int | None, option("Candidates: poses on a dome.", min=1, metavar="N")] = None,
-    views: Annotated[
-        str,
-        option(
-            "Views to plan together, in flying order; with a limit of the flight, at most. auto: "
-            "as few as have the share `enough` of the gain of all candidates.",
-            metavar="N|auto",
-        ),
-    ] = "1",
-    out: Annotated[
-        Path | None,
-        option("New folder for suggestions.json, transforms.json and suggestions.png."),
-    ] = None,
-    plan: Annotated[
-        list[Path] | None,
-        option("Flight plan to write: .plan, .waypoints or .kml; repeatable. Needs --origin."),
-    ] = None,
-    origin: Annotated[
-        str | None,
-        option("Where the world's origin is: LAT,LON,ALT or, if +Y is not north, ...,BEARING."),
-    ] = None,
-    policy: Annotated[
-        str | None,
-        setting(NbvSettings, "policy", " Default: that of the run, or of `mgs nbv`."),
-    ] = None,
-    prior: Annotated[
-        Path | None, option("Folder of `mgs prior`. Default: DATASET/prior, or one built now.")
-    ] = None,
-    gaussians: Annotated[
-        str | None, option("Build a prior of this many Gaussians.", metavar="N|auto")
-    ] = None,
+    source: Path,
+    poses: Path | None = None,
+    dome: Count = None,
+    views: str = "1",
+    out: Path | None = None,
+    plan: list[Path] | None = None,
+    origin: str | None = None,
+    policy: str | None = None,
+    prior: Path | None = None,
+    gaussians: str | None = None,
     settings: Settings = None,
-    force: Force = False,
+    force: bool = False,
 ) -> None:
     """Rank candidate poses by what a picture from each would add; plan the next flight.
 
@@ -124,6 +88,18 @@ def suggest(
     candidates are by default the frames that it has not taken. With --views K it plans K views
     together and puts them into flying order, from the first image and back to it. Lengths are in
     the dataset's unit.
+
+    - source DATASET|RUN: Dataset folder, or folder of a run.
+    - poses: Candidates: a transforms.json without images, or a CSV with columns x,y,z.
+    - dome N: Candidates: poses on a dome.
+    - views N|auto: Views to plan together, in flying order; with a limit of the flight, at most.
+      auto: as few as have the share `enough` of the gain of all candidates.
+    - out: New folder for suggestions.json, transforms.json and suggestions.png.
+    - plan: Flight plan to write: .plan, .waypoints or .kml; repeatable. Needs --origin.
+    - origin: Where the world's origin is: LAT,LON,ALT or, if +Y is not north, ...,BEARING.
+    - policy: Default: that of the run, or of `mgs nbv`.
+    - prior: Folder of `mgs prior`. Default: DATASET/prior, or one built now.
+    - gaussians N|auto: Build a prior of this many Gaussians.
     """
     from mgs.data.flight_plan import check_plan_path, parse_origin
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from rich.table import Table
 
-from mgs.cli.options import Force, Seed, argument, option
+from mgs.cli.options import Seed
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.files import Ours, atomic_folder, below
@@ -20,33 +20,26 @@ FILES = [
 
 
 def survey(
-    dataset: Annotated[Path, argument("Dataset folder (transforms.json) with exact depth images.")],
-    out: Annotated[
-        Path | None, option("Folder to write, new or empty. Default: DATASET/survey.")
-    ] = None,
-    poses: Annotated[
-        Literal["estimated", "exact"],
-        option("estimated: by odometry, registration and loop closure. exact: the true poses."),
-    ] = "estimated",
-    sensor_noise: Annotated[
-        float | None,
-        option(
-            "Factor on the depth camera's noise; 0: exact depth. "
-            "Default: as the dataset's scene says, else 1."
-        ),
-    ] = None,
-    drift: Annotated[
-        float | None,
-        option("Factor on the errors of odometry. Default: as the dataset's scene says, else 1."),
-    ] = None,
+    dataset: Path,
+    out: Path | None = None,
+    poses: Literal["estimated", "exact"] = "estimated",
+    sensor_noise: float | None = None,
+    drift: float | None = None,
     seed: Seed = 0,
-    force: Force = False,
+    force: bool = False,
 ) -> None:
     """Simulate a survey flight along a dataset's orbit: noisy depth, drifting odometry,
     registration, loop closure and fusion.
 
     The result is a dataset with estimated poses and measured depth, from which `mgs prior OUT`
     builds a prior. The folder also holds cloud.ply, survey.json and survey.png.
+
+    - dataset: Dataset folder (transforms.json) with exact depth images.
+    - out: Folder to write, new or empty. Default: DATASET/survey.
+    - poses: estimated: by odometry, registration and loop closure. exact: the true poses.
+    - sensor_noise: Factor on the depth camera's noise; 0: exact depth. Default: as the dataset's
+      scene says, else 1.
+    - drift: Factor on the errors of odometry. Default: as the dataset's scene says, else 1.
     """
     from mgs.data.dataset import load_dataset
     from mgs.survey.flight import SurveySettings, fly

@@ -9,9 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
+import typer
+
 from mgs import runtime
 from mgs.camera import MAX_PIXELS
-from mgs.cli.options import Force, Seed, argument, option
+from mgs.cli.options import Count, Seed
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError, row_named
@@ -26,61 +28,22 @@ FILES = [
 
 
 def synth_orbit(
-    out: Annotated[Path, argument("Folder to write: new, empty, or left by an interrupted run.")],
-    scene: Annotated[
-        str, option("Name of a scene that comes with mgs, or path of a .toml file.")
-    ] = "boulder",
-    orbit: Annotated[
-        str | None, option("circle, rings, spiral or hemisphere. Default: the scene's.")
-    ] = None,
-    distances: Annotated[
-        str | None,
-        option(
-            "Factors on the distance of the frames from the rock, in turn, as in 1,2,3. "
-            "Default: the scene's."
-        ),
-    ] = None,
-    mesh: Annotated[
-        Path | None, option("A real rock: textured GLB, OBJ or PLY, scaled to the scene.")
-    ] = None,
-    mesh_up: Annotated[
-        Literal["y", "z"] | None,
-        option("Up axis of --mesh. Default: y for GLB (as glTF says) and OBJ, else z."),
-    ] = None,
-    preset: Annotated[
-        str, option("quick: 32 frames of 320x240. paper: 100 frames of 640x480.")
-    ] = "quick",
-    spp: Annotated[
-        int | None,
-        option("Samples per pixel, rounded up to a full grid. Default: as --preset says.", min=1),
-    ] = None,
-    frames: Annotated[
-        int | None, option("Number of views on the orbit. Default: as --preset says.", min=1)
-    ] = None,
-    size: Annotated[
-        str | None, option("Image size WIDTHxHEIGHT, pixels. Default: as --preset says.")
-    ] = None,
-    test_views: Annotated[
-        int, option("Number of test views on a dome around the rock, in OUT/test.", min=0)
-    ] = 0,
-    on_demand: Annotated[
-        bool,
-        option(
-            "Render no frames yet, only test views and a survey for `mgs prior`; "
-            "`mgs nbv OUT` renders each frame that it chooses.",
-            "--on-demand",
-        ),
-    ] = False,
-    pose_noise: Annotated[
-        float,
-        option(
-            "Error of camera positions in transforms.json: standard deviation per axis, metres.",
-            min=0,
-        ),
-    ] = 0.0,
-    rotation_noise: Annotated[float, option("The same of camera rotations, degrees.", min=0)] = 0.0,
+    out: Path,
+    scene: str = "boulder",
+    orbit: str | None = None,
+    distances: str | None = None,
+    mesh: Path | None = None,
+    mesh_up: Literal["y", "z"] | None = None,
+    preset: str = "quick",
+    spp: Count = None,
+    frames: Count = None,
+    size: str | None = None,
+    test_views: Annotated[int, typer.Option(min=0)] = 0,
+    on_demand: bool = False,
+    pose_noise: Annotated[float, typer.Option(min=0)] = 0.0,
+    rotation_noise: Annotated[float, typer.Option(min=0)] = 0.0,
     seed: Seed = 0,
-    force: Force = False,
+    force: bool = False,
 ) -> None:
     """Render a dataset with Mitsuba: an orbit around a rock, with photoreal images, depth, rock
     masks and exact poses.
@@ -91,6 +54,23 @@ def synth_orbit(
 
     With --on-demand it writes poses, test views and a survey (depth and masks, in OUT/survey). The
     image of a frame is rendered when `mgs nbv` chooses it.
+
+    - out: Folder to write: new, empty, or left by an interrupted run.
+    - scene: Name of a scene that comes with mgs, or path of a .toml file.
+    - orbit: circle, rings, spiral or hemisphere. Default: the scene's.
+    - distances: Factors on the distance of the frames from the rock, in turn, as in 1,2,3. Default:
+      the scene's.
+    - mesh: A real rock: textured GLB, OBJ or PLY, scaled to the scene.
+    - mesh_up: Up axis of --mesh. Default: y for GLB (as glTF says) and OBJ, else z.
+    - preset: quick: 32 frames of 320x240. paper: 100 frames of 640x480.
+    - spp: Samples per pixel, rounded up to a full grid. Default: as --preset says.
+    - frames: Number of views on the orbit. Default: as --preset says.
+    - size: Image size WIDTHxHEIGHT, pixels. Default: as --preset says.
+    - test_views: Number of test views on a dome around the rock, in OUT/test.
+    - on_demand: Render no frames yet, only test views and a survey for `mgs prior`; `mgs nbv OUT`
+      renders each frame that it chooses.
+    - pose_noise: Error of camera positions in transforms.json: standard deviation per axis, metres.
+    - rotation_noise: The same of camera rotations, degrees.
     """
     runtime.start()
     from mgs.synth.orbit import PoseNoise
