@@ -24,10 +24,9 @@ from mgs.camera import Camera
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import TEST_FOLDER, Dataset
 from mgs.data.frames import Frame, as_captured
-from mgs.errors import InputError
 from mgs.files import atomic_path
 from mgs.gaussians import Gaussians
-from mgs.images import PNG_LEVEL, read_png
+from mgs.images import PNG_LEVEL
 from mgs.memory import IMAGE_BYTES, kept_within
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_psnr, compare_surface
 
@@ -258,18 +257,3 @@ def write_comparison(
         draw.text(((i + 0.5) * width, size), caption, fill=(0, 0, 0), font=font, anchor="mm")
     with atomic_path(path) as temporary:
         picture.save(temporary, format="PNG", compress_level=PNG_LEVEL)
-
-
-def read_comparison(path: str | Path, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Read truth and render, linear RGB [H,W,3], rounded to 8 bits, out of a picture of
-    `write_comparison`.
-
-    camera: of the view. Raises InputError if the picture is missing, damaged or not of this
-    camera's size.
-    """
-    pixels, (height, width) = read_png(path), (camera.height, camera.width)
-    if pixels.shape[0] <= height or pixels.shape[1] != 3 * width:
-        raise InputError(
-            f"{path}: is not a comparison of {width}x{height} views; write it again with `mgs eval`"
-        )
-    return pixels[-height:, :width], pixels[-height:, width : 2 * width]

@@ -14,7 +14,7 @@ import numpy as np
 from mgs.files import atomic_path, write_csv, write_json
 from mgs.plotting import NO_GRID, STYLE, drawing
 from mgs.provenance import versions
-from mgs.reports.figures import POLICY_STYLE
+from mgs.reports.figures import POLICY_STYLE, STYLES
 from mgs.reports.tables import markdown
 from mgs.runtime import processor
 from studies.statistics import interval
@@ -184,7 +184,7 @@ def _size(panel: Panel, rows: Sequence[Row]) -> tuple[float, float]:
 def group_styles(groups: Sequence[Any]) -> list[dict[str, Any]]:
     """Keywords for matplotlib: policies as in all figures, else in that order."""
     of_policies = all(group in POLICY_STYLE for group in groups)
-    looks = [POLICY_STYLE[one] for one in groups] if of_policies else cycle(POLICY_STYLE.values())
+    looks = [POLICY_STYLE[one] for one in groups] if of_policies else cycle(STYLES)
     pairs = zip(groups, looks, strict=False)
     return [{"color": c, "marker": m, "label": group} for group, (c, m) in pairs]
 

@@ -82,7 +82,8 @@ def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys):
     assert numbers["spacing"] == pytest.approx(PIXELS_PER_SAMPLE * pixel, rel=0.01)
     assert 1.4 / 52.8 < pixel < 2.6 / 52.8  # between the nearest and the farthest point of the rock
     said = capsys.readouterr().out
-    assert f"{numbers['n'] + numbers['backed']:,} Gaussians, since the closest pixel covers" in said
+    assert f"samples lie {PIXELS_PER_SAMPLE:.3g} pixels apart" in said
+    assert f"{numbers['n'] + numbers['backed']:,}: a sample each" in said
 
 
 def test_surfaces_from_photographs_have_fewer_samples(data):

@@ -39,6 +39,54 @@ WHY = {
 """Reason for a source that was not asked for."""
 
 
+LENGTHS = {
+    *("depth_noise", "voxel", "plane_sigma", "plane_tolerance", "eps", "cloud_spacing", "radius"),
+    *("hull_cell", "fit_rms", "pixel", "accuracy", "completeness", "chamfer", "hausdorff"),
+}
+"""Keys of prior.json that are lengths."""
+
+ROWS = (
+    ("pixels", "depth pixels in the cloud", "{pixels:,}, noise {depth_noise}"),
+    ("voxel", "points of the fused cloud", "{points:,} on a {voxel} grid"),
+    ("points_kept", "points", "{points:,}, {points_kept:,} of them well triangulated"),
+    (
+        "plane_inliers",
+        "ground plane inliers (RANSAC)",
+        "{plane_inliers:,} within {plane_tolerance} (sigma {plane_sigma})",
+    ),
+    (
+        "eps",
+        "rock cluster (DBSCAN)",
+        "{cluster_size:,} points, one of {clusters} clusters, eps {eps}",
+    ),
+    ("cloud_spacing", "points of the rock", "{cluster_size:,}, {cloud_spacing} apart"),
+    ("hull_cell", "visual hull", "cells of {hull_cell}, fills {hull_fills_masks:.1%} of the masks"),
+    ("fit_rms", "cloud to mesh, rms", "{fit_rms}"),
+    ("poisson_depth", "octree depth (Poisson)", "{poisson_depth}"),
+    ("mesh_faces", "mesh", "{mesh_faces:,} faces, {mesh_area:.4f} {unit}²"),
+    ("sampled_area", "area that some frame sees, A", "{sampled_area:.4f} {unit}²"),
+    ("sampled_area", "samples, N = A / spacing²", "{n:,} = {sampled_area:.4f} / {spacing:.6f}²"),
+    ("apart", "closest pixel, on the surface", "{pixel}; samples lie {apart:.3g} pixels apart"),
+    ("radius", "points of the cameras", "{triangulated:,}"),
+    ("radius", "points in all", "{n:,}, in and around a ball of radius {radius}"),
+    ("sum", "Gaussians", "{sum:,}: a sample each, and {backed:,} behind the surface"),
+    ("colour_agreement", "colour variance that all frames agree on", "{colour_agreement:.0%}"),
+    ("outline_error", "outline against masks, median", "{outline_error:.2%} of pixels"),
+    ("up", "up", "{up}"),
+    ("accuracy", "accuracy to the true rock", "{accuracy}"),
+    ("completeness", "completeness to the true rock", "{completeness}"),
+    ("chamfer", "chamfer distance to the true rock", "{chamfer}"),
+    ("hausdorff", "hausdorff distance to the true rock", "{hausdorff}"),
+    ("visible_share", "true surface seen by some frame", "{visible_share:.2%} above the ground"),
+    (
+        "visible_within_2_spacing",
+        "seen surface within 2 spacings",
+        "{visible_within_2_spacing:.2%}",
+    ),
+)
+"""Rows of the printed table: key of prior.json without which it is left out, label, text."""
+
+
 def prior(
     dataset: Path,
     out: Path | None = None,
@@ -110,20 +158,17 @@ def prior(
             console.print(f"prior from {chosen}" + ("" if source or points else WHY[chosen]))
             options = {"source": chosen, "points": points, "up": upward}
             result, segmented = _built(loaded, settings, folder, progress, **options)
-        if result.numbers["from"] != "random" and not loaded.on_demand:
-            progress("colours of the surface")
-            agreed = colour_agreement(result, loaded.frames)
-            if not math.isnan(agreed):
-                numbers = result.numbers | {"colour_agreement": agreed}
-                result = replace(result, numbers=numbers)
         if result.numbers["from"] != "random":
+            progress("colours of the surface")
+            agreed = math.nan if loaded.on_demand else colour_agreement(result, loaded.frames)
             wrong = outline_error(result.mesh, taken_frames(loaded))
-            if not math.isnan(wrong):
-                result = replace(result, numbers=result.numbers | {"outline_error": wrong})
+            checks = {"colour_agreement": agreed, "outline_error": wrong}
+            known = {key: value for key, value in checks.items() if not math.isnan(value)}
+            result = replace(result, numbers=result.numbers | known)
         progress("figure")
         save_prior(unfinished, result)
         draw_prior(unfinished / "prior.png", result, segmented)
-    console.print(_random(result.numbers) if "radius" in result.numbers else _table(result.numbers))
+    console.print(_table(result.numbers))
     agreed = result.numbers.get("colour_agreement", 1.0)
     if agreed < AGREEMENT:
         console.print(
@@ -139,8 +184,6 @@ def prior(
             "masks and poses do not fit",
             soft_wrap=True,
         )
-    if "resolution" in result.numbers:
-        console.print(_reason(result.numbers), soft_wrap=True)
     written = sorted(path.name for path in folder.iterdir())
     console.print(f"wrote {folder}: {', '.join(written)}")
 
@@ -165,75 +208,25 @@ def _built(
         raise InputError(f"{refused} (the points: {picture})") from None
 
 
-def _random(numbers: dict[str, Any]) -> str:
-    """Line about a random start."""
-    given = numbers["triangulated"]
-    return (
-        (f"{given:,} points that came with the cameras, and " if given else "")
-        + f"{numbers['n'] - given:,} random points in and around a ball of radius "
-        f"{numbers['radius']:.3g} {numbers['unit']}"
-    )
-
-
 def _table(numbers: dict[str, Any]) -> Table:
     """Table of the numbers of prior.json."""
-    metres = numbers["unit"] == "m"
-    unit = "m" if metres else "unit"
-    n, spacing, area = numbers["n"], numbers["spacing"], numbers["sampled_area"]
     table = Table("step", "number", title="Mesh prior")
-
-    def length(value: float) -> str:
-        return f"{1e3 * value:.2f} mm" if metres else f"{value:.4g} unit"
-
-    if "points" in numbers:
-        _add_cloud_rows(table, numbers, length)
-    if "hull_cell" in numbers:
-        filled = f"fills {numbers['hull_fills_masks']:.1%} of the masks"
-        table.add_row("visual hull", f"cells of {length(numbers['hull_cell'])}, {filled}")
-    if "poisson_depth" in numbers:
-        depth = f"octree depth {numbers['poisson_depth']}"
-        table.add_row("mesh (Poisson)", f"{numbers['mesh_faces']:,} faces, {depth}, watertight")
-        table.add_row("cloud to mesh, rms", length(numbers["fit_rms"]))
-    whole = f" sampled (what some frame saw), of {numbers['mesh_area']:.4f} {unit}²"
-    table.add_row("area, A", f"{area:.4f} {unit}²{'' if 'mesh' in numbers else whole}")
-    table.add_row("samples, N = A / spacing²", f"{n:,} = {area:.4f} / {spacing:.6f}²")
-    behind = f"a sample each, and {numbers['backed']:,} behind the surface"
-    table.add_row("Gaussians", f"{n + numbers['backed']:,}: {behind}")
-    if "colour_agreement" in numbers:
-        agreed = f"{numbers['colour_agreement']:.0%}"
-        table.add_row("colour variance that all frames agree on", agreed)
-    if "outline_error" in numbers:
-        table.add_row("outline against masks, median", f"{numbers['outline_error']:.2%} of pixels")
-    table.add_row("up", _up(numbers))
-    truth = numbers.get("truth")
-    if truth is None:
+    resolution, unit = numbers.get("resolution", {}), numbers["unit"]
+    shown = numbers | numbers.get("truth", {}) | {"up": _up(numbers)}
+    shown |= {"sum": numbers["n"] + numbers["backed"]}
+    if resolution:
+        apart = resolution["spacing"] / resolution["pixel"]
+        shown |= {"pixel": resolution["pixel"], "apart": apart}
+    for key in LENGTHS & shown.keys():
+        millimetres = f"{1e3 * shown[key]:.2f} mm"
+        shown[key] = millimetres if unit == "m" else f"{shown[key]:.4g} {unit}"
+    for key, label, text in ROWS:
+        if key in shown:
+            table.add_row(label, text.format(**shown))
+    if "truth" not in numbers:
         lacks = "not measured: needs depth, and rock.glb in the dataset"
         table.add_row("distance to the true rock", lacks)
-        return table
-    table.add_section()
-    for name in ("accuracy", "completeness", "chamfer", "hausdorff"):
-        table.add_row(f"{name} to the true rock", f"{1e3 * truth[name]:.2f} mm")
-    share = f"{truth['visible_share']:.2%} of what is above the ground"
-    table.add_row("true surface seen by some frame", share)
-    table.add_row("seen surface within 2 spacings", f"{truth['visible_within_2_spacing']:.2%}")
     return table
-
-
-def _reason(numbers: dict[str, Any]) -> str:
-    """Reason for the number of Gaussians, if the cameras decided it."""
-    from mgs.prior.resolution import MOST_GAUSSIANS
-
-    pixel, count = numbers["resolution"]["pixel"], numbers["n"] + numbers["backed"]
-    size = f"{1e3 * pixel:.2f} mm" if numbers["unit"] == "m" else f"{pixel:.4g} unit"
-    if count == MOST_GAUSSIANS:
-        return (
-            f"{count:,} Gaussians, the most without --gaussians; the closest pixel covers {size} "
-            "of the surface, and would allow more"
-        )
-    return (
-        f"{count:,} Gaussians, since the closest pixel covers {size} of the surface, and samples "
-        f"lie {numbers['resolution']['spacing'] / pixel:.3g} pixels apart"
-    )
 
 
 def _up(numbers: dict[str, Any]) -> str:
@@ -246,27 +239,3 @@ def _up(numbers: dict[str, Any]) -> str:
         return text
     angle = degrees_between(up, unit_up(numbers["plane_normal"]))
     return f"{text}; the ground plane's normal is {angle:.1f}° from it"
-
-
-def _add_cloud_rows(table: Table, numbers: dict[str, Any], length: Callable[[float], str]) -> None:
-    """Add the rows of a mesh that was built from a cloud."""
-    points, size = f"{numbers['points']:,}", f"{numbers['cluster_size']:,}"
-    if "pixels" in numbers:
-        table.add_row("depth pixels in the cloud", f"{numbers['pixels']:,}")
-        table.add_row("noise of a depth pixel", length(numbers["depth_noise"]))
-        grid = f"{points} on a {length(numbers['voxel'])} grid"
-        table.add_row("points of the fused cloud", grid)
-    else:
-        table.add_row("points", f"{points}, {numbers['points_kept']:,} of them well triangulated")
-    if "plane_normal" in numbers:
-        sigma = f"(sigma {length(numbers['plane_sigma'])})"
-        within = f"within {length(numbers['plane_tolerance'])} {sigma}"
-        table.add_row("ground plane inliers (RANSAC)", f"{numbers['plane_inliers']:,} {within}")
-    one_of = f"one of {numbers['clusters']} clusters"
-    if "eps" in numbers:
-        found = f"{one_of}, eps {length(numbers['eps'])}"
-        table.add_row("rock cluster (DBSCAN)", f"{size} points, {found}")
-    else:
-        chosen = f"{one_of} (HDBSCAN)" if numbers["clusters"] else "inside the masks"
-        apart = f"{length(numbers['cloud_spacing'])} apart"
-        table.add_row("points of the rock", f"{size} {chosen}, {apart}")

@@ -39,6 +39,7 @@ def report(
         raise InputError(f"--figures {figures}: --html alone writes no figures; give --out, too")
     if html is not None:
         check_new_file(html, force)
+    runtime.start()
     if out is not None or html is None:
         _write_figures(runs, out or Path("report"), figures or "png", force)
     if html is not None:
@@ -75,7 +76,6 @@ def _write_page(runs: list[Path], html: Path) -> None:
     """Write the page, and print its size."""
     from mgs.reports.page import write_page
 
-    runtime.start()
     with progress_bar() as bar:
         size = write_page(html, runs, progress=partial(bar, "drawing"))
     echo(f"wrote {html} ({size / 1e6:.1f} MB)")

@@ -17,32 +17,23 @@ import numpy as np
 from mgs.colour import srgb_from_linear
 from mgs.data.up import PLUS_Z, Up, upright
 from mgs.plotting import NO_GRID, crop, drawing, literal
+from mgs.run.policies import POLICIES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-POLICY_STYLE: dict[str, tuple[str, str | tuple[int, int, int]]] = {
-    "d-optimal": ("#0072B2", "o"),
-    "coverage": ("#D55E00", "s"),
-    "random": ("#009E73", "^"),
-    "uniform": ("#CC79A7", "D"),
-    "farthest": ("#E69F00", "v"),
-    "t-optimal": ("#56B4E9", "P"),
-    "a-optimal": ("#000000", "X"),
-    "fisherrf": ("#7f7f7f", "p"),
-    "e-optimal": ("#8c510a", "*"),
-    "directional-i": ("#5500bb", "<"),
-    "directional-d": ("#770000", ">"),
-    "paper": ("#335533", "h"),
-    "i-optimal": ("#7755dd", "8"),
-    "block-d": ("#bbbb77", (4, 1, 0)),
-    "angle": ("#553355", (6, 1, 0)),
-    "cover": ("#000066", "d"),
-    "completeness": ("#8888ee", "H"),
-}
-"""Colour and marker of each policy, the same in every figure. The first seven colours are those of
-Okabe and Ito; the others were chosen so that colour-blind readers can tell all of them apart."""
+STYLES: tuple[tuple[str, str | tuple[int, int, int]], ...] = (
+    ("#5500bb", "<"), ("#770000", ">"), ("#335533", "h"), ("#0072B2", "o"), ("#56B4E9", "P"),
+    ("#7f7f7f", "p"), ("#D55E00", "s"), ("#000066", "d"), ("#CC79A7", "D"), ("#E69F00", "v"),
+    ("#009E73", "^"), ("#8888ee", "H"), ("#553355", (6, 1, 0)), ("#bbbb77", (4, 1, 0)),
+    ("#7755dd", "8"), ("#8c510a", "*"), ("#000000", "X"),
+)  # fmt: skip
+"""Colours and markers of lines. Seven colours are those of Okabe and Ito. The others were chosen so
+that colour-blind readers can tell all of them apart."""
+
+POLICY_STYLE = dict(zip(POLICIES, STYLES, strict=False))
+"""Style of each policy, the same in every figure."""
 
 Curves = Mapping[str, tuple[Sequence[float], Sequence[float]]]
 """Label of a run -> x and y of its line."""
@@ -51,24 +42,19 @@ Curves = Mapping[str, tuple[Sequence[float], Sequence[float]]]
 def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
     """Style of the line of each label: keywords for matplotlib's `plot`.
 
-    The first line of a policy in POLICY_STYLE has the policy's colour and marker. Further lines of
-    it, and those of other policies, take unused styles from the end of the table. When none are
-    left, all styles are used again with dashed lines.
+    The first line of a policy has the style of the policy. All others take those of STYLES that are
+    no policy's, one after the other, then all again with dashed lines.
     """
-    labels = list(labels)
-    first = {label.split(" ")[0]: label for label in reversed(labels)}
-    taken = {
-        label: POLICY_STYLE[policy] for policy, label in first.items() if policy in POLICY_STYLE
-    }
-    free = [style for style in reversed(POLICY_STYLE.values()) if style not in taken.values()]
     spare = chain(
-        ((style, "-") for style in free), cycle((style, "--") for style in POLICY_STYLE.values())
+        ((style, "-") for style in STYLES[len(POLICY_STYLE) :]),
+        cycle((style, "--") for style in STYLES),
     )
-    styles = []
+    unused, styles = dict(POLICY_STYLE), []
     for label in labels:
-        (colour, marker), dashes = (taken[label], "-") if label in taken else next(spare)
-        styles.append({"color": colour, "marker": marker, "linestyle": dashes})
-        styles[-1]["label"] = literal(label)
+        own = unused.pop(label.split(" ")[0], None)
+        (colour, marker), dashes = (own, "-") if own else next(spare)
+        style = {"color": colour, "marker": marker, "linestyle": dashes, "label": literal(label)}
+        styles.append(style)
     return styles
 
 

@@ -1,4 +1,4 @@
-"""The report that compares runs on one dataset: figures and a table, from the runs' files alone."""
+"""The report that compares runs on one dataset: figures and a table, from the runs' files."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mgs.data.dataset import TEST_FOLDER
 from mgs.data.frames import Frame
 from mgs.errors import InputError
-from mgs.evaluation import read_comparison
+from mgs.evaluation import render_view
 from mgs.files import write_json, write_text
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.reports import figures
@@ -53,21 +52,19 @@ def report(
     - table.md and table.json (`mgs.reports.tables.comparison_rows`).
 
     Files of an earlier report are replaced. Raises InputError as `compare_runs`; if a run is
-    unfinished or was not evaluated since its last step; and if a picture of `mgs eval` is missing
-    or damaged. Then nothing is written.
+    unfinished or was not evaluated since its last step. Then nothing is written.
     """
     compared = compare_runs([runs] if isinstance(runs, str | PathLike) else runs)
     for run in compared.values():
         check_finished(run)
         check_measured(run)
     out = Path(out)
-    frame, truth, renders, captions = _comparison(compared)
     chosen = any(run.settings.budget for run in compared.values())
     paths = {name: out / f"{name}.{kind}" for name in CHOICES if chosen}
     if chosen:
         _draw_choices(paths, compared)
     paths["comparison"] = out / f"comparison.{kind}"
-    figures.comparison_figure(paths["comparison"], truth, renders, frame.name, captions)
+    _draw_comparison(paths["comparison"], compared)
     if panels := _psnr_panels(compared):
         paths["psnr"] = out / f"psnr.{kind}"
         figures.curves_figure(paths["psnr"], "Quality after each image", panels)
@@ -96,78 +93,43 @@ def _draw_choices(paths: Mapping[str, Path], runs: Mapping[str, Run]) -> None:
     figures.curves_figure(paths["coverage"], title, {y: covered}, top=100)
 
 
-def _comparison(
-    runs: Mapping[str, Run],
-) -> tuple[Frame, np.ndarray, dict[str, np.ndarray], dict[str, str]]:
-    """The shown view: frame, truth [H,W,3], renders [H,W,3] by label, captions by label."""
-    frame, views = shown_view(list(runs.values()))
-    within = Path("renders", TEST_FOLDER) if views == "test_views" else Path("renders")
-    pictures, captions = {}, {}
-    for label, run in runs.items():
-        pictures[label] = picture = run.folder / within / f"{frame.name}.png"
-        of_this_model = (run.metrics or {}).get("pictures", True)
-        if not (of_this_model and picture.is_file()):
-            raise InputError(
-                f"{picture}: no picture of this model; draw it with `mgs eval {run.folder}`"
-            )
-        captions[label] = _caption(run, views, frame.name)
-    pairs = {label: read_comparison(picture, frame.camera) for label, picture in pictures.items()}
-    truth = next(iter(pairs.values()))[0]
-    return frame, truth, {label: render for label, (_, render) in pairs.items()}, captions
-
-
 def shown_view(runs: Sequence[Run]) -> tuple[Frame, str]:
     """The view that the comparison shows, and the key of metrics.json that lists it, "test_views"
     or "views".
 
-    It is the most typical (`_typical_view`) of the test views if all runs were measured on them,
-    else among those that the fewest runs were trained on. Of frames on demand, only those that all
-    runs have taken have an image. Raises InputError as `Dataset.test_views`, and if there is no
-    such frame.
+    It is one of the test views if all runs were measured on them, else of those that the fewest
+    runs were trained on: the one whose PSNRs are closest to the runs' means, in least squares. Of
+    frames on demand, only those that all runs have taken have an image. Raises InputError as
+    `Dataset.test_views`, and if there is no frame on which all runs were measured.
     """
-    dataset = runs[0].dataset
+    dataset, key = runs[0].dataset, "views"
     tests = dataset.test_views()
     if tests is not None and all((run.metrics or {}).get("test_views") for run in runs):
-        return _typical_view(runs, tests.frames, "test_views"), "test_views"
-    shown = dataset.with_images(
-        set.intersection(*({frame.name for frame in run.taken} for run in runs))
-    )
-    if not shown:
+        frames, key = tests.frames, "test_views"
+    else:
+        taken = set.intersection(*({frame.name for frame in run.taken} for run in runs))
+        frames = least_trained(runs, dataset.with_images(taken))
+    psnr = [{view["name"]: view["psnr"] for view in (run.metrics or {})[key]} for run in runs]
+    frames = [frame for frame in frames if all(of.get(frame.name) is not None for of in psnr)]
+    if not frames:
         raise InputError(
-            f"{dataset.root}: has no test views, and no frame that all runs have taken; "
-            "report them one by one"
+            f"{dataset.root}: has no view on which all runs were measured; report them one by one"
         )
-    return _typical_view(runs, least_trained(runs, shown), "views"), "views"
+    values = np.array([[of[frame.name] for frame in frames] for of in psnr])
+    return frames[int(np.argmin(((values - values.mean(1, keepdims=True)) ** 2).sum(0)))], key
 
 
-def _psnr_by_name(run: Run, views: str) -> dict[str, float]:
-    """PSNR of the views that the key `views` of metrics.json lists."""
-    listed = (run.metrics or {}).get(views, [])
-    return {view["name"]: view["psnr"] for view in listed if view["psnr"] is not None}
-
-
-def _typical_view(runs: Sequence[Run], frames: Sequence[Frame], views: str) -> Frame:
-    """The frame whose PSNRs are closest to the runs' means, in least squares, of those that all
-    runs were measured on by the key `views` of metrics.json; the first if there is none."""
-    measured = [_psnr_by_name(run, views) for run in runs]
-    known = [frame for frame in frames if all(frame.name in of for of in measured)]
-    if not known:
-        return frames[0]
-    psnr = np.array([[of[frame.name] for frame in known] for of in measured])
-    return known[int(np.argmin(((psnr - psnr.mean(1, keepdims=True)) ** 2).sum(0)))]
-
-
-def _caption(run: Run, views: str, name: str) -> str:
-    """Number of images, PSNR and SSIM of a render. views: key of metrics.json that lists it.
-    Raises InputError if it was not evaluated."""
-    view = next((view for view in (run.metrics or {})[views] if view["name"] == name), None)
-    if view is None:
-        raise InputError(
-            f"{run.folder}: was not evaluated on {name}; measure it with `mgs eval {run.folder}`"
-        )
-    seen = ", trained on" if view["trained"] else ""
-    decibels, ssim = (table_cell(key, view[key]) for key in ("psnr", "ssim"))
-    return f"{len(run.indices)} images{seen}; {decibels} dB, SSIM {ssim}"
+def _draw_comparison(path: Path, runs: Mapping[str, Run]) -> None:
+    """Draw the shown view: its truth, and the renders of all runs."""
+    frame, views = shown_view(list(runs.values()))
+    renders, captions = {}, {}
+    for label, run in runs.items():
+        renders[label] = render_view(run.gaussians, frame.camera)[0]
+        view = next(view for view in (run.metrics or {})[views] if view["name"] == frame.name)
+        seen = ", trained on" if view["trained"] else ""
+        decibels, ssim = (table_cell(key, view[key]) for key in ("psnr", "ssim"))
+        captions[label] = f"{len(run.indices)} images{seen}; {decibels} dB, SSIM {ssim}"
+    figures.comparison_figure(path, frame.masked_rgb(), renders, frame.name, captions)
 
 
 def _psnr_panels(runs: Mapping[str, Run]) -> dict[str, figures.Curves]:
