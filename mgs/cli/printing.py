@@ -79,13 +79,14 @@ def _heading(key: str, new: bool) -> str:
 
 def print_run(out: Path, state: Checkpoint, metrics: dict[str, Any], console: Terminal) -> None:
     """Print the steps of a run as a table, on a terminal only, then the quality of its model."""
+    from mgs.reports.tables import metrics_row
     from mgs.run.ending import RunEnd, why_ended
 
     if console.is_terminal:  # a log has a line a step
         _print_steps(state.steps, console)
-    for text in _quality_lines(metrics, any("exposure" in step for step in state.steps)):
-        console.print(text)
     last = state.steps[-1] if state.steps else {}
+    coverage = 100 * last["coverage"] if last else None
+    print_quality(console, [metrics_row(metrics["policy"], metrics) | {"coverage": coverage}])
     if "ended" in last and (last["ended"]["views"] or last["ended"]["reason"] != RunEnd.BUDGET):
         console.print(f"the run has ended: {why_ended(last['ended'])}", soft_wrap=True)
     console.print(f"wrote {out}", soft_wrap=True)
@@ -143,28 +144,3 @@ def certificate_line(record: Mapping[str, Any]) -> str:
     from mgs.policy.certificate import Certificate
 
     return Certificate(**record).sentence()
-
-
-def _quality_lines(metrics: dict[str, Any], exposure: bool) -> list[str]:
-    """Mean quality over each set of views in metrics.json."""
-    from mgs.reports.tables import table_cell
-
-    every = "all views" if metrics.get("held_out", {}).get("count") else "training views"
-    sets = {"test": "test views", "all": every, "held_out": "held-out views"}
-    lines = []
-    for key, label in sets.items():
-        mean = metrics.get(key, {"count": 0})
-        if not mean["count"]:
-            continue
-        cells = {name: table_cell(name, value) for name, value in mean.items()}
-        lines.append(
-            f"{label} ({mean['count']}): PSNR {cells['psnr']} dB, SSIM {cells['ssim']}; "
-            f"masked PSNR {cells['psnr_mask']} dB, SSIM {cells['ssim_mask']}"
-        )
-        if exposure:
-            lines.append(
-                f"{label}, with a gain per channel fitted to each view itself: "
-                f"PSNR {cells['psnr_corrected']} dB; "
-                f"masked PSNR {cells['psnr_mask_corrected']} dB"
-            )
-    return lines

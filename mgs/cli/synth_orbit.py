@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import re
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,9 +14,9 @@ from mgs.camera import MAX_PIXELS
 from mgs.cli.options import Count, Seed
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
-from mgs.errors import InputError, row_named
+from mgs.errors import InputError
 from mgs.files import Ours, clear_folder
-from mgs.synth.scene_file import ORBITS, load_scene_file
+from mgs.synth.scene_file import OrbitKind, load_scene_file
 
 FILES = [
     *("config.json", "transforms.json", "images", "depth", "masks", "rock", "rock.glb", "test"),
@@ -30,7 +28,7 @@ FILES = [
 def synth_orbit(
     out: Path,
     scene: str = "boulder",
-    orbit: str | None = None,
+    orbit: OrbitKind | None = None,
     distances: str | None = None,
     mesh: Path | None = None,
     mesh_up: Literal["y", "z"] | None = None,
@@ -57,7 +55,7 @@ def synth_orbit(
 
     - out: Folder to write: new, empty, or left by an interrupted run.
     - scene: Name of a scene that comes with mgs, or path of a .toml file.
-    - orbit: circle, rings, spiral or hemisphere. Default: the scene's.
+    - orbit: Default: the scene's.
     - distances: Factors on the distance of the frames from the rock, in turn, as in 1,2,3. Default:
       the scene's.
     - mesh: A real rock: textured GLB, OBJ or PLY, scaled to the scene.
@@ -74,65 +72,50 @@ def synth_orbit(
     """
     runtime.start()
     from mgs.synth.orbit import PoseNoise
-    from mgs.synth.rendering import PRESETS
     from mgs.synth.rendering import synth_orbit as rendered
 
-    settings = load_scene_file(scene)
-    if orbit is not None and orbit not in ORBITS:
-        raise InputError(f"--orbit {orbit!r}: unknown; choose one of {', '.join(ORBITS)}")
-    changes = {"kind": orbit, "distances": distances and _parse_distances(distances)}
-    chosen = settings.orbit.model_copy(update={k: v for k, v in changes.items() if v})
-    settings = settings.model_copy(update={"orbit": chosen})
+    factors = {"kind": orbit, "distances": distances and distances.split(",")}
+    settings = load_scene_file(scene, **{key: value for key, value in factors.items() if value})
     if mesh_up is not None and mesh is None:
         raise InputError("--mesh-up: says how a mesh stands, but there is none; give --mesh too")
-    given = {"spp": spp, "frames": frames, **_parse_size(size)}
-    images = row_named(PRESETS, preset, "preset")
-    images = replace(images, **{key: value for key, value in given.items() if value is not None})
     noise = PoseNoise(pose_noise, rotation_noise) if pose_noise or rotation_noise else None
-    views = f"{images.frames} frames" + (", none rendered" if on_demand else "")
-    views += f" and {test_views} test views" if test_views else ""
-    stage = f"{views}, {images.width}x{images.height}"
     console = Terminal()
     if force:
         clear_folder(out, Ours(FILES, [path for path in (mesh, Path(scene)) if path]))
-    with progress_bar(stage, console) as progress:
-        rendered(
+    with progress_bar("rendering", console) as progress:
+        made = rendered(
             out,
             settings,
-            images,
+            preset,
             seed,
             mesh,
             noise,
-            progress=partial(progress, stage),
+            progress=partial(progress, "rendering"),
             say=partial(console.print, markup=False),
             mesh_up=mesh_up,
             test_views=test_views,
             on_demand=on_demand,
+            frames=frames,
+            size=_parse_size(size),
+            spp=spp,
         )
+    camera, none = made.frames[0].camera, ", none rendered" if on_demand else ""
     look = "" if on_demand and not test_views else f"; look at {out / 'contact_sheet.png'}"
-    console.print(f"{out}: {views}{look}")
+    console.print(
+        f"{out}: {len(made)} frames{none} and {test_views} test views, "
+        f"{camera.width}x{camera.height}{look}"
+    )
 
 
-def _parse_distances(text: str) -> tuple[float, ...]:
-    """Factors of an option like 1,2,3. Raises InputError if one is no positive number."""
-    try:
-        factors = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        factors = (0.0,)
-    if not all(0 < factor < math.inf for factor in factors):
-        raise InputError(f"--distances {text!r}: expected positive numbers, as in 1,2,3")
-    return factors
-
-
-def _parse_size(size: str | None) -> dict[str, int]:
-    """Width and height of an option like 320x240; {} for None. Raises InputError if malformed."""
+def _parse_size(size: str | None) -> tuple[int, int] | None:
+    """Width and height of an option like 320x240. Raises InputError if malformed."""
     if size is None:
-        return {}
-    found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", size.lower(), re.ASCII)
-    width, height = (int(side) for side in found.groups()) if found else (0, 0)
+        return None
+    sides = re.fullmatch(r"(\d{1,9})x(\d{1,9})", size.lower(), re.ASCII)
+    width, height = (int(side) for side in sides.groups()) if sides else (0, 0)
     if not 0 < width * height <= MAX_PIXELS:
         raise InputError(
             f"--size {size!r}: expected WIDTHxHEIGHT, at most {MAX_PIXELS:,} pixels in all, "
             "as in 320x240"
         )
-    return {"width": width, "height": height}
+    return width, height

@@ -58,13 +58,13 @@ def report(
     for run in compared.values():
         check_finished(run)
         check_measured(run)
-    out = Path(out)
+    out, (frame, views) = Path(out), shown_view(list(compared.values()))
     chosen = any(run.settings.budget for run in compared.values())
     paths = {name: out / f"{name}.{kind}" for name in CHOICES if chosen}
     if chosen:
         _draw_choices(paths, compared)
     paths["comparison"] = out / f"comparison.{kind}"
-    _draw_comparison(paths["comparison"], compared)
+    _draw_comparison(paths["comparison"], compared, frame, views)
     if panels := _psnr_panels(compared):
         paths["psnr"] = out / f"psnr.{kind}"
         figures.curves_figure(paths["psnr"], "Quality after each image", panels)
@@ -103,6 +103,7 @@ def shown_view(runs: Sequence[Run]) -> tuple[Frame, str]:
     `Dataset.test_views`, and if there is no frame on which all runs were measured.
     """
     dataset, key = runs[0].dataset, "views"
+    frames: Sequence[Frame]
     tests = dataset.test_views()
     if tests is not None and all((run.metrics or {}).get("test_views") for run in runs):
         frames, key = tests.frames, "test_views"
@@ -119,9 +120,8 @@ def shown_view(runs: Sequence[Run]) -> tuple[Frame, str]:
     return frames[int(np.argmin(((values - values.mean(1, keepdims=True)) ** 2).sum(0)))], key
 
 
-def _draw_comparison(path: Path, runs: Mapping[str, Run]) -> None:
-    """Draw the shown view: its truth, and the renders of all runs."""
-    frame, views = shown_view(list(runs.values()))
+def _draw_comparison(path: Path, runs: Mapping[str, Run], frame: Frame, views: str) -> None:
+    """Draw truth and renders of the frame that the key `views` of metrics.json lists."""
     renders, captions = {}, {}
     for label, run in runs.items():
         renders[label] = render_view(run.gaussians, frame.camera)[0]

@@ -142,8 +142,9 @@ class SceneFile(_Strict):
     sensor: Sensor = Sensor()
 
 
-def load_scene_file(scene: str | Path) -> SceneFile:
-    """Read a scene by its name (`boulder`) or path (`my.toml`).
+def load_scene_file(scene: str | Path, **orbit: Any) -> SceneFile:
+    """Read a scene by its name (`boulder`) or path (`my.toml`). orbit: values of its orbit that
+    replace those of the file.
 
     Raises InputError if it does not exist, is not TOML, or has an unknown key or a value out of
     range.
@@ -151,7 +152,9 @@ def load_scene_file(scene: str | Path) -> SceneFile:
     path = scene_path(scene)
     data = read_toml(path)
     try:
-        return SceneFile.model_validate(data)
+        settings = SceneFile.model_validate(data)
+        values = settings.orbit.model_dump() | orbit
+        return settings.model_copy(update={"orbit": Orbit.model_validate(values)})
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
