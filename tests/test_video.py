@@ -14,7 +14,7 @@ from refusals import refused
 
 from mgs.errors import InputError
 from mgs.reports import story
-from mgs.reports.video import PATHS, camera_path, write_film
+from mgs.reports.video import camera_path, write_film
 
 
 @pytest.fixture(scope="module")
@@ -23,9 +23,8 @@ def run(tmp_path_factory, pristine):
     return tiny.write_run(root / "run", pristine, tiny.write_prior(root / "prior"))
 
 
-@pytest.mark.parametrize("path", PATHS)
-def test_a_path_goes_around_the_object_and_looks_at_it(loaded, path):
-    cameras = camera_path(loaded, np.zeros((5, 3)), (0, 0, 1), path, 48, 30)
+def test_a_turntable_goes_around_the_object_and_looks_at_it(loaded):
+    cameras = camera_path(loaded, np.zeros((5, 3)), (0, 0, 1), 48, 30)
     eyes = np.array([camera.position for camera in cameras])
     distances = np.linalg.norm(eyes, axis=1)
     np.testing.assert_allclose(distances, np.hypot(3, 1.5), rtol=0.05)
@@ -78,7 +77,7 @@ def test_a_film_that_is_cut_off_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("beside", "count", "path"),
-    [("uncertainty", 5, ["--fps", 5, "--path", "cameras"]), ("truth", tiny.FRAMES, [])],
+    [("uncertainty", 5, ["--fps", 5]), ("truth", tiny.FRAMES, [])],
 )
 def test_the_command_draws_pictures_side_by_side(run, tmp_path, beside, count, path):
     out = tmp_path / "a.png"

@@ -4,64 +4,47 @@ from __future__ import annotations
 
 import shlex
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from mgs.errors import Notice
 
+FLIGHT = ["flight.length", "flight.time", "flight.speed", "flight.hover", "flight.no_fly"]
+FLIGHT.append("flight.clearance")
+FIT = ["train.alpha_weight", "train.optimiser", "pixel_noise", "prior_std.", "train.rates."]
+FIT += ["train.antialiased=true", "train.antialiased=false"]
+NBV = ["nearest", "travel", "stop_gain", "stop_uncertainty", "stop_psnr", "train.passes"]
+NBV += ["warm_passes", "train.means", "sh", "exposure=true", "estimator", "lam", "evaluate_every"]
+NBV += ["capture.timeout", "capture.tries", "capture.failure", "capture.distance"]
+SUGGEST = ["ring", "grid", "radius", "elevations", "safe_distance"]
+"""Settings that were options: the table of one that took KIND=NUMBER ends with a dot, and one that
+took no value has it."""
+
+OTHERS = {
+    "flight.length": "--flight-length",
+    "flight.time": "--flight-time",
+    "capture.timeout": "--capture-timeout",
+    "capture.tries": "--capture-tries",
+    "capture.failure": "--capture-failure",
+    "capture.distance": "--capture-distance",
+    "train.rates.": "--rate",
+    "train.antialiased=false": "--no-antialiased",
+}
+"""Settings whose old option was not their last word."""
+
+
+def _old(keys: Iterable[str]) -> dict[str, str]:
+    """Old options of settings -> the settings."""
+    last = {key: key.partition("=")[0].strip(".").rpartition(".")[2] for key in keys}
+    return {OTHERS.get(key, f"--{word.replace('_', '-')}"): key for key, word in last.items()}
+
+
 SEED = {"--random-seed": "--seed"}
-FLIGHT = {
-    "--flight-length": "flight.length",
-    "--flight-time": "flight.time",
-    "--speed": "flight.speed",
-    "--hover": "flight.hover",
-    "--no-fly": "flight.no_fly",
-    "--clearance": "flight.clearance",
-}
-FIT = SEED | {
-    "--antialiased": "train.antialiased=true",
-    "--no-antialiased": "train.antialiased=false",
-    "--alpha-weight": "train.alpha_weight",
-    "--optimiser": "train.optimiser",
-    "--rate": "train.rates.",
-    "--pixel-noise": "pixel_noise",
-    "--prior-std": "prior_std.",
-}
 OPTIONS = {
-    "nbv": FIT
-    | FLIGHT
-    | {
-        "--seed-views": "--seeds",
-        "--nearest": "nearest",
-        "--travel": "travel",
-        "--stop-gain": "stop_gain",
-        "--stop-uncertainty": "stop_uncertainty",
-        "--stop-psnr": "stop_psnr",
-        "--passes": "train.passes",
-        "--warm-passes": "warm_passes",
-        "--means": "train.means",
-        "--sh": "sh",
-        "--exposure": "exposure=true",
-        "--estimator": "estimator",
-        "--lam": "lam",
-        "--evaluate-every": "evaluate_every",
-        "--capture-timeout": "capture.timeout",
-        "--capture-tries": "capture.tries",
-        "--capture-failure": "capture.failure",
-        "--capture-distance": "capture.distance",
-    },
-    "fit": FIT | {"--most-gaussians": "train.most_gaussians"},
-    "suggest": FLIGHT
-    | {
-        "--ring": "ring",
-        "--grid": "grid",
-        "--radius": "radius",
-        "--elevations": "elevations",
-        "--safe-distance": "safe_distance",
-    },
+    "nbv": SEED | {"--seed-views": "--seeds"} | _old([*FIT, *FLIGHT, *NBV]),
+    "fit": SEED | _old([*FIT, "train.most_gaussians"]),
+    "suggest": _old([*FLIGHT, *SUGGEST]),
     "prior": SEED | {"--from": "--source"},
-    "synth-orbit": SEED,
-    "survey": SEED,
-    "demo": SEED,
+    **dict.fromkeys(("synth-orbit", "survey", "demo"), SEED),
 }
 """Command -> its old options -> what replaces them: an option, a setting of --set, its table where
 the value was KIND=NUMBER, or a setting with its value where there was none."""

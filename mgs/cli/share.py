@@ -125,7 +125,6 @@ def _targets(
 def video(
     runs: list[Path],
     out: Path | None = None,
-    path: Literal["turntable", "spiral", "cameras"] | None = None,
     beside: Literal["truth", "uncertainty"] | None = None,
     story: bool = False,
     seconds: Annotated[float | None, typer.Option(min=0.1, max=3600)] = None,
@@ -133,16 +132,14 @@ def video(
     width: Annotated[int | None, typer.Option(min=16)] = None,
     force: bool = False,
 ) -> None:
-    """Make a video of each run: a camera path around its model, or the model view by view.
+    """Make a video of each run: a turntable of its model, or the model view by view.
 
     - out: File to write: .mp4 (needs imageio-ffmpeg), .gif or .png. Default: RUN/video.mp4.
-    - path: Camera path: a circle (default), two turns that rise and fall, or through the dataset's
-      cameras.
     - beside: Second picture: the true images, at the dataset's own views, or the map of what is
       unknown.
     - story: Show the model after each view of the run; repeats the fits.
     - seconds: Length, seconds. Default: 8, or 1 per view with --story or --beside truth.
-    - fps: Frames per second along a path. Default: 25.
+    - fps: Frames per second of a turntable. Default: 25.
     - width: Width of a picture in pixels. Default: the cameras' own.
     """
     from mgs import runtime
@@ -151,7 +148,7 @@ def video(
     from mgs.run.folder import open_run
 
     one_by_one = story or beside == "truth"
-    unused: dict[str, object] = {"--path": path, "--fps": fps} if one_by_one else {}
+    unused: dict[str, object] = {"--fps": fps} if one_by_one else {}
     unused |= {"--beside": beside, "--width": width} if story else {}
     if given := [name for name, value in unused.items() if value is not None]:
         why = "--story" if story else "--beside truth"
@@ -169,7 +166,7 @@ def video(
             else:
                 count = views if beside == "truth" else max(1, round((seconds or 8.0) * fps))
                 wide = width or opened.dataset.frames[0].camera.width
-                frames = path_frames(opened, path or "turntable", beside, count, wide)
+                frames = path_frames(opened, beside, count, wide)
             each = (seconds or float(count)) / count if one_by_one else 1 / fps
             lengths = [each] * (count - 1) + [3 * each if story else each]
             write_film(target, frames, lengths, partial(bar.whole, "frames"))

@@ -43,11 +43,11 @@ def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
     """Style of the line of each label: keywords for matplotlib's `plot`.
 
     The first line of a policy has the style of the policy. All others take those of STYLES that are
-    no policy's, one after the other, then all again with dashed lines.
+    no policy's, one after the other, then all again with dashed and dotted lines.
     """
     spare = chain(
         ((style, "-") for style in STYLES[len(POLICY_STYLE) :]),
-        cycle((style, "--") for style in STYLES),
+        ((style, dashes) for dashes in cycle(("--", ":")) for style in STYLES),
     )
     unused, styles = dict(POLICY_STYLE), []
     for label in labels:

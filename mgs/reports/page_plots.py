@@ -77,7 +77,7 @@ def line_plot(title: str, curves: Curves, y: str, from_zero: bool = False) -> di
     traces = []
     for (label, (xs, ys)), style in zip(curves.items(), line_styles(curves), strict=True):
         colour = style["color"]
-        dash = "dash" if style["linestyle"] == "--" else "solid"
+        dash = {"-": "solid", "--": "dash", ":": "dot"}[style["linestyle"]]
         trace: dict[str, Any] = {"name": label, "x": list(xs), "y": list(ys)}
         trace["mode"] = "lines+markers"
         trace["marker"] = {"symbol": SYMBOLS[style["marker"]], "color": colour, "size": 7}

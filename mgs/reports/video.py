@@ -1,6 +1,6 @@
-"""Films of a run: a path of cameras around its model, and how the model came to be, view by view.
+"""Films of a run: a turntable, and how the model came to be, view by view.
 
-A path turns about the median of the Gaussians' means, at the median distance and height of the
+A turntable turns about the median of the Gaussians' means, at the median distance and height of the
 dataset's cameras. Films are MP4, or without any package beside Pillow GIF and animated PNG.
 """
 
@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from mgs.camera import Camera, look_at
 from mgs.colour import srgb_from_linear
@@ -28,57 +27,41 @@ from mgs.run.folder import Run
 Film = Iterator[np.ndarray]
 """Frames, sRGB uint8 [H,W,3], all of one size."""
 
-PATHS = ("turntable", "spiral", "cameras")
-"""Paths: a circle; two turns from low to high and back; a spline through the dataset's cameras."""
-
 FORMATS = (".mp4", ".gif", ".png")
 """Endings of films; .png is an animated PNG."""
 
 GAP = 4
 """Pixels between two pictures of a frame."""
 
-STEEPEST = 75.0
-"""Largest elevation of a spiral, degrees."""
-
 UNKNOWN = "cividis"
 """Colour map of what is unknown: blue is known, yellow unknown."""
 
 
 def camera_path(
-    dataset: Dataset, means: np.ndarray, up: Sequence[float], path: str, count: int, width: int
+    dataset: Dataset, means: np.ndarray, up: Sequence[float], count: int, width: int
 ) -> list[Camera]:
-    """Cameras of a closed path, at equal intervals of time.
+    """Cameras of a turntable, at equal angles.
 
-    means: [N,3] of the Gaussians. up: of the world. path: one of PATHS. count: of cameras. width:
-    of their images, pixels.
+    means: [N,3] of the Gaussians. up: of the world. count: of cameras. width: of their images,
+    pixels.
     """
     first = dataset.frames[0].camera
     turn, centre = upright((up[0], up[1], up[2])), np.median(means, axis=0)
     eyes = np.array([frame.camera.position for frame in dataset.frames])
-    t = np.arange(count) / count
-    if path == "cameras":
-        closed = np.concatenate([eyes, eyes[:1]])
-        places = CubicSpline(np.linspace(0, 1, len(closed)), closed, bc_type="periodic")(t)
-    else:
-        away = (eyes - centre) @ turn.T
-        distance = float(np.median(np.linalg.norm(away, axis=1)))
-        heights = np.arcsin(np.clip(away[:, 2] / np.linalg.norm(away, axis=1), -1, 1))
-        start = float(np.arctan2(away[0, 1], away[0, 0]))
-        turns, elevation = 1, np.full(count, float(np.median(heights)))
-        if path == "spiral":
-            low, steepest = float(heights.min()), np.radians(STEEPEST)
-            high = min(max(float(heights.max()), low + np.radians(45)), steepest)
-            turns, elevation = 2, low + (high - low) * (1 - np.cos(2 * np.pi * t)) / 2
-        angle, flat = start + 2 * np.pi * turns * t, distance * np.cos(elevation)
-        rise = distance * np.sin(elevation)
-        places = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), rise]) @ turn + centre
+    away = (eyes - centre) @ turn.T
+    distances = np.linalg.norm(away, axis=1)
+    distance = float(np.median(distances))
+    elevation = np.median(np.arcsin(np.clip(away[:, 2] / distances, -1, 1)))
+    angle = np.arctan2(away[0, 1], away[0, 0]) + 2 * np.pi * np.arange(count) / count
+    flat, rise = distance * np.cos(elevation), np.full(count, distance * np.sin(elevation))
+    places = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), rise]) @ turn + centre
     shape = first.resized(width + width % 2)
     shape = replace(shape, height=shape.height + shape.height % 2)  # encoders need even numbers
     return [replace(shape, world_to_camera=look_at(eye, centre, up)) for eye in places]
 
 
-def path_frames(run: Run, path: str, beside: str | None, count: int, width: int) -> Film:
-    """Frames along a path; with beside="uncertainty", the map of what is unknown to the right.
+def path_frames(run: Run, beside: str | None, count: int, width: int) -> Film:
+    """Frames of a turntable; with beside="uncertainty", the map of what is unknown to the right.
 
     With beside="truth", the frames are the dataset's views themselves, in their order, beside their
     images.
@@ -92,7 +75,7 @@ def path_frames(run: Run, path: str, beside: str | None, count: int, width: int)
         return
     scalars = {"uncertainty": run_scalars(run)["uncertainty"]} if beside else {}
     up = run.up
-    for camera in camera_path(run.dataset, model.means, up, path, count, width):
+    for camera in camera_path(run.dataset, model.means, up, count, width):
         maps = view_maps(model, camera, scalars)
         right = [_unknown(maps)] if beside else []
         yield _side_by_side(picture(maps), *right)
