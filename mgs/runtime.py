@@ -15,18 +15,11 @@ import ctypes
 import glob
 import os
 import re
-import signal
 import sys
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Thread
-from typing import TYPE_CHECKING
 
 from mgs.errors import InputError
-
-if TYPE_CHECKING:
-    from concurrent.futures import ProcessPoolExecutor
 
 VARIANT = "llvm_ad_rgb"
 """Default variant: compiled by LLVM, differentiable, RGB, single precision."""
@@ -237,31 +230,6 @@ def _prepare_variant() -> None:
     if dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
         _check_libllvm()
         _keep_order()
-
-
-def processes(count: int) -> ProcessPoolExecutor:
-    """Executor of `count` new processes, which end silently at Ctrl-C and with this process."""
-    from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
-
-    return ProcessPoolExecutor(count, get_context("spawn"), initializer=_begin_process)
-
-
-def _begin_process() -> None:
-    """Begin a process of `processes`."""
-    from multiprocessing import parent_process
-
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    if not sys.warnoptions:
-        warnings.simplefilter("ignore")  # as `mgs.__main__`
-    parent = parent_process()
-    assert parent
-
-    def wait() -> None:
-        parent.join()
-        os._exit(1)
-
-    Thread(target=wait, daemon=True).start()
 
 
 def processor() -> dict[str, str | int]:

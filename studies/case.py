@@ -8,13 +8,15 @@ study's folder, or absolute. All tasks continue after an interruption.
 from __future__ import annotations
 
 import shutil
+import signal
 from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from mgs import runtime
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.errors import InputError
 from mgs.evaluation import evaluate_model
@@ -259,7 +261,9 @@ def in_new_process(
 
     Raises InputError if that process is killed, and what the function raises.
     """
-    with runtime.processes(1) as pool:
+    at_interrupt = (signal.SIGINT, signal.SIG_DFL)  # end silently
+    context = get_context("spawn")
+    with ProcessPoolExecutor(1, context, initializer=signal.signal, initargs=at_interrupt) as pool:
         try:
             return pool.submit(task, *arguments).result()
         except BrokenProcessPool:

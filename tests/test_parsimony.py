@@ -75,7 +75,8 @@ def write_data(root):
     return synthetic.write_dataset(root, synthetic.orbit_cameras(12, 48, 36))
 
 
-def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys):
+def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
     command("prior", data.root, "--out", tmp_path / "p")
     numbers = json.loads((tmp_path / "p/prior.json").read_text())
     pixel = numbers["resolution"]["pixel"]

@@ -8,7 +8,7 @@ missing.
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
 from itertools import pairwise
@@ -154,47 +154,30 @@ def _section(label: str, run: Run) -> dict[str, Any]:
 
 
 def _view(label: str, run: Run, k: int, frame: Frame) -> dict[str, Any]:
-    """The k-th view that a run took: facts, pictures, and the position of its camera in the
-    plot."""
-    seeds = run.settings.seeds
+    """The k-th view that a run took: facts, pictures (names in the album, captions, alternative
+    texts), and the position of its camera in the plot."""
+    seeds, view, quality = run.settings.seeds, frame.name, psnr_of(run, frame.name)
     step = run.steps[max(0, k - seeds + 1)]
     role = f"seed {k + 1} of {seeds}" if k < seeds else f"step {step['step']}"
-    facts = [("view", frame.name), ("taken as", role)]
+    facts = [("view", view), ("taken as", role)]
     # The numbers are known after the last of the seeds.
     facts += step_facts(step) if k >= seeds - 1 else [("images", str(k + 1))]
+    own, where, bright = f"{view}/{label}", f"seen from {view}", "bright where little is known"
+    pictures = [
+        (f"truth/{view}", "truth", f"Truth: the image of {view}, the rock in front of black."),
+        (f"render/{own}", f"render{quality}", f"Render of the last model at {view}{quality}."),
+        (f"error/{own}", "error", f"Absolute difference of truth and render at {view}{quality}."),
+    ]
+    for when, count in (("before", k), ("after", k + 1)):
+        caption = f"uncertainty {when} ({count} image{'' if count == 1 else 's'})"
+        alt = f"Uncertainty {where} {when} it was taken: {bright}."
+        pictures.append((f"{when}/{own}", caption, alt))
     return {
-        "name": frame.name,
+        "name": view,
         "facts": facts,
-        "pictures": list(_pictures(label, run, frame.name, k)),
+        "pictures": [dict(zip(("name", "caption", "alt"), row, strict=True)) for row in pictures],
         "eye": (upright(run.up) @ frame.camera.position).tolist(),
     }
-
-
-def _pictures(label: str, run: Run, view: str, k: int) -> Iterable[dict[str, str]]:
-    """Pictures of the k-th view that a run took: names in the album, captions, alternative
-    texts."""
-    quality, known = psnr_of(run, view), f"Uncertainty seen from {view}"
-    before, after = (f"{n} image{'' if n == 1 else 's'}" for n in (k, k + 1))
-    render = f"Render of the model of {len(run.indices)} images at {view}{quality}."
-    error = f"Absolute difference of truth and render at {view}, bright where it is large{quality}."
-    bright = "bright where little is known"
-    for name, caption, alt in (
-        ("truth", "truth", f"Truth: the image of {view}, the rock in front of black."),
-        ("render", f"render{quality}", render),
-        ("error", "error", error),
-        (
-            "before",
-            f"uncertainty before ({before})",
-            f"{known} before it was taken, with {before}: {bright}.",
-        ),
-        (
-            "after",
-            f"uncertainty after ({after})",
-            f"{known} after it was taken, with {after}: {bright}.",
-        ),
-    ):
-        own = "" if name == "truth" else f"/{label}"
-        yield {"name": f"{name}/{view}{own}", "caption": caption, "alt": alt}
 
 
 def _compared(runs: Mapping[str, Run], frame: Frame) -> dict[str, Any]:
@@ -213,38 +196,36 @@ def _compared(runs: Mapping[str, Run], frame: Frame) -> dict[str, Any]:
 def _plots(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     """Plots that compare runs: the paper's figures, and every metric that was measured after steps
     or of views."""
-    covered = step_curves(runs, "coverage", 100)
+    gain, covered = step_curves(runs, "information_gain"), step_curves(runs, "coverage", 100)
     added = {
         label: (x[1:], [b - a for a, b in pairwise(y)])
         for label, (x, y) in covered.items()
         if len(y) > 1
     }
-    gain, left = step_curves(runs, "information_gain"), step_curves(runs, "uncertainty")
-    wanted = [
-        (
-            "Information gain of each chosen view (the paper's Fig. 2)",
-            gain,
-            f"information gain ({GAIN_UNIT})",
-            True,
-        ),
+    title, axis = "Information gain of each chosen view", f"information gain ({GAIN_UNIT})"
+    plots = [
+        (f"{title} (the paper's Fig. 2)", gain, axis, True),
         ("Gaussians observed (coverage, Fig. 3)", covered, "coverage (%)", False),
         ("Coverage that each view added (Fig. 3)", added, "percentage points", True),
-        ("Variance left, over that of the prior", left, "mean over all parameters", True),
     ]
     steps = [step for run in runs.values() for step in run.steps]
-    for key in dict.fromkeys(key for step in steps for key in measured(step)):
-        name = METRIC_NAMES[key]
-        wanted.append((f"{name} after each step", step_curves(runs, key), name, False))
-    loss = step_curves(runs, "loss")
-    wanted.append(("Loss at the end of each fit", loss, "mean squared error", True))
-    plots = [line_plot(title, curves, y, zero) for title, curves, y, zero in wanted if curves]
+    of_steps = {
+        "uncertainty": ("Variance left, over that of the prior", "mean over all parameters", True)
+    }
+    of_steps |= {
+        key: (f"{METRIC_NAMES[key]} after each step", METRIC_NAMES[key], False)
+        for step in steps
+        for key in measured(step)
+    }
+    of_steps["loss"] = ("Loss at the end of each fit", "mean squared error", True)
+    for key, (title, axis, zero) in of_steps.items():
+        plots.append((title, step_curves(runs, key), axis, zero))
+    drawn = [line_plot(title, curves, axis, zero) for title, curves, axis, zero in plots if curves]
     views = {label: measured_views(run) for label, run in runs.items() if run.measured}
     if views:
-        masked = all(
-            any(view.get("psnr_mask") is not None for view in of_run) for of_run in views.values()
-        )
-        plots.append(views_plot("psnr_mask" if masked else "psnr", views))
-    return plots
+        masked = all(any(one.get("psnr_mask") is not None for one in of) for of in views.values())
+        drawn.append(views_plot("psnr_mask" if masked else "psnr", views))
+    return drawn
 
 
 def _fill_in(**values: Any) -> str:

@@ -63,28 +63,19 @@ class Access:
         if self.token is None:
             name = urlsplit(f"//{asked}").hostname
             return None if name in LOCAL else "the request names another host"
-        if self.given(path) or self.kept(headers):
+        tokens = parse_qs(urlsplit(path).query).get("token", [])
+        cookie = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
+        tokens += [cookie.value] if cookie else []
+        if any(hmac.compare_digest(text.encode(), self.token.encode()) for text in tokens):
             return None
         return "open the address that mgs view printed, with its token"
-
-    def given(self, path: str) -> bool:
-        """Whether the URL of a request has the token."""
-        return self._is_token(parse_qs(urlsplit(path).query).get("token", [""])[0])
-
-    def kept(self, headers: Any) -> bool:
-        """Whether the cookie of a request has the token."""
-        found = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
-        return found is not None and self._is_token(found.value)
-
-    def _is_token(self, text: str) -> bool:
-        return self.token is not None and hmac.compare_digest(text.encode(), self.token.encode())
 
     def answered(self, connection: Any, request: Any, answer: Callable[..., Any] | None) -> Any:
         """The response to a request; None goes on to a websocket. answer: of the server."""
         if why := self.refusal(request.path, request.headers):
             return connection.respond(HTTPStatus.FORBIDDEN, f"mgs: {why}\n")
         response = answer(connection, request) if answer else None
-        if response is not None and self.given(request.path):
+        if response is not None and self.token:
             cookie = f"{COOKIE}={self.token}; HttpOnly; SameSite=Strict; Path=/"
             response.headers["Set-Cookie"] = cookie
         return response
