@@ -46,47 +46,34 @@ def evaluate(
     - pictures: Write truth, render and difference of each view to RUN/renders.
     """
     from mgs.reports.evaluation import evaluate as measured
+    from mgs.reports.evaluation import evaluate_run
     from mgs.reports.simplify import PRUNED, REFITTED
-    from mgs.reports.tables import metrics_row
+    from mgs.reports.tables import comparison_rows, metrics_row
+    from mgs.run.folder import open_run
 
     runtime.start()
     rows, said = list[dict[str, Any]](), list[str]()
     with progress_bar() as bar:
         progress = partial(bar, "rendering and comparing")
         for subject in subjects:
-            others = (
-                [subject / name for name in (REFITTED, PRUNED)] if subject.is_dir() else [subject]
-            )
+            files = [subject]
             if subject.is_dir():
                 if dataset is not None:
                     raise InputError(
                         f"--dataset: is for a file, and {subject} has its own dataset; leave it out"
                     )
-                options = {"pictures": pictures, "progress": progress}
-                rows += _measured_run(subject, len(subjects) == 1, said, options)
-            for path in others:
-                if path.is_file() or path == subject:
-                    name = path.name if path == subject else f"  {path.stem.partition('_')[2]}"
-                    metrics = measured(path, dataset, progress=progress)
-                    rows.append(metrics_row(name, metrics))
-                    said.append(f"wrote {path.with_suffix('.metrics.json')}")
+                run = open_run(subject)
+                evaluate_run(run, pictures=pictures, progress=progress, say=said.append)
+                folder = f" ({subject.resolve().name})" if len(subjects) > 1 else ""
+                rows += comparison_rows({f"{run.label}{folder}": run})
+                smaller = [subject / name for name in (REFITTED, PRUNED)]
+                files = [path for path in smaller if path.is_file()]
+            for path in files:
+                name = path.name if path == subject else f"  {path.stem.partition('_')[2]}"
+                rows.append(metrics_row(name, measured(path, dataset, progress=progress)))
+                said.append(f"wrote {path.with_suffix('.metrics.json')}")
     print_quality(Terminal(), rows)
     _print(said)
-
-
-def _measured_run(
-    run: Path, alone: bool, said: list[str], options: dict[str, Any]
-) -> list[dict[str, Any]]:
-    """Evaluate a run; return its row of the table. alone: whether no other one is shown. said: gets
-    the lines for the user."""
-    from mgs.reports.evaluation import evaluate_run
-    from mgs.reports.tables import comparison_rows
-    from mgs.run.folder import open_run
-
-    opened = open_run(run)
-    evaluate_run(opened, say=said.append, **options)
-    label = opened.label if alone else f"{opened.label} ({run.resolve().name})"
-    return comparison_rows({label: opened})
 
 
 def diagnose(

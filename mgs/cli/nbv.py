@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from mgs.run.live import Live
     from mgs.run.state import Checkpoint
 
-TYPED = "COMMANDLINE"
-"""Name of the source of options that were given, not left at their default."""
-
 NAMES = f"Names (docs/nbv.md): {', '.join(POLICIES)}."
 
 
@@ -48,7 +45,6 @@ class _Keys(NbvSettings):
 
 @with_keys(_Keys)
 def nbv(
-    context: typer.Context,
     dataset: Annotated[Path | None, typer.Argument()] = None,
     out: Path | None = None,
     prior: Path | None = None,
@@ -89,7 +85,11 @@ def nbv(
     values = parse_settings(settings, nbv)
     live = live_capture(capture_command, capture_folder, values.pop("capture", {}))
     if resume is not None:
-        refuse_others(context, resume, values)
+        others = given(dataset=dataset, out=out, prior=prior, gaussians=gaussians, budget=budget)
+        others |= given(seeds=seeds, batch=batch, seed=seed, config=config, force=force or None)
+        for name in others | values:
+            where = f"--resume takes its settings from {resume / 'config.json'}; change it there"
+            raise InputError(f"nbv: {name}: {where}")
         resume_and_print(resume, console, policy, live=live)
         return
     recorded = settings_in(config) if config else {}
@@ -135,21 +135,6 @@ def live_capture(command: str | None, folder: Path | None, values: dict[str, Any
     return None
 
 
-def refuse_others(context: typer.Context, resume: Path, values: dict[str, Any]) -> None:
-    """Raises InputError where an option or a setting is given beside --resume."""
-    from mgs.errors import InputError
-
-    again = ("resume", "policy", "settings", "capture_command", "capture_folder")
-    others = [
-        name
-        for name in context.params
-        if name not in again and getattr(context.get_parameter_source(name), "name", "") == TYPED
-    ]
-    if others := [*others, *values]:
-        where = f"--resume takes its settings from {resume / 'config.json'}; change it there"
-        raise InputError(f"nbv: {others[0]}: {where}")
-
-
 def start_and_print(
     dataset: Path,
     out: Path,
@@ -178,12 +163,11 @@ def start_and_print(
 def resume_and_print(
     run: Path | Run,
     console: Terminal,
-    policy: Annotated[str | None, typer.Option(help=NAMES)] = None,
-    pictures: bool = False,
+    policy: str | None = None,
     live: Live | None = None,
 ) -> None:
-    """Run or resume the loop of a run, evaluate (with pictures where asked), print the table of
-    steps; where the output is no terminal, a line after each step instead.
+    """Run or resume the loop of a run, evaluate, print the table of steps; where the output is no
+    terminal, a line after each step instead.
 
     policy: FILE.py:FUNCTION where the run has a policy of the user's own. live: of its pictures.
     """
@@ -212,7 +196,6 @@ def resume_and_print(
                     progress.print(f"step {line['step']}: {warning}")
 
         state = resume_nbv(run, on_step, progress, policy, live).state
-        metrics = evaluate_run(
-            run.folder, pictures=pictures, progress=partial(progress, "evaluating")
-        )
+        watched = partial(progress, "evaluating")
+        metrics = evaluate_run(run.folder, pictures=False, progress=watched)
     print_run(run.folder, state, metrics, console)

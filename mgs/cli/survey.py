@@ -70,22 +70,21 @@ def _table(numbers: dict[str, Any]) -> Table:
     """Table of the numbers of survey.json."""
     from mgs.survey.flight import STAGES
 
+    rows = {
+        "frames, length of the flight": f"{numbers['frames']}, {numbers['path_length']:.1f} m",
+        "depth error on the rock (robust sigma)": f"{1e3 * numbers['depth_error_on_rock']:.1f} mm",
+        "returns lost": f"{numbers['returns_lost']:.1%}",
+        "points of the fused cloud": f"{numbers['points']:,}",
+    }
+    if not numbers["settings"]["exact_poses"]:
+        closed = ", ".join(f"{i}-{j}" for i, j, _ in numbers["loops"])
+        rows["steps where registration failed"] = str(numbers["steps_by_odometry"])
+        rows["loop closures"] = closed or "none"
+        for name, label in STAGES.items():
+            rms, most, turn = numbers["error"][name].values()
+            text = f"{1e3 * rms:.1f} mm rms, {1e3 * most:.1f} mm at most, {turn:.2f} degrees"
+            rows[f"trajectory error, {label}"] = text
     table = Table("survey", "number", title="Survey")
-    flight = f"{numbers['frames']}, {numbers['path_length']:.1f} m"
-    table.add_row("frames, length of the flight", flight)
-    error = f"{1e3 * numbers['depth_error_on_rock']:.1f} mm"
-    table.add_row("depth error on the rock (robust sigma)", error)
-    table.add_row("returns lost", f"{numbers['returns_lost']:.1%}")
-    table.add_row("points of the fused cloud", f"{numbers['points']:,}")
-    if numbers["settings"]["exact_poses"]:
-        table.add_row("poses", "as flown, no odometry")
-        return table
-    table.add_row("steps where registration failed", str(numbers["steps_by_odometry"]))
-    table.add_row("loop closures", ", ".join(f"{i}-{j}" for i, j, _ in numbers["loops"]) or "none")
-    table.add_section()
-    for name, label in STAGES.items():
-        found = numbers["error"][name]
-        text = f"{1e3 * found['ate_rms']:.1f} mm rms, {1e3 * found['ate_max']:.1f} mm at most"
-        text = f"{text}, {found['rotation_rms']:.2f} degrees"
-        table.add_row(f"trajectory error, {label}", text)
+    for row in rows.items():
+        table.add_row(*row)
     return table

@@ -125,9 +125,7 @@ def write_information_ply(
     columns |= {name: (rgb[:, i], "u1") for i, name in enumerate(("red", "green", "blue"))}
     columns |= {name.replace(".", "_"): (values, "f4") for name, values in scalars.items()}
     layout = [(name, kind) for name, (_, kind) in columns.items()]
-    vertices = np.empty(len(gaussians), dtype=layout)
-    for name, (values, _) in columns.items():
-        vertices[name] = values
+    vertices = np.rec.fromarrays([values for values, _ in columns.values()], dtype=layout)
     with atomic_path(path) as temporary:
         PlyData([PlyElement.describe(vertices, "vertex")]).write(str(temporary))
 
@@ -154,8 +152,6 @@ def write_preview(
     maps: `view_maps` of all scalars; title: of the render; unit: name of a length of 1. Raises
     InputError if the file cannot be written.
     """
-    import matplotlib
-
     from mgs.plotting import NO_GRID, crop, drawing, literal
 
     visible = maps["A"] >= VISIBLE
@@ -167,24 +163,36 @@ def write_preview(
         axes[0].imshow(picture(maps)[window], interpolation="nearest")
         axes[0].set_title(literal(title))
         for axis, (channel, (label, name)) in zip(axes[1:], PANELS.items(), strict=True):
-            values = np.ma.masked_where(~visible, maps[channel])[window]
-            colours = matplotlib.colormaps[name].with_extremes(bad="#e8e8e8")
-            norm = _norm(channel, values)
-            shown = axis.imshow(values, cmap=colours, norm=norm, interpolation="nearest")
+            norm = _norm(channel, maps[channel][visible])
+            shown = show_map(axis, maps, channel, window, name, norm=norm)
             axis.set_title(f"{label} ({unit})" if channel == "Z" else label)
             ticks = [0, 1] if channel == "unobserved" else None
             figure.colorbar(shown, ax=axis, shrink=0.85, aspect=16, pad=0.02, ticks=ticks)
-        for axis in axes:
-            axis.set_axis_off()
+        axes[0].set_axis_off()
 
 
-def _norm(channel: str, values: np.ma.MaskedArray) -> Any:
+def show_map(
+    axis: Any, maps: dict[str, np.ndarray], channel: str, window: Any, colours: str, **scale: Any
+) -> Any:
+    """Draw a channel of `view_maps` into axes without frame, grey where the opacity is below
+    VISIBLE.
+
+    window: rows and columns. colours: of a colour map. scale: `norm`, or `vmin` and `vmax`.
+    """
+    import matplotlib
+
+    values = np.ma.masked_where(maps["A"] < VISIBLE, maps[channel])[window]
+    axis.set_axis_off()
+    grey = matplotlib.colormaps[colours].with_extremes(bad="#e8e8e8")
+    return axis.imshow(values, cmap=grey, interpolation="nearest", **scale)
+
+
+def _norm(channel: str, data: np.ndarray) -> Any:
     """Colour scale of a channel: logarithmic for Fisher information, which spans many powers of
     ten; from 0 to 1 for `uncertainty` and `unobserved`; else from the least to about the largest of
-    the unmasked values [H,W]."""
+    the visible values [M]."""
     from matplotlib.colors import LogNorm, Normalize
 
-    data = values.compressed()
     if channel in ("uncertainty", "unobserved") or len(data) == 0:
         return Normalize(0, 1)
     high = float(np.quantile(data, 0.999))

@@ -15,7 +15,7 @@ from mgs.metrics import psnr
 from mgs.plotting import NO_GRID, crop, new_figure
 from mgs.policy import criteria
 from mgs.progress import Progress, listening
-from mgs.reports.diagnostics import VISIBLE, picture, view_maps
+from mgs.reports.diagnostics import VISIBLE, picture, show_map, view_maps
 from mgs.reports.figures import NEWEST, draw_cameras
 from mgs.reports.video import UNKNOWN, Film
 from mgs.run.folder import Run
@@ -74,7 +74,6 @@ def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], shown: Frame) ->
     """One frame, sRGB uint8 [H,W,3]."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.cm import ScalarMappable
 
     truth = srgb_from_linear(shown.masked_rgb())
     rgb = picture(maps)
@@ -93,10 +92,10 @@ def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], shown: Frame) ->
         orbit.set_xlabel("cameras, from above")
         render.imshow(rgb[window], interpolation="nearest")
         render.set_xlabel(f"render of a new view: {psnr(rgb, truth):.1f} dB")
-        inside = np.ma.masked_where(maps["A"] < VISIBLE, maps["uncertainty"])[window]
-        map_.imshow(inside, cmap=UNKNOWN, vmin=0, vmax=1, interpolation="nearest")
+        image = show_map(map_, maps, "uncertainty", window, UNKNOWN, vmin=0, vmax=1)
+        map_.set_axis_on()
         map_.set_xlabel(f"still unknown: {100 * _left(maps):.0f} %")
-        bar = figure.colorbar(ScalarMappable(cmap=UNKNOWN), ax=map_, shrink=0.7, aspect=14)
+        bar = figure.colorbar(image, ax=map_, shrink=0.7, aspect=14)
         bar.set_ticks([0, 1], labels=["known", "unknown"])
         for axis in (render, map_):
             axis.set(xticks=[], yticks=[])

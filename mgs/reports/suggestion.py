@@ -14,7 +14,7 @@ from mgs.data.frames import Frame
 from mgs.data.up import upright
 from mgs.files import write_json
 from mgs.policy.criteria import GAIN_UNIT
-from mgs.reports.diagnostics import VISIBLE, picture, run_scalars, view_maps
+from mgs.reports.diagnostics import VISIBLE, picture, run_scalars, show_map, view_maps
 from mgs.run.folder import Run
 from mgs.run.suggest import Suggestion, View, taken_in_order
 
@@ -83,8 +83,6 @@ def _record(view: View) -> dict[str, Any]:
 def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
     """Draw the site from above, and for the first planned views what the model shows from there and
     how uncertain it is. Raises InputError if the figure cannot be written."""
-    import matplotlib
-
     from mgs.plotting import NO_GRID, crop, drawing
 
     views = found.plan[:MOST_PICTURES]
@@ -95,17 +93,14 @@ def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
         for k, view in enumerate(views, 1):
             small = view.camera.resized(min(view.camera.width, PICTURE_WIDTH))
             maps = view_maps(run.state.gaussians, small, scalars)
-            visible = maps["A"] >= VISIBLE
-            window = crop(visible)
-            unknown = np.ma.masked_where(~visible, maps["uncertainty"])
-            colours = matplotlib.colormaps["cividis"].with_extremes(bad="#e8e8e8")
+            window = crop(maps["A"] >= VISIBLE)
             top, below = (figure.add_subplot(grid[row, k]) for row in (0, 1))
             top.imshow(picture(maps)[window])
             top.set_title(f"{k}: {view.name}\ngain {view.information_gain:.3f}")
-            shown = below.imshow(unknown[window], cmap=colours, vmin=0, vmax=1)
+            shown = show_map(below, maps, "uncertainty", window, "cividis", vmin=0, vmax=1)
             below.set_title(f"unknown {100 * view.unknown:.0f} %")
+            top.set_axis_off()
             for axis in (top, below):
-                axis.set_axis_off()
                 axis.set_anchor("N")
         figure.colorbar(shown, ax=below, shrink=0.8, aspect=16, label="variance left")
         figure.legend(loc="outside lower left", ncols=3)

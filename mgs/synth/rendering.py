@@ -27,7 +27,7 @@ from mgs.data.dataset import (
 )
 from mgs.data.frames import Frame
 from mgs.data.masks import write_sheet
-from mgs.data.meshes import GLTF, to_glb
+from mgs.data.meshes import to_glb
 from mgs.data.rock_image import write_rock_image
 from mgs.errors import InputError, row_named
 from mgs.files import atomic_path, copy_file, fingerprint, folder_locked, reading, write_json
@@ -49,12 +49,6 @@ ROCK_EXPOSURE = 0.2
 MAX_CLIPPED = 0.2
 """Largest share of rock and ground pixels that the exposure may clip, so that a dark rock does not
 blow out bright ground. The scenes of mgs clip at most 0.04."""
-
-VIEW_SECONDS, SAMPLE_SECONDS = 0.1, 1e-6
-"""Estimated seconds of a view, and of a sample more, on two cores; a lower bound."""
-
-MOST_HOURS = 24 * 90
-"""Longest estimate that is accepted; a longer one is a slip."""
 
 MOST_SAMPLES = 2**32
 """Samples that Mitsuba cannot render at once."""
@@ -143,7 +137,7 @@ def synth_orbit(
         if resumes(out, "config.json", resolved) and (out / "transforms.json").is_file():
             say(f"{out}: is finished already; nothing is rendered")
             return load_dataset(out)
-        _check_cost(out, preset, test_views, spp, say)
+        _check_cost(out, preset, test_views, spp)
         rock, scale = rock_of(settings, seed, mesh, mesh_up, say)
         size = preset.width, preset.height
         cameras = rock_cameras(settings, size, preset.frames, rock)
@@ -187,32 +181,21 @@ def synth_orbit(
         return load_dataset(out)
 
 
-def _check_cost(
-    out: Path, preset: RenderPreset, test_views: int, spp: int, say: Callable[[str], None]
-) -> None:
-    """Estimate time and disk space of a dataset, and say them if it takes more than an hour.
-
-    Raises InputError if a frame has more samples than Mitsuba renders at once, or if time, memory
-    or disk do not suffice.
-    """
+def _check_cost(out: Path, preset: RenderPreset, test_views: int, spp: int) -> None:
+    """Raise InputError if a frame has more samples than Mitsuba renders at once, or if memory or
+    disk do not suffice."""
     views, pixels = preset.frames + test_views, preset.width * preset.height
-    samples = pixels * spp
     what = f"{views:,} views of {preset.width}x{preset.height} with {spp:,} samples per pixel"
     instead = "lower `frames`, `test_views`, `size` or `spp`"
-    hours = views * (VIEW_SECONDS + SAMPLE_SECONDS * samples) / 3600
     needed = views * pixels * PIXEL_BYTES
     free = shutil.disk_usage(next(p for p in out.resolve().parents if p.exists())).free
-    cost = f"take about {hours:,.0f} hours and {needed / 2**30:,.1f} GiB on disk"
-    guides = pixels * whole_grid(GUIDES_PER_SAMPLE * spp)
-    if guides >= MOST_SAMPLES or hours > MOST_HOURS or needed > free:
+    if pixels * whole_grid(GUIDES_PER_SAMPLE * spp) >= MOST_SAMPLES or needed > free:
         raise InputError(
-            f"synth-orbit: {what} {cost}; at most {MOST_HOURS:,} hours, {free / 2**30:,.1f} GiB "
+            f"synth-orbit: {what} take {needed / 2**30:,.1f} GiB on disk; {free / 2**30:,.1f} GiB "
             f"and {MOST_SAMPLES // GUIDES_PER_SAMPLE:,} samples per view are possible; {instead}"
         )
     memory = views * VIEW_BYTES + pixels * IMAGE_BYTES
     check_room(memory, f"synth-orbit: {what}", instead)
-    if hours > 1:
-        say(f"{what} {cost}")
 
 
 def rock_of(
@@ -227,17 +210,10 @@ def rock_of(
         return make_rock(settings.rock, generator(seed, "rock")), 1.0
     rock, scale = load_rock(mesh, settings.rock, mesh_up)
     extents = " x ".join(f"{x:.2f}" for x in rock.extents)
-    up, suffix = mesh_up or up_axis(mesh), Path(mesh).suffix.lower()
-    if mesh_up:
-        reason = "is up, as `mesh_up` says"
-    elif suffix in GLTF:
-        reason = f"is up, as in all {suffix[1:].upper()} files"
-    else:
-        other = "y" if up == "z" else "z"
-        reason = f"taken as up, since its format does not say (`mesh_up` = {other} turns it)"
+    up = (mesh_up or up_axis(mesh)).upper()
     say(
-        f"{mesh}: +{up.upper()} {reason}; scaled {scale:.4g} times to the scene's rock size, "
-        f"now {extents} m"
+        f"{mesh}: +{up} is up (`mesh_up` tells); scaled {scale:.4g} times to the scene's rock "
+        f"size, now {extents} m"
     )
     return rock, scale
 
