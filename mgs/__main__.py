@@ -18,17 +18,12 @@ def main() -> None:
 
         run()
     except BaseException as error:
+        from mgs.errors import from_interrupt
+
         if isinstance(error, SystemExit) or not from_interrupt(error):
             raise
         print("mgs: interrupted", file=sys.stderr)
         raise SystemExit(130) from None
-
-
-def from_interrupt(error: BaseException | None) -> bool:
-    """Whether Ctrl-C caused an exception: during a call, Dr.Jit raises one of its own."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
 
 
 if __name__ == "__main__":

@@ -55,6 +55,13 @@ class InputError(ValueError):
         return printable(str(self.args[0]))
 
 
+def from_interrupt(error: BaseException | None) -> bool:
+    """Whether Ctrl-C caused an exception: during a call, Dr.Jit raises one of its own."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
 class Notice(UserWarning):
     """Something that a user should know and that ends nothing. Commands print it as one line."""
 

@@ -23,10 +23,9 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from mgs import __version__
-from mgs.__main__ import from_interrupt
 from mgs.cli.options import Row, describe
 from mgs.cli.renamed import renewed
-from mgs.errors import InputError, Notice, missing, printable
+from mgs.errors import InputError, Notice, from_interrupt, missing, printable
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C: by convention 128 plus the number of the signal, SIGINT."""
