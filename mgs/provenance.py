@@ -1,11 +1,9 @@
-"""Command line and versions, which files of results record."""
+"""Versions, which files of results record."""
 
 from __future__ import annotations
 
 import platform
-import shlex
 import subprocess
-import sys
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -42,13 +40,3 @@ def _commit() -> dict[str, str]:
     except (OSError, subprocess.SubprocessError):
         return {}
     return {"commit": result.stdout.strip()}
-
-
-def command_line() -> str:
-    """Command line of this process as typed, with the program's name without its folder.
-
-    `python -m mgs` becomes `mgs`.
-    """
-    program = Path(sys.argv[0])
-    name = program.parent.name if program.name == "__main__.py" else program.name
-    return shlex.join([name, *sys.argv[1:]])

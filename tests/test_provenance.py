@@ -1,25 +1,9 @@
-"""Command line and versions in results."""
+"""Versions in results."""
 
 import subprocess
-import sys
-
-import pytest
 
 from mgs import provenance
-from mgs.provenance import command_line, versions
-
-
-@pytest.mark.parametrize(
-    ("typed", "said"),
-    [
-        (["/usr/bin/mgs", "nbv", "out"], "mgs nbv out"),
-        (["/lib/mgs/__main__.py", "nbv", "out dir"], "mgs nbv 'out dir'"),  # python -m mgs
-        (["tools/ranking.py", "a.json"], "ranking.py a.json"),
-    ],
-)
-def test_the_command_that_is_recorded_is_the_one_that_was_typed(monkeypatch, typed, said):
-    monkeypatch.setattr(sys, "argv", typed)
-    assert command_line() == said
+from mgs.provenance import versions
 
 
 def test_a_checkout_tells_its_commit(monkeypatch, tmp_path):

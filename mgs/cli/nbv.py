@@ -166,14 +166,13 @@ def resume_and_print(
     policy: str | None = None,
     live: Live | None = None,
 ) -> None:
-    """Run or resume the loop of a run, evaluate, print the table of steps; where the output is no
-    terminal, a line after each step instead.
+    """Run or resume the loop of a run with a line for each step, evaluate, print the quality.
 
     policy: FILE.py:FUNCTION where the run has a policy of the user's own. live: of its pictures.
     """
     from functools import partial
 
-    from mgs.cli.printing import certificate_line, print_run, step_line
+    from mgs.cli.printing import print_run, step_lines
     from mgs.cli.progress import progress_bar
     from mgs.reports.evaluation import evaluate_run
     from mgs.run.folder import open_run
@@ -187,13 +186,8 @@ def resume_and_print(
             progress.whole(f"{run.folder.name}: images", len(state.taken), total)
             new = state.steps[len(known) :]
             known.extend(new)
-            for line in new:
-                if not console.is_terminal:
-                    progress.print(step_line(line))
-                if "certificate" in line:
-                    progress.print(certificate_line(line["certificate"]))
-                for warning in line.get("warnings", []):
-                    progress.print(f"step {line['step']}: {warning}")
+            for line in [line for step in new for line in step_lines(step)]:
+                progress.print(line)
 
         state = resume_nbv(run, on_step, progress, policy, live).state
         watched = partial(progress, "evaluating")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,11 +34,11 @@ MOST_NAMES = 8
 """Most seed views that are named in a line, not counted."""
 
 MEASURED = {
-    f"{prefix}{key}": f"{name}\n{views}"
-    for prefix, views in (("test_", "test"), ("held_out_", "held out"), ("", "all"))
+    f"{prefix}{key}": f"{name} of {views} views"
+    for prefix, views in (("test_", "test"), ("held_out_", "held-out"), ("", "all"))
     for key, name in (("psnr", "PSNR"), ("psnr_mask", "masked PSNR"))
 }
-"""Metrics of steps.jsonl -> headings; a table of steps shows the first two that there are."""
+"""Metrics of steps.jsonl -> words; a line shows the first two that there are."""
 
 
 def settings_table(keys: Sequence[tuple[str, str, str]]) -> Table:
@@ -78,69 +78,36 @@ def _heading(key: str, new: bool) -> str:
 
 
 def print_run(out: Path, state: Checkpoint, metrics: dict[str, Any], console: Terminal) -> None:
-    """Print the steps of a run as a table, on a terminal only, then the quality of its model."""
+    """Print the quality of a run's model, and why it has ended."""
     from mgs.reports.tables import metrics_row
     from mgs.run.ending import RunEnd, why_ended
 
-    if console.is_terminal:  # a log has a line a step
-        _print_steps(state.steps, console)
-    last = state.steps[-1] if state.steps else {}
-    coverage = 100 * last["coverage"] if last else None
-    print_quality(console, [metrics_row(metrics["policy"], metrics) | {"coverage": coverage}])
+    last = state.steps[-1]
+    row = metrics_row(metrics["policy"], metrics) | {"coverage": 100 * last["coverage"]}
+    print_quality(console, [row])
     if "ended" in last and (last["ended"]["views"] or last["ended"]["reason"] != RunEnd.BUDGET):
         console.print(f"the run has ended: {why_ended(last['ended'])}", soft_wrap=True)
     console.print(f"wrote {out}", soft_wrap=True)
 
 
-def _print_steps(steps: Sequence[Mapping[str, Any]], console: Terminal) -> None:
-    """Print the steps of a run as a table."""
-    measured = _measured(steps)
-    columns = ["step", "image", "score", "coverage", "passes"]
-    columns += [MEASURED[key] for key in measured] or ["loss", "stopped"]
-    table = Table(box=None)
-    for heading in (*columns, "seconds"):
-        table.add_column(heading, no_wrap=heading != "image", overflow="fold")
-    for line in steps:
-        names = [line["name"]] if line["name"] else line["seed_names"]
-        score = "" if line["score"] is None else f"{line['score']:.4g}"
-        fit = ["", "", ""]
-        if "loss" in line:
-            fit = [passes(line), f"{line['loss']:.3g}", line["stop_reason"]]
-        if measured:
-            fit[1:] = [f"{line[key]:.2f}" if key in line else "" for key in measured]
-        coverage, seconds = f"{100 * line['coverage']:.2f} %", sum(line["seconds"].values())
-        table.add_row(str(line["step"]), "\n".join(names), score, coverage, *fit, f"{seconds:.1f}")
-    console.print(table)
-
-
-def _measured(steps: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The two keys of MEASURED to show: PSNR and masked PSNR over the first set that steps have."""
-    return [key for key in MEASURED if any(key in line for line in steps)][:2]
-
-
-def passes(line: Mapping[str, Any]) -> str:
-    """Number of passes of the fit in a line of steps.jsonl."""
-    return str(line["iterations"] // line["images"])
-
-
-def step_line(line: Mapping[str, Any]) -> str:
-    """A step in one line, for a log."""
-    names = [line["name"]] if line["name"] else line["seed_names"]
-    views = ", ".join(names) if len(names) <= MOST_NAMES else f"{len(names)} views"
-    parts = [f"step {line['step']}: {views}"]
-    parts.append(f"coverage {100 * line['coverage']:.2f} %")
-    if "loss" in line:
-        parts.append(f"{passes(line)} passes")
-    measured = _measured([line])
-    if not measured and (psnr := line.get("prediction", {}).get("psnr")):
-        parts.append(f"masked PSNR of views not taken about {psnr:.1f} dB")
-    for key in measured:
-        parts.append(f"{' '.join(MEASURED[key].split())} views {line[key]:.2f} dB")
-    return ", ".join([*parts, f"{sum(line['seconds'].values()):.1f} s"])
-
-
-def certificate_line(record: Mapping[str, Any]) -> str:
-    """Sentence of a certificate in steps.jsonl."""
+def step_lines(step: Mapping[str, Any]) -> Iterator[str]:
+    """A line of steps.jsonl in words: a line for the step, its certificate and its warnings."""
     from mgs.policy.certificate import Certificate
 
-    return Certificate(**record).sentence()
+    names = [step["name"]] if step["name"] else step["seed_names"]
+    views = ", ".join(names) if len(names) <= MOST_NAMES else f"{len(names)} views"
+    parts = [f"step {step['step']}: {views}"]
+    if step["score"] is not None:
+        parts.append(f"score {step['score']:.4g}")
+    parts.append(f"coverage {100 * step['coverage']:.2f} %")
+    if "loss" in step:
+        passes = step["iterations"] // step["images"]
+        parts.append(f"{passes} passes to a loss of {step['loss']:.3g} ({step['stop_reason']})")
+    measured = [key for key in MEASURED if key in step][:2]
+    if not measured and (psnr := step.get("prediction", {}).get("psnr")):
+        parts.append(f"masked PSNR of views not taken about {psnr:.1f} dB")
+    parts += [f"{MEASURED[key]} {step[key]:.2f} dB" for key in measured]
+    yield ", ".join([*parts, f"{sum(step['seconds'].values()):.1f} s"])
+    if "certificate" in step:
+        yield Certificate(**step["certificate"]).sentence()
+    yield from (f"step {step['step']}: {warning}" for warning in step.get("warnings", []))
