@@ -1,5 +1,5 @@
 """Quality of a rendered view as an image (PSNR and SSIM of sRGB values) and as a surface (alpha and
-depth), and agreement of rankings."""
+depth)."""
 
 from __future__ import annotations
 
@@ -198,17 +198,3 @@ def compare_surface(
 def _mean(values: np.ndarray) -> float:
     """Mean of the values, NaN if there are none."""
     return float(values.mean()) if values.size else math.nan
-
-
-def agreement(mine: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Agreement of scores of candidates [C] with reference scores.
-
-    "tau": Kendall's tau, 0 if one of them is constant. "regret": share of the best reference score
-    that is lost by taking our best candidate.
-    """
-    from scipy.stats import kendalltau  # takes half a second, and few programs rank
-
-    constant = np.ptp(mine) == 0 or np.ptp(reference) == 0
-    tau = 0.0 if constant else float(kendalltau(mine, reference).statistic)
-    best, top = int(np.argmax(mine)), float(reference.max())
-    return {"tau": tau, "regret": float((top - reference[best]) / max(abs(top), 1e-300))}

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from mgs.metrics import agreement
 from mgs.policy.criteria import Score, d_optimal, fisherrf, t_optimal
 from studies.output import Panel
 from studies.stress.lab import Array, Experiment, cells_per_rock, open_lab, turns
@@ -172,3 +171,17 @@ CONVERGENCE = Experiment(
               (("fit", "with the prior"),)),
     ),
 )  # fmt: skip
+
+
+def agreement(mine: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """Agreement of scores of candidates [C] with reference scores.
+
+    "tau": Kendall's tau, 0 if one of them is constant. "regret": share of the best reference score
+    that is lost by taking our best candidate.
+    """
+    from scipy.stats import kendalltau  # takes half a second, and few programs rank
+
+    constant = np.ptp(mine) == 0 or np.ptp(reference) == 0
+    tau = 0.0 if constant else float(kendalltau(mine, reference).statistic)
+    best, top = int(np.argmax(mine)), float(reference.max())
+    return {"tau": tau, "regret": float((top - reference[best]) / max(abs(top), 1e-300))}
