@@ -204,6 +204,13 @@ class Camera:
         film = self.film and self.film.moved(offset)
         return Camera(self.K, self.width, self.height, pose, film, self.corner)
 
+    def turned(self, turn: ArrayLike) -> Camera:
+        """Same camera in a world that is turned by a rotation [3,3]."""
+        pose = self.world_to_camera.copy()
+        pose[:3, :3] = pose[:3, :3] @ np.transpose(turn)
+        film = self.film and self.film.turned(turn)
+        return Camera(self.K, self.width, self.height, pose, film, self.corner)
+
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """Camera of a window of the image, all four in pixels.
 
@@ -246,13 +253,13 @@ def look_at(
     return pose
 
 
-def heading_and_pitch(camera: Camera, turn: ArrayLike = np.eye(3)) -> tuple[float, float]:
+def heading_and_pitch(camera: Camera) -> tuple[float, float]:
     """Direction of view, degrees: heading clockwise from +Y (0 to 360), pitch above the horizon.
 
-    turn: rotation [3,3] from the camera's world to one with +Z up. Where the camera looks straight
-    down, the heading is that of the image's top; straight up, that of its bottom.
+    Where the camera looks straight down, the heading is that of the image's top; straight up, that
+    of its bottom.
     """
-    _, (down_x, down_y, _), (x, y, z) = camera.world_to_camera[:3, :3] @ np.transpose(turn)
+    _, (down_x, down_y, _), (x, y, z) = camera.world_to_camera[:3, :3]
     if np.hypot(x, y) < 1e-6:
         x, y = np.sign(z) * down_x, np.sign(z) * down_y
     heading, pitch = np.degrees(np.arctan2(x, y)), np.degrees(np.arcsin(np.clip(z, -1, 1)))

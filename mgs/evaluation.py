@@ -24,6 +24,7 @@ from mgs.camera import Camera
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import TEST_FOLDER, Dataset
 from mgs.data.frames import Frame, as_captured
+from mgs.data.world import UPRIGHT, World
 from mgs.files import atomic_path
 from mgs.gaussians import Gaussians
 from mgs.images import PNG_LEVEL
@@ -75,7 +76,7 @@ def psnr_measure(
     """
     tests = dataset.test_views()
     frames = dataset.frames if tests is None else tests.frames
-    of = psnr_over(frames, cache, exposure)
+    of = psnr_over(frames, cache, exposure, dataset.world)
 
     def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
         if tests is not None:
@@ -89,17 +90,17 @@ def psnr_measure(
 
 
 def psnr_over(
-    frames: Sequence[Frame], cache: ListCache, exposure: bool = False
+    frames: Sequence[Frame], cache: ListCache, exposure: bool = False, world: World = UPRIGHT
 ) -> Callable[[Gaussians, Sequence[int]], dict[str, np.ndarray]]:
     """Returns a function (gaussians, indices of frames) -> PSNR of each of these views, dB.
 
     Keys: those of `mgs.metrics.compare_psnr`, `..._corrected` only with `exposure`. Images are kept
-    for the next call.
+    for the next call. world: of the frames' files.
     """
     names = ("psnr", "psnr_mask", *(("psnr_corrected", "psnr_mask_corrected") if exposure else ()))
 
     def read(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        rgba, weight = as_captured(frames[index]).target()
+        rgba, weight = as_captured(frames[index], world).target()
         return srgb_from_linear(rgba[..., :3]), weight > 0, frames[index].mask() & (weight > 0)
 
     truth = kept_within(IMAGE_BYTES, read, lambda parts: sum(part.nbytes for part in parts))
@@ -113,7 +114,8 @@ def psnr_over(
         from mgs.splat import as_drjit
 
         model = as_drjit(gaussians)
-        drawn = ((i, render_view(model, as_captured(frames[i]).camera, cache)) for i in chosen)
+        cameras = {i: as_captured(frames[i], world).camera for i in chosen}
+        drawn = ((i, render_view(model, camera, cache)) for i, camera in cameras.items())
         rows = list(_compared(drawn, compared, 2))
         return {name: np.array([row[name] for row in rows], float) for name in names}
 

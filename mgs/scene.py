@@ -17,7 +17,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, target_of
 from mgs.data.frames import Frame, as_asked
-from mgs.data.up import upright
+from mgs.errors import InputError
 from mgs.fit.fitting import Fit, fit
 from mgs.fit.settings import ALPHA_WEIGHT, ModelSettings, TrainSettings
 from mgs.fit.stopping import DivergedError, StopReason
@@ -104,7 +104,7 @@ class Scene:
       choices (`mgs.memory.VIEW_BYTES`).
 
     Values are computed at their first use and kept. Raises InputError as
-    `ModelSettings.regularisation`.
+    `ModelSettings.regularisation`, and where the prior was built with another upward direction.
     """
 
     dataset: Dataset
@@ -118,6 +118,11 @@ class Scene:
             weight = ALPHA_WEIGHT if self.dataset.outlined else 0.0
             settings = ModelSettings(train=TrainSettings(alpha_weight=weight))
             object.__setattr__(self, "settings", settings)
+        if not np.allclose(self.prior.world.up, self.dataset.world.up):
+            raise InputError(
+                f"prior: was built with up {self.prior.world.up}, the dataset has "
+                f"{self.dataset.world.up}; load the dataset with `up` of the prior"
+            )
 
     @cached_property
     def frames(self) -> tuple[Frame, ...]:
@@ -125,19 +130,14 @@ class Scene:
         return tuple(as_asked(frame) for frame in self.dataset.frames)
 
     @cached_property
-    def turn(self) -> np.ndarray:
-        """Rotation [3,3] that turns the world's up to +Z."""
-        return upright(self.prior.up)
-
-    @cached_property
     def centre(self) -> np.ndarray:
-        """Middle of the object [3], metres, +Z up."""
-        return self.turn @ self.prior.points.mean(axis=0)
+        """Middle of the object [3], metres."""
+        return np.asarray(self.prior.points.mean(axis=0))
 
     @cached_property
     def ground(self) -> float:
         """Height of the object's lowest point, metres."""
-        return float((self.prior.mesh.vertices @ np.array(self.prior.up)).min())
+        return float(self.prior.mesh.vertices[:, 2].min())
 
     @cached_property
     def groups(self) -> dict[str, slice]:
@@ -296,12 +296,12 @@ class Scene:
         def progress(done: int, total: int) -> None:
             report(Stage.SCORE, done, total)
 
-        points, lam = start.means[:count] @ self.turn.T, float(self.surface_lam[0])
-        return Visibility(state.cameras, exact, points, self.centre, lam, self.turn, progress)
+        points, lam = start.means[:count], float(self.surface_lam[0])
+        return Visibility(state.cameras, exact, points, self.centre, lam, progress)
 
     def positions(self, frames: Sequence[Frame]) -> np.ndarray:
-        """Camera centres [V,3], metres, +Z up."""
-        return np.array([frame.camera.position for frame in frames]) @ self.turn.T
+        """Camera centres [V,3], metres."""
+        return np.array([frame.camera.position for frame in frames])
 
     def seeds(self, count: int, among: Sequence[int] | None = None) -> list[int]:
         """Views to begin with, spread over the directions of the poses (`poses.seed_views`).

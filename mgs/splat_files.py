@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mgs.data.gltf import MAGIC
-from mgs.data.up import PLUS_Z, Up
+from mgs.data.world import PLUS_Z, Vector
 from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, parsing, reading
 from mgs.gaussians import ARRAYS, Gaussians
@@ -95,7 +95,7 @@ def load_gaussians(path: str | Path) -> Gaussians:
     return g.check(path)
 
 
-def upward(path: str | Path) -> Up:
+def upward(path: str | Path) -> Vector:
     """Upward direction of a file's world: what a GLB says, else +Z."""
     return up_of_glb(Path(path)) if _kind(Path(path)) == "glb" else PLUS_Z
 

@@ -18,7 +18,7 @@ from scipy.special import logit
 
 from mgs.colour import SH_C0
 from mgs.data.gltf import BINARY, INSTANCING, JSON, MAGIC, SIZES, Gltf
-from mgs.data.up import PLUS_Z, Up, unit_up
+from mgs.data.world import PLUS_Z, Vector, unit_up
 from mgs.errors import InputError
 from mgs.files import atomic_path, parsing, reading
 from mgs.gaussians import ARRAYS, Gaussians
@@ -134,7 +134,7 @@ def read_glb(path: str | Path) -> Gaussians:
         return mirrored(whole, (-1, -1, 1)) if made_by.startswith(PLAYCANVAS) else whole
 
 
-def up_of_glb(path: Path) -> Up:
+def up_of_glb(path: Path) -> Vector:
     """Upward direction in the world in which `read_glb` returns Gaussians. Raises InputError."""
     with reading(path, "file; give a GLB"), parsing(path, "GLB", "export it again"):
         gltf = Gltf(path, HANDLED)

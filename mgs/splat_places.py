@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mgs.data.world import World
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.rotation import rotmat_from_quat
@@ -75,6 +76,26 @@ def moved(g: Gaussians, matrix: np.ndarray, where: object) -> Gaussians:
     quats, log_scales, sh = (np.asarray(array, np.float32) for array in (quats, log_scales, sh))
     turned = replace(g, quats=quats, log_scales=log_scales, sh=sh)
     return settled(turned, g.means.astype(np.float64) @ A.T, origin)
+
+
+def to_source(g: Gaussians, world: World) -> Gaussians:
+    """Gaussians of an upright world in that of the files it was read from, except for its origin:
+    the only way out for models."""
+    return g if np.array_equal(world.turn, np.eye(3)) else moved(g, _turn(world.turn.T), "model")
+
+
+def from_source(g: Gaussians, world: World) -> Gaussians:
+    """Gaussians in the world of a dataset's files as that dataset's upright world has them. Those
+    without an origin of their own count from that of the dataset already."""
+    g = g.counted_from(world.origin)
+    return g if np.array_equal(world.turn, np.eye(3)) else moved(g, _turn(world.turn), "model")
+
+
+def _turn(rotation: np.ndarray) -> np.ndarray:
+    """Transform [4,4] of a rotation [3,3]."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    return matrix
 
 
 def settled(g: Gaussians, means: np.ndarray, origin: np.ndarray) -> Gaussians:

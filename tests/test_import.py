@@ -302,7 +302,7 @@ def test_images_are_set_apart_as_test_views(dataset, tmp_path, capsys):
     names = [frame.name for frame in dataset.frames]
     assert [frame.name for frame in tests.frames] == names[::3]
     assert [frame.name for frame in made.frames] == [name for i, name in enumerate(names) if i % 3]
-    assert tests.up == made.up
+    assert tests.world == made.world
     for frame in dataset.frames[1:]:
         frame.image_path.unlink()
     assert exit_code(*arguments, tmp_path / "none") == 2

@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter
 import mgs
 from mgs.camera import look_at, opengl_from_opencv
 from mgs.data.dataset import load_dataset
-from mgs.data.up import unit_up
+from mgs.data.world import unit_up
 from mgs.errors import InputError, Notice
 from mgs.images import read_exr, read_rgba, write_png
 from mgs.prior.build import load_prior
@@ -119,10 +119,11 @@ def test_the_run_of_a_command_is_that_on_the_complete_dataset(flight, pristine, 
 
 
 def test_headings_are_clockwise_from_the_worlds_own_y(poses, tmp_path):
-    dataset = replace(load_dataset(poses, to_capture=True), up=unit_up((-0.6, 0.5, -0.4)))
-    up, frame = np.array(dataset.up), dataset.frames[4]
+    dataset = load_dataset(poses, to_capture=True, up=unit_up((-0.6, 0.5, -0.4)))
+    up, frame = np.array(dataset.world.up), dataset.frames[4]
+    asked = dataset.world.leave(frame.camera)
     pose, _ = live.ask(tmp_path, frame, dataset, 1)
-    y, ahead = (v - (v @ up) * up for v in (np.eye(3)[1], frame.camera.world_to_camera[2, :3]))
+    y, ahead = (v - (v @ up) * up for v in (np.eye(3)[1], asked.world_to_camera[2, :3]))
     heading = math.degrees(math.atan2(-np.cross(y, ahead) @ up, y @ ahead)) % 360
     assert json.loads(pose.read_text())["heading"] == pytest.approx(heading)
 

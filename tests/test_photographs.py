@@ -28,7 +28,7 @@ from mgs.data.importers import import_source
 from mgs.data.masks import make_masks
 from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.sources import read_source
-from mgs.data.up import degrees_between, levelled, unit_up, up_of_cameras, upright
+from mgs.data.world import World, degrees_between, levelled, unit_up, up_of_cameras
 from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.fit import density
@@ -189,7 +189,7 @@ def test_real_clouds_give_the_rock(exact, colmap, tmp_path, masks):
     settings = PriorSettings(gaussians=600, backing=0)
     prior, cloud = prior_and_cloud(dataset, settings)
     rock = synthetic.rock_mesh()
-    points = (prior.points - SHIFT) @ TURN / SCALE
+    points = (prior.world.leave(prior.points) - SHIFT) @ TURN / SCALE
     distance = distances_to_mesh(points, rock.vertices, rock.faces)
     assert prior.numbers["from"] == "points"
     assert ("hull_cell" in prior.numbers) == masks
@@ -197,7 +197,7 @@ def test_real_clouds_give_the_rock(exact, colmap, tmp_path, masks):
     assert distance.mean() < (0.015 if masks else 0.025)
     assert np.quantile(distance, 0.9) < (0.035 if masks else 0.06)
     assert len(cloud.rock_points) > 150
-    assert degrees_between(prior.up, unit_up(TURN[:, 2])) < 3
+    assert degrees_between(prior.world.up, unit_up(TURN[:, 2])) < 3
     assert np.array_equal(prior.points, build_prior(dataset, settings).points)
 
     sparse = read_cloud(dataset.root / "sparse.ply")
@@ -307,14 +307,10 @@ def test_a_cloud_survives_its_file_and_of_points_in_one_place_one_is_kept(tmp_pa
 @example([0.0, 0.0, -1.0])
 def test_upright_is_the_rotation_that_turns_up_to_z(vector):
     up = unit_up(vector)
-    turn = upright(up)
-    assert np.allclose(turn @ turn.T, np.eye(3), atol=1e-9)
-    assert np.linalg.det(turn) == pytest.approx(1)
-    assert np.allclose(turn @ up, [0, 0, 1], atol=1e-9)
-    assert np.array_equal(upright((0.0, 0.0, 1.0)), np.eye(3))
     ahead = [0, 0, 1] if abs(up[1]) > np.sqrt(0.5) else [0, 1, 0]  # the bearing of a flight plan
     turn = levelled(up)
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(turn) == pytest.approx(1)
     np.testing.assert_allclose(turn @ up, [0, 0, 1], atol=1e-9)
     along = turn @ ahead
     assert abs(along[0]) < 1e-9 < along[1]
@@ -346,20 +342,21 @@ def test_the_unit_scales_cameras_and_points_to_metres(colmap, tmp_path, capsys):
     raw, metres = load_dataset(tmp_path / "raw"), load_dataset(tmp_path / "metres")
     assert (raw.unit, metres.unit) == ("unit", "m")
     for one, other in zip(raw.frames, metres.frames, strict=True):
-        assert np.allclose(one.camera.position / SCALE, other.camera.position)
+        own = metres.world.leave(other.camera)
+        assert np.allclose(one.camera.position / SCALE, own.position)
     points = [read_cloud(tmp_path / name / "sparse.ply").points for name in ("raw", "metres")]
     assert np.allclose(points[0] / SCALE, points[1], atol=1e-5)
 
 
 def test_lengths_of_unknown_unit_are_not_called_metres(tmp_path, capsys):
     dataset = synthetic.write_dataset(tmp_path, depth=False)
-    write_transforms(tmp_path, dataset.frames, unit="unit")
+    write_transforms(tmp_path, dataset.frames, World(unit="unit"))
     command("prior", tmp_path, "--gaussians", "300", "--up", "0,1,0")
     out = said(capsys)[0]
     assert "prior from hull: the dataset has masks" in out
     assert "unit²" in out
     assert "m²" not in out
-    assert load_prior(tmp_path / "prior").up == (0.0, 1.0, 0.0)
+    assert load_prior(tmp_path / "prior").world.up == (0.0, 1.0, 0.0)
 
 
 # Photographs of a phone
@@ -472,7 +469,7 @@ def test_a_world_in_which_nothing_would_be_drawn_is_one_line(tmp_path, capsys):
     command("import", tmp_path / "src", "--out", tmp_path / "d", "--unit", "0.002")
     command("prior", tmp_path / "d", "--gaussians", "300")
     capsys.readouterr()
-    message = "m from it, and nothing nearer than 0.01 is drawn; import the data with `unit`"
+    message = "from it, and nothing nearer than 0.01 is drawn; import the data with `unit`"
     out = tmp_path / "run"
     assert message in refused(capsys, ["nbv", tmp_path / "d", "--out", out, "--budget", 1], out)
 
@@ -522,7 +519,8 @@ def test_photographs_without_masks_are_fitted_whole_from_their_points(colmap, tm
     command(*fitted, "--gaussians", "400", "--out", tmp_path / "whole")
     assert "start: 400 points of the cameras and 0 random ones" in capsys.readouterr().out
     prior, cloud = load_prior(tmp_path / "whole/prior"), read_cloud(tmp_path / "d/sparse.ply")
-    assert cKDTree(cloud.points).query(prior.points)[0].max() < 1e-5
+    own = prior.world.leave(prior.points)
+    assert cKDTree(cloud.points).query(own)[0].max() < 1e-5
     command(*fitted, "--prior", tmp_path / "d/prior", "--out", tmp_path / "object")
     for name, sh in (("whole", 0), ("object", 1)):
         assert read_json(tmp_path / name / "config.json")["settings"]["sh"] == sh

@@ -259,7 +259,7 @@ def test_error_to_truth_sees_a_wrong_prior(built, dataset):
     prior, rock = built
     moved = Mesh(prior.mesh.vertices + 0.05 * Z, prior.mesh.faces, prior.mesh.seen)
     points, truth = prior.points + 0.05 * Z, dataset.root / "rock.glb"
-    error = error_to_truth(points, prior.spacing, moved, truth, dataset.frames, rock, 0)
+    error = error_to_truth(points, prior.spacing, moved, truth, dataset, rock, 0)
     assert 0.02 < error["accuracy"] < 0.05
     assert error["hausdorff"] == pytest.approx(0.05, abs=0.02)
 

@@ -258,7 +258,7 @@ def test_cameras_pixels_and_depth_are_those_recorded(dataset, tmp_path, capsys, 
     assert not (tmp_path / "out.unpacked").exists()
     made = load_dataset(out)
     assert len(made) == len(dataset)
-    assert np.allclose(made.up, (0, 0, 1), atol=1e-9)
+    assert np.allclose(made.world.up, (0, 0, 1), atol=1e-9)
     for one, other in zip(dataset.frames, made.frames, strict=True):
         assert np.allclose(one.camera.world_to_camera, other.camera.world_to_camera, atol=1e-6)
         assert np.allclose(one.camera.K, other.camera.K, atol=1e-9)

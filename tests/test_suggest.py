@@ -16,7 +16,7 @@ import mgs
 from mgs.camera import Camera, heading_and_pitch, look_at
 from mgs.data import flight_plan
 from mgs.data.dataset import load_cameras, load_dataset
-from mgs.data.up import upright
+from mgs.data.world import World
 from mgs.run.candidates import Site, inside, place_poses, read_poses
 from mgs.run.folder import open_run
 from mgs.run.suggest import coarse_prior, suggest
@@ -262,7 +262,8 @@ def test_headings_straight_down_and_up_and_in_a_world_that_stands_otherwise():
     assert (heading, pitch) == (pytest.approx(100), pytest.approx(-90))
     up = Camera(camera.K, 8, 8, look_at([0, 0, 0], [0, 0, 5], [-1, 0, 0]))
     assert heading_and_pitch(up) == pytest.approx((90, 90))
+    world = World((0.0, -1.0, 0.0))
     west = Camera(camera.K, 8, 8, look_at([0, 0, 0], [-1, 0, 0], [0, -1, 0]))
-    assert heading_and_pitch(west, upright((0, -1, 0))) == pytest.approx((270, 0))
+    assert heading_and_pitch(world.enter(west)) == pytest.approx((270, 0))
     north = Camera(camera.K, 8, 8, look_at([0, 0, 0], [0, 0, 1], [0, -1, 0]))
-    assert heading_and_pitch(north, upright((0, -1, 0))) == pytest.approx((0, 0))
+    assert heading_and_pitch(world.enter(north)) == pytest.approx((0, 0))

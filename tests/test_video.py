@@ -24,7 +24,7 @@ def run(tmp_path_factory, pristine):
 
 
 def test_a_turntable_goes_around_the_object_and_looks_at_it(loaded):
-    cameras = camera_path(loaded, np.zeros((5, 3)), (0, 0, 1), 48, 30)
+    cameras = camera_path(loaded, np.zeros((5, 3)), 48, 30)
     eyes = np.array([camera.position for camera in cameras])
     distances = np.linalg.norm(eyes, axis=1)
     np.testing.assert_allclose(distances, np.hypot(3, 1.5), rtol=0.05)

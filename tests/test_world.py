@@ -1,56 +1,48 @@
-"""Reports of a world whose up axis is not +Z and whose unit is unknown: figures, page, maps,
-viewer."""
+"""A world whose up axis is not +Z and whose unit is unknown: mgs turns it upright when it reads it,
+and turns back what leaves."""
 
 import json
-from dataclasses import replace
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+import synthetic
 import tiny
 from matplotlib.figure import Figure
+from program import command
 
+import mgs
 from mgs import plotting
-from mgs.data.dataset import load_dataset, write_transforms
-from mgs.data.up import PLUS_Z, unit_up, upright
+from mgs.camera import opencv_from_opengl
+from mgs.data.dataset import load_cameras, load_dataset, write_transforms
+from mgs.data.world import UPRIGHT, World, unit_up
+from mgs.errors import InputError
 from mgs.files import write_json
-from mgs.gaussians import Gaussians
 from mgs.reports import diagnostics
 from mgs.reports.page import write_page
 from mgs.reports.writing import report
 from mgs.run.folder import Run, open_run
+from mgs.splat_files import load_gaussians
 from mgs.view import layers
 from mgs.view.subject import read_subject
 
-UP = unit_up([0.3, -0.8, 0.2])
+TILTED = World(unit_up([0.3, -0.8, 0.2]), "unit")
+WORLDS = UPRIGHT, TILTED
 
 
-def make_run(root: Path, tilted: bool) -> Path:
-    """A measured run; tilted: in the same world turned so that UP is up, and in units."""
+def make_run(root: Path, world: World) -> Path:
+    """A measured run of a dataset whose files are in this world."""
     dataset = load_dataset(tiny.write_dataset(root / "dataset"))
-    turn = upright(UP).T if tilted else np.eye(3)
-    frames = []
-    for frame in dataset.frames:
-        pose = frame.camera.world_to_camera.copy()
-        pose[:3, :3] = pose[:3, :3] @ turn.T
-        frames.append(replace(frame, camera=replace(frame.camera, world_to_camera=pose)))
-    write_transforms(dataset.root, frames, UP if tilted else PLUS_Z, "unit" if tilted else "m")
+    write_transforms(dataset.root, dataset.frames, world)
+    parts = {"prior": tiny.prior(world.up)}
     dataset = load_dataset(dataset.root)
-
-    def turned(g: Gaussians) -> Gaussians:
-        return replace(g, means=(g.means @ turn.T).astype(np.float32))
-
-    def initial(frames):
-        return turned(tiny.initial(frames))
-
-    there = tiny.prior(dataset.up)
-    parts = {"initial": initial, "prior": there}
     return tiny.write_measured_run(root / "run", dataset, 0.0, parts, policy="uniform")
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    return [make_run(tmp_path_factory.mktemp("run"), tilted) for tilted in (False, True)]
+    return [make_run(tmp_path_factory.mktemp("run"), world) for world in WORLDS]
 
 
 @pytest.fixture
@@ -92,7 +84,7 @@ def test_the_page_draws_it_upright_too_and_names_the_unit(runs, tmp_path):
     eyes = ([view["eye"] for view in run["views"]] for run in (tilted, level))
     np.testing.assert_allclose(*eyes, atol=1e-9)
     titles = [run["orbit"]["layout"]["scene"]["zaxis"]["title"]["text"] for run in data]
-    assert titles == ["z (m)", "up (unit)"]
+    assert titles == ["z (m)", "z (unit)"]
     assert "path (unit)" in text
     assert "(m)" not in text.split("<script")[0]
 
@@ -103,16 +95,98 @@ def test_maps_of_depth_name_the_unit(runs, drawn):
         assert f"depth ({unit})" in [axis.get_title() for axis in drawn["kf_0001.png"].axes]
 
 
-def test_the_viewer_knows_both(runs):
-    for run, up, unit in zip(runs, (PLUS_Z, UP), ("m", "unit"), strict=True):
-        subject = read_subject(run)
-        assert subject.up == pytest.approx(up)
-        assert f"3 {unit}" in layers.legend("depth", (1.0, 3.0), subject.unit)
+def test_the_viewer_stands_upright_and_names_the_unit(runs):
+    level, tilted = (read_subject(run) for run in runs)
+    assert "3 unit" in layers.legend("depth", (1.0, 3.0), tilted.unit)
+    np.testing.assert_allclose(tilted.eyes, level.eyes, atol=1e-9)
 
 
-def test_the_axis_of_the_prior_goes_before_that_of_the_dataset(runs, tmp_path):
+def test_the_up_of_the_prior_goes_before_that_of_the_dataset(runs, tmp_path):
     run = open_run(runs[1])
     settings = run.settings.model_copy(update={"prior": tmp_path})
-    assert Run(run.folder, settings).up == run.dataset.up
+    assert Run(run.folder, settings).dataset.world == TILTED
     write_json(tmp_path / "prior.json", {"up": [0, 2, 0]})
-    assert Run(run.folder, settings).up == (0, 1, 0)
+    assert Run(run.folder, settings).dataset.world == World((0.0, 1.0, 0.0), "unit")
+
+
+def test_a_scene_of_two_worlds_is_refused(runs):
+    dataset = open_run(runs[1]).dataset
+    with pytest.raises(InputError, match="was built with up"):
+        mgs.Scene(dataset, tiny.prior())
+
+
+def test_a_tilted_run_of_an_older_version_is_refused(runs, tmp_path):
+    folder = shutil.copytree(runs[1], tmp_path / "run")
+    path = folder / "checkpoint.npz"
+    with np.load(path) as data:
+        arrays = dict(data)
+    record = json.loads(str(arrays["json"][()]))
+    del record["upright"]
+    np.savez(path, **arrays | {"json": np.array(json.dumps(record))})
+    with pytest.raises(InputError, match="older mgs"):
+        _ = open_run(folder).state
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The same run in both worlds, each with its prior, with colours of degree 1."""
+    made = []
+    for world in WORLDS:
+        root = tmp_path_factory.mktemp("fitted")
+        data = synthetic.write_dataset(root / "data", synthetic.orbit_cameras(10, 48, 36))
+        write_transforms(data.root, data.frames, world)
+        mgs.save_prior(root / "prior", mgs.build_prior(data.root, gaussians=300))
+        options = {"prior": root / "prior", "seeds": 3, "budget": 2, "sh": 1}
+        made.append(Path(mgs.run_nbv(data.root, root / "run", **options).folder))
+    return made
+
+
+def test_a_run_chooses_the_same_and_its_files_are_in_the_worlds_own_coordinates(fitted):
+    level, tilted = (open_run(run) for run in fitted)
+    assert level.indices == tilted.indices
+    np.testing.assert_allclose(tilted.gaussians.means, level.gaussians.means, atol=1e-5)
+    for name in ("gaussians.ply", "diagnostics/information.ply"):
+        if "/" in name:
+            diagnostics.diagnose(tilted, [level.taken[0].name])
+            means = synthetic_points(tilted.folder / name)
+        else:
+            means = load_gaussians(tilted.folder / name).means
+        np.testing.assert_allclose(TILTED.enter(means), level.gaussians.means, atol=1e-5)
+    prior = mgs.load_prior(tilted.settings.prior)
+    np.testing.assert_allclose(prior.points, level.prior.points, atol=1e-5)
+
+
+def synthetic_points(path: Path) -> np.ndarray:
+    from plyfile import PlyData
+
+    vertex = PlyData.read(str(path))["vertex"]
+    return np.stack([vertex[axis] for axis in "xyz"], axis=1)
+
+
+@pytest.mark.parametrize("kind", ["ply", "glb"])
+def test_exports_are_in_the_worlds_own_coordinates_and_are_measured_alike(fitted, tmp_path, kind):
+    run, path = open_run(fitted[1]), tmp_path / f"a.{kind}"
+    command("export", run.folder, "--to", kind, "--out", path)
+    np.testing.assert_allclose(
+        TILTED.enter(load_gaussians(path).means), run.gaussians.means, atol=1e-5
+    )
+    own = mgs.evaluate(run)["all"]["psnr"]
+    names = [frame.name for frame in run.taken]
+    of_file = mgs.evaluate(path, dataset=run.dataset.root, trained=names)["all"]["psnr"]
+    assert of_file == pytest.approx(own, abs=0.05)
+
+
+def test_views_and_suggestions_are_in_the_worlds_own_coordinates(fitted, tmp_path):
+    run = open_run(fitted[1])
+    poses = {Path(name).stem: camera for name, camera in load_cameras(run.dataset.root)}
+    command("export", run.folder, "--to", "nerfstudio", "--out", tmp_path / "views")
+    for name, camera in load_cameras(tmp_path / "views"):
+        own = poses[Path(name).stem].world_to_camera
+        np.testing.assert_allclose(camera.world_to_camera, own, atol=1e-9)
+    command("suggest", run.folder, "--views", 2, "--out", tmp_path / "next")
+    for name, camera in load_cameras(tmp_path / "next"):
+        own = poses[Path(name).stem].world_to_camera
+        np.testing.assert_allclose(camera.world_to_camera, own, atol=1e-9)
+    for view in json.loads((tmp_path / "next/suggestions.json").read_text())["ranking"]:
+        pose = opencv_from_opengl(view["transform_matrix"])
+        np.testing.assert_allclose(pose, poses[view["name"]].world_to_camera, atol=1e-9)

@@ -18,7 +18,6 @@ from mgs.camera import Camera, look_at
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.data.frames import Frame
 from mgs.data.meshes import Mesh
-from mgs.data.up import upright
 from mgs.files import write_json
 from mgs.fit.settings import TrainSettings
 from mgs.fit.stopping import StopReason
@@ -181,11 +180,11 @@ class TinyScene(Scene):
 
 
 def prior(up=(0, 0, 1)) -> Prior:
-    """The sphere's points, turned with the world where `up` is not +Z."""
-    n = _normals() @ upright(up)
+    """The sphere's points. up: of the world of its files."""
+    n = _normals()
     mesh = Mesh(n[:3], np.array([[0, 1, 2]]), np.zeros(1, bool))
     numbers = {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS, "backed": 0, "up": list(up)}
-    return Prior(mesh, n, n, 0.5, 0.2, numbers, up=tuple(up))
+    return Prior(mesh, n, n, 0.5, 0.2, numbers)
 
 
 def scene(dataset: Dataset, settings: NbvSettings, **parts) -> TinyScene:

@@ -156,7 +156,7 @@ def given(**options: Any) -> dict[str, Any]:
 
 def parse_up(text: str) -> tuple[float, float, float] | None:
     """Unit vector of an option like 0,0,1; None for auto. Raises InputError for anything else."""
-    from mgs.data.up import unit_up
+    from mgs.data.world import unit_up
 
     if text == "auto":
         return None

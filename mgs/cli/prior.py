@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.table import Table
 
 from mgs.cli.options import Seed, parse_gaussians, parse_up
@@ -137,7 +136,7 @@ def prior(
         raise InputError(
             "prior: --mesh gives the surface, and --source or --points build one; give one of them"
         )
-    loaded = load_dataset(dataset)
+    loaded = load_dataset(dataset, up=axis)
     folder = out if out is not None else below(dataset, "prior")
     number = parse_gaussians(gaussians)
     settings = PriorSettings(number, spacing, poisson_depth, seed, backing)
@@ -146,17 +145,13 @@ def prior(
     with atomic_folder(folder, ours) as unfinished, progress_bar(console=console) as progress:
         segmented = None
         if mesh is not None:
-            cameras = [frame.camera for frame in loaded.frames]
-            result = prior_from_mesh(
-                mesh, settings, axis or loaded.up, loaded.unit, cameras, loaded.origin
-            )
+            result = prior_from_mesh(mesh, settings, loaded)
             if mesh.suffix.lower() in GLTF:
                 console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
         else:
-            upward: Any = "auto" if up == "auto" else axis
             chosen = source_of(loaded, source, points)
             console.print(f"prior from {chosen}" + ("" if source or points else WHY[chosen]))
-            options = {"source": chosen, "points": points, "up": upward}
+            options = {"source": chosen, "points": points}
             result, segmented = _built(loaded, settings, folder, progress, **options)
         if result.numbers["from"] != "random":
             progress("colours of the surface")
@@ -166,8 +161,11 @@ def prior(
             known = {key: value for key, value in checks.items() if not math.isnan(value)}
             result = replace(result, numbers=result.numbers | known)
         progress("figure")
+        built = result
+        if up == "auto" and "plane_normal" in result.numbers:
+            result = result.with_up(result.numbers["plane_normal"])
         save_prior(unfinished, result)
-        draw_prior(unfinished / "prior.png", result, segmented)
+        draw_prior(unfinished / "prior.png", built, segmented)
     console.print(_table(result.numbers))
     agreed = result.numbers.get("colour_agreement", 1.0)
     if agreed < AGREEMENT:
@@ -204,7 +202,7 @@ def _built(
         return prior_and_cloud(dataset, settings, on_stage, **options)
     except NoSurface as refused:
         picture = folder.with_name(f"{folder.name}-refused.png")
-        draw_refused(picture, refused.points, refused.kept, np.array(dataset.up))
+        draw_refused(picture, refused.points, refused.kept)
         raise InputError(f"{refused} (the points: {picture})") from None
 
 
@@ -231,7 +229,7 @@ def _table(numbers: dict[str, Any]) -> Table:
 
 def _up(numbers: dict[str, Any]) -> str:
     """The up vector, and its angle from the ground plane's normal, if any."""
-    from mgs.data.up import degrees_between, unit_up
+    from mgs.data.world import degrees_between, unit_up
 
     up = unit_up(numbers["up"])
     text = f"({', '.join(f'{value:.3g}' for value in up)})"

@@ -86,7 +86,7 @@ def _in_srgb(model: Path, linear: Gaussians) -> Gaussians:
     """Gaussians of a linear model, of this file or run folder, for sRGB blending. Prints what that
     costs."""
     from mgs.reports.evaluation import compare_models
-    from mgs.reports.exporting import difference, in_srgb, refit_in_srgb
+    from mgs.reports.exporting import as_imported, difference, in_srgb, refit_in_srgb
     from mgs.run.folder import open_run
 
     if not model.is_dir():
@@ -108,7 +108,7 @@ def _in_srgb(model: Path, linear: Gaussians) -> Gaussians:
             f"{after:.2f} dB blended in sRGB, as exported, with colours fitted again to the views "
             f"taken ({between:.2f} dB with converted colours)"
         )
-    return replace(fitted, origin=linear.origin)
+    return as_imported(run, fitted)
 
 
 def _targets(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -186,7 +185,7 @@ def _candidates(
     shapes = given(dome=dome, ring=asked.ring, grid=asked.grid)
     if len(shapes) + (poses is not None) > 1:
         raise InputError("suggest: `poses`, `dome`, `ring`, `grid`: give one of them")
-    site = Site(run.prior, run.taken[-1].camera)
+    site = Site(run.prior, run.taken[-1].camera, run.dataset.world)
     left = [frame for frame in run.dataset.frames if frame not in run.taken]
     safe, band = asked.safe_distance, asked.elevations
     if poses is not None:
@@ -229,20 +228,15 @@ def _write_plan(path: Path, run: Run, found: Suggestion, place: Any, limits: Fli
     import numpy as np
 
     from mgs.data.flight_plan import Stop, write_flight_plan
-    from mgs.data.up import levelled
     from mgs.run.suggest import taken_in_order
 
-    turn = levelled(run.prior.up)
-    pose = np.eye(4)
-    pose[:3, :3] = turn.T
-    home = turn @ taken_in_order(run)[0].camera.position
-    ground = float((run.prior.mesh.vertices @ turn.T)[:, 2].min())
+    home = taken_in_order(run)[0].camera.position
+    ground = float(run.prior.mesh.vertices[:, 2].min())
     stops = [Stop(np.array([*home[:2], ground]))]
     for corners, view in zip(found.corners, [*found.plan, None], strict=True):
-        stops += [Stop(turn @ corner) for corner in corners]
+        stops += [Stop(corner) for corner in corners]
         if view is not None:
-            turned = replace(view.camera, world_to_camera=view.camera.world_to_camera @ pose)
-            stops.append(Stop(turn @ view.camera.position, view.name, turned))
+            stops.append(Stop(view.camera.position, view.name, view.camera))
     write_flight_plan(path, stops, place, limits.hover, limits.speed)
 
 

@@ -11,6 +11,7 @@ from plyfile import PlyData, PlyElement
 
 from mgs.camera import Camera
 from mgs.data.visibility import in_image
+from mgs.data.world import World
 from mgs.errors import InputError
 from mgs.files import atomic_path, parsing, reading
 
@@ -34,6 +35,12 @@ class SparseCloud:
     views: np.ndarray | None = None
     track: np.ndarray | None = None
     error: np.ndarray | None = None
+
+    def upright(self, world: World) -> SparseCloud:
+        """The same cloud, of the files of a dataset, in its upright world (`World.enter`)."""
+        views = None if self.views is None else world.enter(self.views)
+        points = world.enter(towards(self.points, world.origin))
+        return SparseCloud(points, views, self.track, self.error)
 
     def scaled(self, factor: float) -> SparseCloud:
         """The same cloud with coordinates multiplied by `factor`."""

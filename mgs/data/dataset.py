@@ -14,7 +14,7 @@ import numpy as np
 
 from mgs.camera import Camera, opencv_from_opengl, opengl_from_opencv
 from mgs.data.frames import SURVEY_FOLDER, Frame, as_asked, as_captured
-from mgs.data.up import PLUS_Z, Up, unit_up
+from mgs.data.world import PLUS_Z, UPRIGHT, Vector, World, unit_up
 from mgs.errors import InputError
 from mgs.files import THERE, check_new_folder, read_json, remove_leftovers, write_json
 from mgs.memory import padded
@@ -42,22 +42,16 @@ FILES = {
 """Path fields of `Frame` -> their keys in transforms.json."""
 
 
-Position = tuple[float, float, float]
-
-
 @dataclass(frozen=True, repr=False)
 class Dataset:
     """A folder of keyframes in order of time.
 
-    up: unit vector that points upwards in the world. unit: unit of length, "m", or "unit" if
-    unknown. origin: position of the world's origin in the data that was imported.
+    Cameras are in a world with +Z up. world: that of the files, which may stand otherwise.
     """
 
     root: Path
     frames: tuple[Frame, ...]
-    up: Up = PLUS_Z
-    unit: str = "m"
-    origin: Position = (0.0, 0.0, 0.0)
+    world: World = UPRIGHT
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -68,6 +62,11 @@ class Dataset:
 
     def _repr_html_(self) -> str:
         return html(repr(self), thumbnails([frame.image_path for frame in self.frames]))
+
+    @property
+    def unit(self) -> str:
+        """Name of the unit of length: "m", or "unit" if it is unknown."""
+        return self.world.unit
 
     @property
     def on_demand(self) -> bool:
@@ -92,7 +91,8 @@ class Dataset:
         """Load the test views, on which no model is trained, or None. Raises InputError as
         `load_dataset`."""
         folder = self.root / TEST_FOLDER
-        return load_dataset(folder) if (folder / "transforms.json").is_file() else None
+        there = (folder / "transforms.json").is_file()
+        return load_dataset(folder, up=self.world.up) if there else None
 
     def survey(self) -> Dataset:
         """Dataset to build the prior from: the survey of an on-demand dataset, else this one.
@@ -107,16 +107,20 @@ class Dataset:
                 f"{self.root}: has neither images nor a survey to build a prior of; "
                 "give one with `prior`"
             )
-        return load_dataset(folder)
+        return load_dataset(folder, up=self.world.up)
 
 
-def load_dataset(root: str | Path, *, to_capture: bool = False) -> Dataset:
+def load_dataset(
+    root: str | Path, *, to_capture: bool = False, up: Vector | None = None
+) -> Dataset:
     """Load the dataset in the folder `root`: the frames of its transforms.json (docs/data.md).
 
     Checks that image files exist, unless the dataset is on demand. Pixels are read later, by the
-    methods of `Frame`. to_capture: frames without an image are on demand, too. Raises InputError if
-    the folder or a file is missing, intrinsics are missing, images are distorted, a pose is not
-    finite or singular, there are no frames, or two frames have the same name.
+    methods of `Frame`. to_capture: frames without an image are on demand, too. up: vector that
+    points upwards in the files, by default as transforms.json says, else +Z; cameras are turned so
+    that it is +Z. Raises InputError if the folder or a file is missing, intrinsics are missing,
+    images are distorted, a pose is not finite or singular, there are no frames, or two frames have
+    the same name.
     """
     root = Path(root)
     path = root / "transforms.json"
@@ -125,19 +129,20 @@ def load_dataset(root: str | Path, *, to_capture: bool = False) -> Dataset:
             f"{root}: no such dataset folder; make one with `mgs import` or `mgs synth-orbit`"
         )
     data, records = read_records(path)
-    frames = [_frame(path, data, i, record, to_capture) for i, record in enumerate(records)]
+    upward = up or data.get("up") or PLUS_Z
+    world = World(unit_up(upward), unit_of(path, data) or "m", _origin_of(path, data))
+    frames = [_frame(path, data, i, record, to_capture, world) for i, record in enumerate(records)]
     for name, count in Counter(frame.name for frame in frames).items():
         if count > 1:  # runs and pictures refer to a frame by its name
             raise InputError(
                 f"{path}: lists {count} frames named {name}; remove or rename all but one"
             )
     ordered = tuple(sorted(frames, key=lambda frame: (frame.timestamp, frame.name)))
-    up = unit_up(data["up"]) if data.get("up") else PLUS_Z
-    return Dataset(root, ordered, up, unit_of(path, data) or "m", _origin_of(path, data))
+    return Dataset(root, ordered, world)
 
 
 def load_cameras(path: str | Path, like: Camera | None = None) -> list[tuple[str, Camera]]:
-    """Read (file_path, camera) of every frame of a transforms.json, in its order.
+    """Read (file_path, camera) of every frame of a transforms.json, in its order and world.
 
     path: the file, or its folder. like: a camera whose intrinsics are used if the file has none.
     Raises InputError as `load_dataset`, except that image files need not exist.
@@ -246,14 +251,14 @@ def unit_of(path: Path, data: dict[str, Any]) -> str | None:
     return unit or None
 
 
-def load_origin(path: str | Path) -> Position:
-    """`Dataset.origin` of a transforms.json, or of the folder that holds it. Raises InputError as
+def load_origin(path: str | Path) -> Vector:
+    """`World.origin` of a transforms.json, or of the folder that holds it. Raises InputError as
     `load_cameras`."""
     path = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
     return _origin_of(path, read_records(path)[0])
 
 
-def _origin_of(path: Path, data: dict[str, Any]) -> Position:
+def _origin_of(path: Path, data: dict[str, Any]) -> Vector:
     """Origin in a transforms.json. Raises InputError unless it is three finite numbers."""
     given = data.get("origin", [0.0, 0.0, 0.0])
     if not isinstance(given, list) or len(given) != 3:
@@ -263,10 +268,16 @@ def _origin_of(path: Path, data: dict[str, Any]) -> Position:
 
 
 def _frame(
-    path: Path, data: dict[str, Any], index: int, record: dict[str, Any], to_capture: bool
+    path: Path,
+    data: dict[str, Any],
+    index: int,
+    record: dict[str, Any],
+    to_capture: bool,
+    world: World,
 ) -> Frame:
     root, where = path.parent, f"{path}: frame {index}"
-    camera, on_demand = _camera(path, data, index, record), data.get("on_demand") is True
+    camera = world.enter(_camera(path, data, index, record))
+    on_demand = data.get("on_demand") is True
     on_demand |= to_capture and not (root / record["file_path"]).is_file()
     timestamp = timestamp_of(where, index, record)
     paths: dict[str, Any] = {}
@@ -278,7 +289,7 @@ def _frame(
                 "restore it or remove the frame"
             )
     name = Path(record["file_path"]).stem
-    return as_captured(Frame(name, camera, timestamp, **paths, on_demand=on_demand))
+    return as_captured(Frame(name, camera, timestamp, **paths, on_demand=on_demand), world)
 
 
 def intrinsics(camera: Camera) -> dict[str, float]:
@@ -290,22 +301,21 @@ def intrinsics(camera: Camera) -> dict[str, float]:
 def write_transforms(
     root: str | Path,
     frames: list[Frame] | tuple[Frame, ...],
-    up: Up = PLUS_Z,
-    unit: str = "m",
+    world: World = UPRIGHT,
     notes: Mapping[str, str | float] | None = None,
-    origin: Position = (0.0, 0.0, 0.0),
 ) -> None:
     """Write transforms.json into the folder `root`, with paths relative to it if they are below it.
 
-    up, unit, origin: as `Dataset`. notes: more entries. Frames are either all on demand
-    or none. Intrinsics equal to those of the first frame are written once. Write this file last:
-    its presence marks a complete dataset.
+    world: the one to write them in; the frames have +Z up. notes: more entries. Frames are either
+    all on demand or none. Intrinsics equal to those of the first frame are written once. Write this
+    file last: its presence marks a complete dataset.
     """
     root = Path(root)
     header: dict[str, Any] = {"camera_model": "OPENCV", **intrinsics(frames[0].camera)}
-    # Default: +Z and metres.
-    world: dict[str, Any] = {"up": list(up), "unit": unit} if (up, unit) != (PLUS_Z, "m") else {}
-    world |= {"origin": list(origin)} if any(origin) else {}
+    place: dict[str, Any] = {}
+    if (world.up, world.unit) != (PLUS_Z, "m"):
+        place = {"up": list(world.up), "unit": world.unit}
+    place |= {"origin": list(world.origin)} if any(world.origin) else {}
     demand = {"on_demand": True} if frames[0].on_demand else {}
     records = []
     for frame in frames:
@@ -315,12 +325,13 @@ def write_transforms(
             for key, path in paths.items()
             if path
         }
-        record["transform_matrix"] = opengl_from_opencv(frame.camera.world_to_camera).tolist()
+        pose = world.leave(frame.camera).world_to_camera
+        record["transform_matrix"] = opengl_from_opencv(pose).tolist()
         record["timestamp"] = frame.timestamp
         own = intrinsics(frame.camera)
         record |= {key: value for key, value in own.items() if value != header[key]}
         records.append(record)
-    known = header | world | demand | dict(notes or {})
+    known = header | place | demand | dict(notes or {})
     write_json(root / "transforms.json", known | {"frames": records})
 
 

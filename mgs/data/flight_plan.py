@@ -42,7 +42,8 @@ KML = "http://www.opengis.net/kml/2.2"
 class Origin:
     """Place of the world's origin, degrees and metres.
 
-    bearing: of +Y, degrees clockwise from north. Positions are `mgs.data.up.levelled`.
+    bearing: of the level part of the world's +Y (of +Z where +Y is steep), degrees clockwise from
+    north. Positions have +Z up and that direction as +Y (`mgs.data.world.World`).
     """
 
     latitude: float

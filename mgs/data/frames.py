@@ -9,6 +9,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.rock_image import boundary, read_rock_image
+from mgs.data.world import UPRIGHT, World
 from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.images import image_size, read_depth, read_mask, read_png
@@ -112,9 +113,9 @@ def capture_record(frame: Frame) -> Path:
     return frame.image_path.parent.parent / CAPTURED / f"{frame.name}.json"
 
 
-def as_captured(frame: Frame) -> Frame:
+def as_captured(frame: Frame, world: World = UPRIGHT) -> Frame:
     """The frame as a live capture recorded it, with the pose and lens of its picture; itself where
-    there is no record. Raises InputError if the record is damaged."""
+    there is no record. world: that of the record. Raises InputError if the record is damaged."""
     path = capture_record(frame)
     if not frame.on_demand or frame.capture_path or not path.is_file():
         return frame
@@ -128,7 +129,7 @@ def as_captured(frame: Frame) -> Frame:
         )
         if record["camera"] is None:
             return found
-        camera = Camera(**record["camera"])
+        camera = world.enter(Camera(**record["camera"]))
     except (AttributeError, TypeError, KeyError, ValueError, InputError):
         raise InputError(f"{path}: is damaged; delete it to capture the frame again") from None
     return replace(found, asked=frame.camera, camera=camera)

@@ -21,7 +21,7 @@ from mgs.data.meshes import Mesh
 from mgs.data.rock_image import premultiplied, write_rock_image
 from mgs.data.shots import Shot, Source
 from mgs.data.sources import find_image
-from mgs.data.up import PLUS_Z, Up
+from mgs.data.world import PLUS_Z, Vector, World
 from mgs.errors import InputError, Notice
 from mgs.files import copy_file, fingerprint, folder_locked, remove_file, write_json
 from mgs.images import PNG_BIT_DEPTH, read_depth, read_mask, read_rgba, write_exr, write_png
@@ -40,7 +40,7 @@ def import_source(
     masks: Path | None = None,
     mesh: Path | None = None,
     downscale: int = 1,
-    up: Up = PLUS_Z,
+    up: Vector = PLUS_Z,
     tests: Source | None = None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Dataset:
@@ -51,7 +51,7 @@ def import_source(
     come from the source's mask files or the images' alpha. Rock images come from the source, or
     from an alpha with intermediate values that gives the mask; with `masks` or `mesh` there are
     none. Images, depth and masks are undistorted to a pinhole camera in which every pixel is valid,
-    then reduced by blocks of `downscale` x `downscale`. up: as `Dataset`. tests: shots of the same
+    then reduced by blocks of `downscale` x `downscale`. up: as `World`. tests: shots of the same
     world, which become the test views. on_frame: called (done, total) before each frame.
 
     When an interrupted import continues, a finished frame is made again only if one of its files
@@ -68,7 +68,7 @@ def import_source(
         from mgs.data.raycast import mesh_in_sight  # imported here because it loads Mitsuba
 
         silhouette = silhouette_of(
-            mesh_in_sight(mesh, [shot.camera for shot in shots], source.origin)
+            mesh_in_sight(mesh, [shot.camera for shot in shots], World(origin=source.origin))
         )
     asked = {
         "kind": source.kind,
@@ -104,7 +104,9 @@ def import_source(
                 up=up,
                 on_frame=on_frame,
             )
-        write_transforms(out, frames, up, source.unit or "unit", origin=source.origin)
+        world = World(up, source.unit or "unit", source.origin)
+        upright = [replace(frame, camera=world.enter(frame.camera)) for frame in frames]
+        write_transforms(out, upright, world)
     return load_dataset(out)
 
 

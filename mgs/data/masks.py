@@ -64,7 +64,7 @@ def make_masks(
             "make masks with another"
         )
     write_sheet(dataset.root / SHEET, thumbnails, ACROSS)
-    write_transforms(dataset.root, frames, dataset.up, dataset.unit, origin=dataset.origin)
+    write_transforms(dataset.root, frames, dataset.world)
     return replace(dataset, frames=tuple(frames))
 
 

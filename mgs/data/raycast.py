@@ -15,6 +15,7 @@ from mgs.camera import Camera
 from mgs.data.clouds import towards
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh, read_mesh
+from mgs.data.world import World
 from mgs.errors import InputError
 from mgs.memory import padded
 
@@ -22,15 +23,15 @@ SMALL = 40_000
 """Pixels of a picture in which a mesh is searched."""
 
 
-def mesh_in_sight(path: Path, cameras: Sequence[Camera], origin: Sequence[float]) -> Mesh:
-    """Read a mesh, move it to a dataset of this origin (`towards`), and check that it is in some
-    picture.
+def mesh_in_sight(path: Path, cameras: Sequence[Camera], world: World) -> Mesh:
+    """Read a mesh, move it to a dataset of this world (`towards`, `World.enter`), and check that it
+    is in some picture.
 
     Raises InputError as `read_mesh`, and if none of a few cameras sees the mesh, or all are inside,
     as happens with another unit or other axes.
     """
     mesh = read_mesh(path)
-    mesh = replace(mesh, vertices=towards(mesh.vertices, origin))
+    mesh = replace(mesh, vertices=world.enter(towards(mesh.vertices, world.origin)))
     depth, some = mesh_depth(mesh), cameras[:: max(1, len(cameras) // 4)]
     hits = [depth(shrunk_to(camera, SMALL)[0]) > 0 for camera in some]
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)

@@ -14,7 +14,7 @@ from mgs.camera import Camera
 from mgs.data.agreement import Agreement
 from mgs.data.clouds import SparseCloud
 from mgs.data.lens import Lens
-from mgs.data.up import PLUS_Z, Up, degrees_between, up_of_cameras
+from mgs.data.world import PLUS_Z, Vector, degrees_between, up_of_cameras
 from mgs.errors import InputError
 from mgs.images import exif_orientation, image_size
 
@@ -66,12 +66,12 @@ class Source:
     left_out: Counter[str] = field(default_factory=Counter)
     notes: tuple[str, ...] = ()
     sparse: SparseCloud | None = None
-    up: Up | None = None
+    up: Vector | None = None
     unit: str | None = None
     no_cloud: Path | None = None
     tests: frozenset[str] = frozenset()
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     fit: Agreement | None = None
+    origin: Vector = (0.0, 0.0, 0.0)
 
     def in_metres(self, unit: float) -> Source:
         """Scale cameras and points by `unit` metres. Raises InputError unless it is positive."""
@@ -111,7 +111,7 @@ class Source:
             return self, None
         return replace(self, shots=others), replace(self, shots=apart, sparse=None)
 
-    def up_or_estimate(self) -> tuple[Up, str]:
+    def up_or_estimate(self) -> tuple[Vector, str]:
         """Up vector and the reason for it: given by the source, by the format, or estimated by
         `up_of_cameras`, whose InputError it raises."""
         if self.up is not None:

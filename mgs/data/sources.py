@@ -27,7 +27,7 @@ from mgs.data.rgbd_folders import (
 )
 from mgs.data.shots import Shot, Source, checked, frame_name, turned_by_exif
 from mgs.data.tracks import Spacing
-from mgs.data.up import unit_up
+from mgs.data.world import unit_up
 from mgs.errors import InputError
 from mgs.images import image_size
 

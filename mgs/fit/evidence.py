@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from mgs.camera import Camera
 from mgs.data.dataset import target_of
 from mgs.data.frames import Frame
-from mgs.data.up import upright
 from mgs.errors import InputError
 from mgs.evaluation import render_view
 from mgs.fit.fitting import fit
@@ -120,9 +119,9 @@ def last_images(
     def target(view: int) -> np.ndarray:
         return without_gain(target_of(frames[view], with_alpha), gains[view])
 
-    turn, cameras = upright(prior.up), [frame.camera for frame in frames]
-    positions = np.array([camera.position for camera in cameras]) @ turn.T
-    around = azimuths(positions, turn @ prior.points.mean(axis=0))
+    cameras = [frame.camera for frame in frames]
+    positions = np.array([camera.position for camera in cameras])
+    around = azimuths(positions, prior.points.mean(axis=0))
     order = np.argsort(around, kind="stable").tolist()
     targets = Deferred(range(len(frames)), target)
     return Images(cameras, targets, start, order)

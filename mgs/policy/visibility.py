@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING
 
@@ -34,11 +33,10 @@ class Visibility:
     - cameras: of the run.
     - exact(camera): exact information about the Gaussians before any training [N,P].
     - points: their means [N,3], metres. centre: middle of the rock [3]. lam: lambda of colours.
-    - turn: rotation [3,3] from the cameras' world to that of points and centre, which has +Z up.
     - progress(done, total): called for each camera in `pool`.
 
     Attributes:
-    - positions: camera centres [V,3], metres, with +Z up.
+    - positions: camera centres [V,3], metres.
     - seen(frame): squared blending weights in one view [N]. information(frame): `exact` of it.
     - pool(), dome(): `Views` of all cameras of the run, and of a dome around the rock.
     - planned(...), path(...): views to take next, as a set (`_planned`) and in order (`_path`).
@@ -51,13 +49,11 @@ class Visibility:
         points: Array,
         centre: Array,
         lam: float,
-        turn: Array | None = None,
         progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> None:
         self.cameras, self.exact, self.progress = cameras, exact, progress
         self.points, self.centre, self.lam = points, centre, lam
-        self.turn = np.eye(3) if turn is None else turn
-        self.positions = np.array([camera.position for camera in cameras]) @ self.turn.T
+        self.positions = np.array([camera.position for camera in cameras])
         self.seen, self.pool, self.dome = cache(self._seen), cache(self._pool), cache(self._dome)
         self.planned, self.path = cache(self._planned), cache(self._path)
         # A copy, because the kernel returns part of a larger array.
@@ -135,9 +131,6 @@ class Visibility:
 
     def _dome(self) -> Views:
         """A dome of cameras around the rock, and what they see."""
-        upright = dome_cameras(self.cameras[0], self.positions, self.centre)
-        turn = np.eye(4)
-        turn[:3, :3] = self.turn
-        cameras = [replace(c, world_to_camera=c.world_to_camera @ turn) for c in upright]
+        cameras = dome_cameras(self.cameras[0], self.positions, self.centre)
         seen = np.stack([squared_weights(self.exact(camera)) for camera in cameras])
-        return Views(np.array([camera.position for camera in upright]), seen)
+        return Views(np.array([camera.position for camera in cameras]), seen)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from plyfile import PlyData
@@ -22,8 +22,8 @@ from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
-from mgs.data.up import PLUS_Z, Up, unit_up, upright
 from mgs.data.visibility import in_mask, visible
+from mgs.data.world import UPRIGHT, World, unit_up
 from mgs.errors import InputError
 from mgs.files import atomic_path, check_new_folder, parsing, read_json, write_json
 from mgs.notebook import cloud, html
@@ -52,15 +52,14 @@ from mgs.seeds import derive_seed
 class Prior:
     """A mesh of the rock, and N samples of those of its faces that some frame sees.
 
-    - points: [N,3] samples in the world, metres. normals: [N,3], of unit length.
+    - points: [N,3] samples in the upright world of the dataset, metres. normals: [N,3], unit.
     - spacing: sqrt(sampled area / N), metres, about the distance between neighbours.
     - depth_tolerance: largest difference between a depth image and the prior that counts as the
       same surface, metres. It is three rms distances of the cloud from the mesh, a voxel, or two
       standard deviations of depth noise, whichever is largest; for a given mesh, the spacing.
-    - numbers: contents of prior.json.
+    - numbers: contents of prior.json, where `up` is the dataset's upward direction in its files.
     - backed: the first `backed` points, evenly spread, have a second Gaussian behind the surface
       (`mgs.prior.initial`).
-    - up: unit vector that points upwards in the world.
     """
 
     mesh: Mesh
@@ -70,7 +69,6 @@ class Prior:
     depth_tolerance: float
     numbers: dict[str, Any]
     backed: int = 0
-    up: Up = PLUS_Z
 
     def __repr__(self) -> str:
         points, unit = len(self.points), self.numbers.get("unit", "m")
@@ -78,8 +76,24 @@ class Prior:
         return f"Prior({number}, spacing {self.spacing:.4g} {unit})"
 
     def _repr_html_(self) -> str:
-        turn = upright(self.up)
-        return html(repr(self), [cloud(self.points @ turn.T, 0.5 + self.normals @ turn.T / 2)])
+        return html(repr(self), [cloud(self.points, 0.5 + self.normals / 2)])
+
+    @property
+    def world(self) -> World:
+        """World of the files of the dataset that the prior was built from."""
+        return World(unit_up(self.numbers["up"])) if "up" in self.numbers else UPRIGHT
+
+    def with_up(self, up: Sequence[float]) -> Prior:
+        """The prior turned so that this direction in the dataset's files is +Z."""
+        old, new = self.world, World(unit_up(up))
+        turned = self.moved(lambda points: new.enter(old.leave(points)))
+        return replace(turned, numbers=self.numbers | {"up": list(new.up)})
+
+    def moved(self, change: Callable[[np.ndarray], np.ndarray]) -> Prior:
+        """The prior after a rotation: `change` of points or directions [N,3]."""
+        mesh = replace(self.mesh, vertices=change(self.mesh.vertices))
+        points, normals = change(self.points), change(self.normals)
+        return replace(self, mesh=mesh, points=points, normals=normals)
 
 
 def build_prior(
@@ -89,7 +103,6 @@ def build_prior(
     *,
     source: str | None = None,
     points: Path | None = None,
-    up: Up | Literal["auto"] | None = None,
     **given: Any,
 ) -> Prior:
     """Build the prior of a dataset, as in `build_prior("demo/dataset", gaussians=2000)`.
@@ -98,13 +111,12 @@ def build_prior(
     - on_stage: called with the name of each stage.
     - source: "depth", "points", "hull" (of the masks) or "random"; by default the first that the
       dataset has. points: PLY file in place of the dataset's points.
-    - up: unit vector; "auto": normal of the ground plane, if there is one; None: the dataset's.
 
     Raises InputError if the dataset lacks the source, or no surface is found that a frame sees.
     """
     dataset = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     asked = replace(settings or PriorSettings(), **given)
-    return prior_and_cloud(dataset, asked, on_stage, source=source, points=points, up=up)[0]
+    return prior_and_cloud(dataset, asked, on_stage, source=source, points=points)[0]
 
 
 def prior_and_cloud(
@@ -114,7 +126,6 @@ def prior_and_cloud(
     *,
     source: str | None = None,
     points: Path | None = None,
-    up: Up | Literal["auto"] | None = None,
 ) -> tuple[Prior, SegmentedCloud | None]:
     """Build the prior of a dataset. Returns it, and the cloud of its mesh (None for a hull).
 
@@ -127,9 +138,7 @@ def prior_and_cloud(
         check_photographs(dataset.frames)
         check_masks(dataset.frames)
     if chosen == "random":
-        return _random_prior(
-            dataset, settings, dataset.up if up is None or up == "auto" else up
-        ), None
+        return _random_prior(dataset, settings), None
     if chosen == "depth":
         surface = _depth_surface(dataset, settings, on_stage)
     else:
@@ -149,34 +158,37 @@ def prior_and_cloud(
     pixel = cell if chosen == "depth" else float(np.median(pixels))
     closest = PIXELS_PER_SAMPLE if chosen == "depth" else PIXELS_OF_PHOTOGRAPHS
     samples, normals, spacing, sampled = _samples(mesh, settings, cameras, pixel, closest)
-    upward = up if up is not None and up != "auto" else dataset.up
     numbers = {"from": chosen, "frames": len(dataset.frames), **surface.numbers}
     if segmented is not None and plane is not None:
-        upward = unit_up(plane.normal) if up == "auto" else upward
         numbers |= {
             "plane_inliers": int(segmented.ground.sum()),
             "plane_sigma": plane.sigma,
             "plane_tolerance": plane.tolerance,
-            "plane_normal": plane.normal.tolist(),
+            "plane_normal": dataset.world.leave(plane.normal).tolist(),
         }
     numbers |= {"fit_rms": residual, "depth_tolerance": tolerance, **sampled}
-    numbers |= {"up": list(upward), "unit": dataset.unit, "settings": asdict(settings)}
+    numbers |= _place(dataset) | {"settings": asdict(settings)}
     truth = dataset.root / "rock.glb"
     if truth.is_file() and chosen == "depth" and segmented is not None:
         on_stage("distance to the true rock")
         numbers["truth"] = error_to_truth(
-            samples, spacing, mesh, truth, dataset.frames, segmented, settings.seed
+            samples, spacing, mesh, truth, dataset, segmented, settings.seed
         )
-    prior = Prior(mesh, samples, normals, spacing, tolerance, numbers, sampled["backed"], upward)
+    prior = Prior(mesh, samples, normals, spacing, tolerance, numbers, sampled["backed"])
     return prior, segmented
 
 
-def _random_prior(dataset: Dataset, settings: PriorSettings, up: Up) -> Prior:
+def _place(dataset: Dataset) -> dict[str, Any]:
+    """Items of prior.json about the world of the dataset's files."""
+    return {"up": list(dataset.world.up), "unit": dataset.unit}
+
+
+def _random_prior(dataset: Dataset, settings: PriorSettings) -> Prior:
     """The prior of the source "random". Raises InputError as `scattered`."""
     mesh, points, normals, spacing, numbers = scattered(dataset, settings)
-    about = {"from": "random", "frames": len(dataset.frames), "up": list(up), "unit": dataset.unit}
+    about = {"from": "random", "frames": len(dataset.frames), **_place(dataset)}
     tolerance = float(numbers["depth_tolerance"])
-    return Prior(mesh, points, normals, spacing, tolerance, about | numbers, 0, up)
+    return Prior(mesh, points, normals, spacing, tolerance, about | numbers)
 
 
 def _depth_surface(
@@ -247,23 +259,20 @@ def _samples(
 
 
 def prior_from_mesh(
-    path: str | Path,
-    settings: PriorSettings,
-    up: Up = PLUS_Z,
-    unit: str = "m",
-    cameras: Sequence[Camera] = (),
-    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    path: str | Path, settings: PriorSettings, dataset: Dataset | None = None
 ) -> Prior:
-    """Sample a given mesh file in world coordinates, all over.
+    """Sample a mesh file in the coordinates of the dataset's files, all over.
 
-    up, unit, cameras, origin: of the dataset; the cameras decide the number of Gaussians if the
-    settings do not. Raises InputError if the mesh cannot be read or sampled, if no camera sees it,
-    and for settings that only a cloud has: poisson_depth and density.
+    The cameras of the dataset decide the number of Gaussians if the settings do not. Without a
+    dataset the mesh has +Z up, and lengths are metres. Raises InputError if the mesh cannot be read
+    or sampled, if no camera sees it, and for settings that only a cloud has: poisson_depth and
+    density.
     """
     settings.refuse_shaping("`mesh` gives one")
     from mgs.data.raycast import mesh_in_sight  # imported here because it loads Mitsuba
 
-    mesh = mesh_in_sight(Path(path), cameras, origin) if cameras else read_mesh(path)
+    cameras = [frame.camera for frame in dataset.frames] if dataset else []
+    mesh = mesh_in_sight(Path(path), cameras, dataset.world) if dataset else read_mesh(path)
     if settings.density is not None:
         raise InputError(
             f"{path}: a density is relative to the voxels of a cloud, and a mesh has none; "
@@ -276,11 +285,10 @@ def prior_from_mesh(
         "mesh": str(path),
         "depth_tolerance": spacing,
         **sampled,
-        "up": list(up),
-        "unit": unit,
+        **_place(dataset or Dataset(Path(), ())),
         "settings": used,
     }
-    return Prior(mesh, points, normals, spacing, spacing, numbers, sampled["backed"], up)
+    return Prior(mesh, points, normals, spacing, spacing, numbers, sampled["backed"])
 
 
 def outline_error(mesh: Mesh, frames: Sequence[Frame]) -> float:
@@ -328,11 +336,12 @@ def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
 def save_prior(out: str | Path, prior: Prior) -> Path:
     """Write mesh.ply, points.ply (x y z nx ny nz) and prior.json into a new folder, and return it.
 
-    Raises InputError if the folder is not empty or cannot be written.
+    The files are in the world of the dataset's files (`Prior.world`). Raises InputError if the
+    folder is not empty or cannot be written.
     """
     import trimesh
 
-    out = check_new_folder(out)
+    out, prior = check_new_folder(out), prior.moved(prior.world.leave)
     with atomic_path(out / "mesh.ply") as temporary:
         trimesh.Trimesh(prior.mesh.vertices, prior.mesh.faces, process=False).export(temporary)
     write_cloud(out / "points.ply", SparseCloud(prior.points, prior.normals))
@@ -341,8 +350,8 @@ def save_prior(out: str | Path, prior: Prior) -> Path:
 
 
 def load_prior(folder: str | Path) -> Prior:
-    """Read a prior that `save_prior` wrote. All faces of its mesh count as seen, since the file
-    does not say which were sampled.
+    """Read a prior that `save_prior` wrote, turned upright. All faces of its mesh count as seen,
+    since the file does not say which were sampled.
 
     Raises InputError if the folder or a file is missing, damaged or holds NaN.
     """
@@ -360,7 +369,7 @@ def load_prior(folder: str | Path) -> Prior:
         names = ("x", "y", "z", "nx", "ny", "nz")
         columns = np.stack([np.asarray(data[name], np.float64) for name in names], 1)
         spacing, tolerance = float(numbers["spacing"]), float(numbers["depth_tolerance"])
-        backed, up = int(numbers["backed"]), unit_up(numbers["up"])
+        backed, world = int(numbers["backed"]), World(unit_up(numbers["up"]))
     if not np.isfinite(columns).all() or len(columns) < 2:
         raise InputError(
             f"{path}: has NaN values, or fewer than two points; "
@@ -377,4 +386,5 @@ def load_prior(folder: str | Path) -> Prior:
         )
     mesh = read_mesh(folder / "mesh.ply")
     points, normals = columns[:, :3], columns[:, 3:]
-    return Prior(mesh, points, normals, spacing, tolerance, numbers, backed, up)
+    prior = Prior(mesh, points, normals, spacing, tolerance, numbers, backed)
+    return prior.moved(world.enter)

@@ -16,6 +16,8 @@ from mgs.plotting import STYLE, drawing
 from mgs.prior.build import Prior
 from mgs.prior.segmentation import SegmentedCloud
 
+UP = np.array([0.0, 0.0, 1.0])
+
 BLUE, TAN = [0.15, 0.35, 0.75], [0.85, 0.76, 0.6]
 
 FRAMED = STYLE | {"axes.spines.top": True, "axes.spines.right": True}
@@ -68,9 +70,9 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
     Raises InputError if it cannot be written.
     """
     plane = None if segmented is None else segmented.plane
-    up, body = np.array(prior.up), prior.mesh.vertices
+    body = prior.mesh.vertices
     reach = 0.5 * float(np.linalg.norm(np.ptp(body, axis=0)))
-    axes_of_view = _oblique(up if plane is None else plane.normal)
+    axes_of_view = _oblique(UP if plane is None else plane.normal)
     view = _View(axes_of_view, (body.min(0) + body.max(0)) / 2, reach)
     truth = prior.numbers.get("truth")
     error = f", accuracy {1e3 * truth['accuracy']:.2f} mm" if truth else ""
@@ -85,7 +87,7 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
     with drawing(path, 17 if segmented is not None else 7, 4.2, FRAMED, dpi=100) as figure:
         axes = figure.subplots(1, 5 if segmented is not None else 2)
         if segmented is not None:
-            _cloud_panels(axes[:3], view, segmented, up)
+            _cloud_panels(axes[:3], view, segmented)
         _shaded_mesh(axes[-2], view, prior.mesh)
         axes[-2].set_title(f"mesh, {area}{error}{unseen}")
         view.dots(axes[-1], prior.points[towards], shade, 1, dot)
@@ -93,18 +95,17 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
         axes[-1].set_title(f"{samples}\nspacing {spacing}")
 
 
-def draw_refused(path: str | Path, points: np.ndarray, kept: np.ndarray, up: np.ndarray) -> None:
+def draw_refused(path: str | Path, points: np.ndarray, kept: np.ndarray) -> None:
     """Write the figure of a cloud [P,3] without surface, from the side and from above, as a PNG.
 
-    kept: [P] bool, taken for the object, blue. up: [3] unit. Raises InputError if it cannot be
-    written.
+    kept: [P] bool, taken for the object, blue. Raises InputError if it cannot be written.
     """
     object_points = points[kept] if kept.any() else points
     middle = np.median(object_points, axis=0)
     reach = 1.5 * float(np.quantile(np.linalg.norm(object_points - middle, axis=1), 0.95))
     tint = np.where(kept[:, None], BLUE, TAN)
-    oblique = _oblique(up)
-    above = np.stack([oblique[0], np.cross(up, oblique[0]), up])
+    oblique = _oblique(UP)
+    above = np.stack([oblique[0], np.cross(UP, oblique[0]), UP])
     with drawing(path, 7, 4.2, FRAMED, dpi=100) as figure:
         views = {"from the side": oblique, "from above": above}
         taken = f"{int(kept.sum()):,} taken for the object (blue)"
@@ -113,12 +114,12 @@ def draw_refused(path: str | Path, points: np.ndarray, kept: np.ndarray, up: np.
             axis.set_title(f"{name}: {len(points):,} points,\n{taken}")
 
 
-def _cloud_panels(axes, view: _View, segmented: SegmentedCloud, up: np.ndarray) -> None:
+def _cloud_panels(axes, view: _View, segmented: SegmentedCloud) -> None:
     """Draw three panels: the cloud, its points on the ground plane (or, without one, not the
-    rock's), and the rock's. up: [3] unit, for heights without a plane."""
+    rock's), and the rock's."""
     cloud, rock, ground = segmented.cloud.points, segmented.rock_points, segmented.ground
     if segmented.plane is None:
-        height = cloud @ up - np.min(rock @ up)
+        height = cloud[:, 2] - np.min(rock[:, 2])
         other, named = cKDTree(rock).query(cloud)[0] > 0, "not the object's"
     else:
         height = segmented.plane.height(cloud)
@@ -128,7 +129,7 @@ def _cloud_panels(axes, view: _View, segmented: SegmentedCloud, up: np.ndarray) 
     panels = [
         (f"cloud: {len(cloud):,} points\ncoloured by height", cloud[near], height[near], 2.2),
         (f"{named} (tan)\nthe rest in blue", cloud[near], tint, 2.2),
-        (f"rock cluster: {len(rock):,} points", rock, rock @ up, 1.0),
+        (f"rock cluster: {len(rock):,} points", rock, rock[:, 2], 1.0),
     ]
     for axis, (title, points, colour, zoom) in zip(axes, panels, strict=True):
         view.dots(axis, points, colour, zoom, 0.8)

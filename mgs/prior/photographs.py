@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mgs.data.clouds import read_cloud, towards
+from mgs.data.clouds import read_cloud
 from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame
 from mgs.data.meshes import Mesh
@@ -121,8 +120,7 @@ def surface_of(
     if source == "hull":
         settings.refuse_shaping("a hull is carved from masks")
         return visual_hull(dataset.frames, on_stage)
-    cloud = read_cloud(points or dataset.root / CLOUD)
-    cloud = replace(cloud, points=towards(cloud.points, dataset.origin))
+    cloud = read_cloud(points or dataset.root / CLOUD).upright(dataset.world)
     segmented = segment_points(cloud, dataset, settings, on_stage)
     hull = visual_hull(dataset.frames, on_stage) if has_masks(dataset.frames) else None
     on_stage("Poisson mesh")

@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 from mgs.data.clouds import SparseCloud, views_of
 from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame
-from mgs.data.up import Up
 from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError
 from mgs.prior.segmentation import (
@@ -60,7 +59,7 @@ GROWN, GROWN_NEIGHBOURS = 0.15, 4
 extent, and min_samples. A part with few points, as in shade, is no cluster of its own."""
 
 PLANE_TILT = 45.0
-"""Largest angle between the ground's normal and the dataset's up, degrees."""
+"""Largest angle between the ground's normal and the vertical, degrees."""
 
 PLANE_VOXEL = 0.25
 """Voxel passed to `ground_plane`, over the point spacing."""
@@ -155,7 +154,7 @@ def segment_points(
         where = "inside the masks; give masks and poses that fit, or take the source hull"
     else:
         on_stage("ground plane and clusters")
-        plane = _plane_or_none(cloud, frames, dataset.up, settings)
+        plane = _plane_or_none(cloud, frames, settings)
         if plane is not None:
             ground = np.abs(plane.height(points)) <= plane.tolerance
         kept, clusters = _cluster_looked_at(cloud, frames, plane)
@@ -174,9 +173,7 @@ def segment_points(
     return SegmentedCloud(cloud, plane, ground, rock, normals, 0.0, clusters)
 
 
-def _plane_or_none(
-    cloud: Cloud, frames: Sequence[Frame], up: Up, settings: PriorSettings
-) -> Plane | None:
+def _plane_or_none(cloud: Cloud, frames: Sequence[Frame], settings: PriorSettings) -> Plane | None:
     """The ground plane, if it is about level and below all cameras; else None."""
     target = focus(frames)
     near = np.linalg.norm(cloud.points - target.point, axis=1) < REACH * target.distance
@@ -187,7 +184,7 @@ def _plane_or_none(
     except InputError:
         return None
     above = plane.height(np.stack([frame.camera.position for frame in frames])) > 0
-    level = abs(plane.normal @ up) > np.cos(np.radians(PLANE_TILT))
+    level = abs(plane.normal[2]) > np.cos(np.radians(PLANE_TILT))
     return plane if above.all() and level else None
 
 

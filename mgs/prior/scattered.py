@@ -108,7 +108,7 @@ def _triangulated(
     `most`, and unit directions to their cameras [N,3]; none where it has no cloud."""
     if not (dataset.root / CLOUD).is_file():
         return np.zeros((0, 3)), np.zeros((0, 3))
-    cloud = read_cloud(dataset.root / CLOUD)
+    cloud = read_cloud(dataset.root / CLOUD).upright(dataset.world)
     share, count = mask_share(cloud.points, dataset.frames)
     kept = np.flatnonzero(reliable(cloud) & (count > 0) & (share >= MASK_SHARE))
     kept = np.sort(rng.permutation(kept)[:most])

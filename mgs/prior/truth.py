@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from mgs.data.frames import Frame
+from mgs.data.dataset import Dataset
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
 from mgs.data.visibility import visible
 from mgs.errors import InputError
@@ -23,13 +22,13 @@ def error_to_truth(
     spacing: float,
     mesh: Mesh,
     truth: Path,
-    frames: Sequence[Frame],
+    dataset: Dataset,
     segmented: SegmentedCloud,
     seed: int,
 ) -> dict[str, float]:
     """Distances between a prior and the true rock, metres.
 
-    points: [N,3] samples, `spacing` metres apart; truth: file of the rock; frames: with depth;
+    points: [N,3] samples, `spacing` metres apart; truth: file of the rock; dataset: with depth;
     segmented: the cloud of the mesh; seed: root of the random points. Returns:
 
     - accuracy, completeness (Knapitsch et al. 2017): mean distance from the samples to the true
@@ -43,7 +42,8 @@ def error_to_truth(
     import trimesh
 
     known = read_mesh(truth)
-    true = trimesh.Trimesh(known.vertices, known.faces, process=False)
+    vertices = dataset.world.enter(known.vertices)
+    true = trimesh.Trimesh(vertices, known.faces, process=False)
     sample_seed = derive_seed(seed, "prior/truth")
     surface, face = trimesh.sample.sample_surface(true, TRUTH_SAMPLES, seed=sample_seed)
     surface, normals = np.asarray(surface), true.face_normals[face]
@@ -52,7 +52,7 @@ def error_to_truth(
         surface, normals = surface[exposed], normals[exposed]
     tolerance = max(spacing / 2, 2 * segmented.cloud.noise)
     seen = np.zeros(len(surface), bool)
-    for frame in frames:
+    for frame in dataset.frames:
         # Faces of a scanned rock may be wound either way.
         seen |= visible(surface, normals, frame.camera, frame.depth(), tolerance, two_sided=True)
     if not seen.any():

@@ -13,9 +13,11 @@ from scipy.spatial.transform import Rotation
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import write_transforms
 from mgs.data.frames import Frame
+from mgs.data.world import World
 from mgs.files import copy_file
 from mgs.gaussians import Gaussians
 from mgs.images import write_png
+from mgs.reports.exporting import as_imported
 from mgs.run.folder import Run
 
 OPAQUE = 0.5
@@ -37,16 +39,16 @@ def write_views(out: Path, run: Run, kind: str, every: bool = False) -> str:
     kind: a format of NAMES. Images are copied, masks are black and white; the points are centres of
     the model's Gaussians. Returns a line for the user. Raises InputError if a file is missing.
     """
-    frames, origin = list(run.taken), run.dataset.origin
+    frames, world = list(run.taken), run.dataset.world
     if every:
         frames = list(run.dataset.with_images([frame.name for frame in frames]))
-    back = np.negative(origin).tolist()
+    points = _points(as_imported(run, run.gaussians))
+    back, world = world.enter(np.negative(world.origin)).tolist(), World(world.up, world.unit)
     frames = [replace(frame, camera=frame.camera.seen_from(back)) for frame in frames]
-    points = _points(replace(run.gaussians, origin=origin))
     if kind == "nerfstudio":
-        _write_nerfstudio(out, run, frames, points)
+        _write_nerfstudio(out, frames, points, world)
     else:
-        _write_colmap(out, frames, points)
+        _write_colmap(out, frames, points, world)
     masks = sum(frame.mask_path is not None or frame.rock_path is not None for frame in frames)
     return f"{len(frames)} views, {masks} masks and {len(points):,} points"
 
@@ -76,7 +78,7 @@ def _copied(out: Path, frame: Frame, mask: str) -> Frame:
     return replace(frame, mask_path=path, rock_path=None)
 
 
-def _write_nerfstudio(out: Path, run: Run, frames: Sequence[Frame], points: np.ndarray) -> None:
+def _write_nerfstudio(out: Path, frames: Sequence[Frame], points: np.ndarray, world: World) -> None:
     """transforms.json, images, masks, depth in 16 bits, and points.ply."""
     deepest = max((frame.depth().max() for frame in frames if frame.depth_path), default=0.0)
     step = max(STEP, float(deepest) / (2**16 - 1))
@@ -91,10 +93,10 @@ def _write_nerfstudio(out: Path, run: Run, frames: Sequence[Frame], points: np.n
     PlyData([PlyElement.describe(points, "vertex")]).write(str(out / "points.ply"))
     notes: dict[str, str | float] = {"ply_file_path": "points.ply"}
     notes |= {"depth_unit_scale_factor": step} if deepest else {}
-    write_transforms(out, written, run.dataset.up, run.dataset.unit, notes)
+    write_transforms(out, written, world, notes)
 
 
-def _write_colmap(out: Path, frames: Sequence[Frame], points: np.ndarray) -> None:
+def _write_colmap(out: Path, frames: Sequence[Frame], points: np.ndarray, world: World) -> None:
     """images, masks/NAME.png.png, and sparse/0 as text: pinhole cameras, poses, points."""
 
     def numbers(*values: float) -> str:
@@ -103,7 +105,7 @@ def _write_colmap(out: Path, frames: Sequence[Frame], points: np.ndarray) -> Non
     cameras: dict[str, int] = {}
     images = []
     for number, frame in enumerate(frames, 1):
-        image, camera = _copied(out, frame, ".png").image_path.name, frame.camera
+        image, camera = _copied(out, frame, ".png").image_path.name, world.leave(frame.camera)
         K, turn, t = camera.K, camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
         lens = numbers(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
         lens = f"PINHOLE {camera.width} {camera.height} {lens}"

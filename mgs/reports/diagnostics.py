@@ -240,7 +240,7 @@ def diagnose(
     gaussians, trained = opened.state.gaussians, [frame.name for frame in opened.taken]
     frames = choose_views(opened.dataset.frames, trained, wanted)
     scalars, out = run_scalars(opened), opened.folder / "diagnostics"
-    write_information_ply(out / "information.ply", gaussians, scalars)
+    write_information_ply(out / "information.ply", opened.model, scalars)
     written = [out / "information.ply"]
     for done, frame in enumerate(frames):
         progress(done, len(frames))
@@ -249,8 +249,9 @@ def diagnose(
         if opened.settings.estimator != "exact":  # its numbers are not in the units of the panels
             title += f"; by {opened.settings.estimator}"
         files = [out / f"{frame.name}.exr", out / f"{frame.name}.png"]
-        write_exr(files[0], maps, frame.camera, opened.dataset.unit)
-        write_preview(files[1], maps, title, opened.dataset.unit)
+        world = opened.dataset.world
+        write_exr(files[0], maps, world.leave(frame.camera), world.unit)
+        write_preview(files[1], maps, title, world.unit)
         written += files
     progress(len(frames), len(frames))
     return written

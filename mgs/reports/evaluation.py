@@ -21,6 +21,7 @@ from mgs.provenance import versions
 from mgs.run.folder import Run, holds_run, open_run, read_config
 from mgs.run.inputs import array_digest, camera_digest, frame_digests
 from mgs.splat_files import load_gaussians
+from mgs.splat_places import from_source
 
 
 def evaluate_run(
@@ -170,7 +171,7 @@ def evaluate(
     if dataset is None:
         raise InputError(f"{path or 'the model'}: is in no run folder; give its `dataset`")
     views = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
-    subject = subject.counted_from(views.origin)
+    subject = from_source(subject, views.world)
     names, tests = list(trained), views.test_views()
     if unknown := sorted(set(names) - {frame.name for frame in views.frames}):
         raise InputError(f"{views.root}: has no frame {unknown[0]}, which `trained` names")

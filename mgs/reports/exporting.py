@@ -11,7 +11,7 @@ import numpy as np
 from mgs.camera import Camera, look_at
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import target_of
-from mgs.data.up import Up, upright
+from mgs.data.world import Vector, levelled
 from mgs.evaluation import render_view
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.gaussians import Gaussians
@@ -21,6 +21,7 @@ from mgs.prior.exposure import exposure_of, without_gain
 from mgs.run.folder import Run, open_run
 from mgs.splat.reference import sh_basis
 from mgs.splat_files import load_gaussians, upward
+from mgs.splat_places import to_source
 
 DIRECTIONS = 64
 """Directions to which the coefficients of a converted colour are fitted."""
@@ -37,7 +38,7 @@ PART = 1 << 16
 """Gaussians whose colours are converted at a time."""
 
 
-def read_model(source: str | Path) -> tuple[Gaussians, Up]:
+def read_model(source: str | Path) -> tuple[Gaussians, Vector]:
     """Read the model of a run folder, in the coordinates that its dataset was made of, or of a file
     with the up that it has (`upward`). Raises InputError as `open_run`, `Run.state` and
     `load_gaussians`."""
@@ -45,7 +46,13 @@ def read_model(source: str | Path) -> tuple[Gaussians, Up]:
     if not source.is_dir():
         return load_gaussians(source), upward(source)
     run = open_run(source)
-    return replace(run.gaussians, origin=run.dataset.origin), run.up
+    return as_imported(run, run.gaussians), run.dataset.world.up
+
+
+def as_imported(run: Run, g: Gaussians) -> Gaussians:
+    """A model of a run in the coordinates that its dataset was made of."""
+    world = run.dataset.world
+    return replace(to_source(g, world), origin=world.origin)
 
 
 def in_srgb(g: Gaussians) -> Gaussians:
@@ -100,6 +107,6 @@ def difference(one: Gaussians, other: Gaussians) -> float:
     return psnr(*np.concatenate(pictures, 1))
 
 
-def to_y_up(up: Up) -> np.ndarray:
+def to_y_up(up: Vector) -> np.ndarray:
     """Rotation [3,3] of a world with this upward direction into glTF's, in which +Y is up."""
-    return np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) @ upright(up)
+    return np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) @ levelled(up)

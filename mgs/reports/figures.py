@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mgs.colour import srgb_from_linear
-from mgs.data.up import PLUS_Z, Up, upright
 from mgs.plotting import NO_GRID, crop, drawing, literal
 from mgs.run.policies import POLICIES
 
@@ -58,12 +57,6 @@ def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
     return styles
 
 
-def axis_names(up: Up, unit: str) -> tuple[str, str, str]:
-    """Names of the axes of a world that was turned so that +Z is up."""
-    x, y, z = ("x", "y", "z") if up == PLUS_Z else ("horizontal", "horizontal, across", "up")
-    return f"{x} ({unit})", f"{y} ({unit})", f"{z} ({unit})"
-
-
 ACROSS = 3
 """Most panels side by side in `orbit_figure`."""
 
@@ -76,14 +69,12 @@ def orbit_figure(
     positions: np.ndarray,
     surface: np.ndarray,
     choices: Mapping[str, tuple[Sequence[int], Sequence[int]]],
-    up: Up,
     unit: str,
 ) -> None:
     """Draw the views that each run chose, from above, a panel for each run.
 
     positions: [C,3] camera centres, world. surface: [N,3] points of the rock. choices:
-    label -> indices into positions: (seeds, chosen views in their order). up, unit: of the world
-    (`mgs.data.dataset.Dataset`); it is drawn turned so that +Z is up.
+    label -> indices into positions: (seeds, chosen views in their order). unit: of the world.
     """
     columns = min(ACROSS, len(choices))
     lines = -(-len(choices) // columns)
@@ -91,7 +82,7 @@ def orbit_figure(
     with drawing(path, 2.7 * columns, height, NO_GRID) as figure:
         axes = figure.subplots(lines, columns, squeeze=False).ravel()
         for axis, (label, (seeds, chosen)) in zip(axes, choices.items(), strict=False):
-            draw_cameras(axis, positions, surface, seeds, chosen, up)
+            draw_cameras(axis, positions, surface, seeds, chosen)
             axis.set_title(_in_lines(label))
         for axis in axes[len(choices) :]:
             axis.remove()
@@ -110,7 +101,6 @@ def draw_cameras(
     surface: np.ndarray,
     seeds: Sequence[int],
     chosen: Sequence[int],
-    up: Up,
     newest: int | None = None,
 ) -> None:
     """Draw cameras from above into axes: all as rings, seeds as discs, chosen ones as discs with
@@ -119,9 +109,7 @@ def draw_cameras(
     newest: index of a camera to draw in NEWEST, with its line to the rock. Others: as
     `orbit_figure`.
     """
-    turn = upright(up)
-    xy = (np.asarray(positions) @ turn.T)[:, :2]
-    rock = (np.asarray(surface) @ turn.T)[:: max(1, len(surface) // 6000), :2]
+    xy, rock = positions[:, :2], surface[:: max(1, len(surface) // 6000), :2]
     centre = rock.mean(axis=0)
     axis.scatter(*rock.T, s=0.6, color="#b9b4ab", linewidths=0)
     hollow = {"facecolors": "white", "edgecolors": "#9a9a9a", "linewidths": 0.6}

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from mgs.data.frames import Frame
-from mgs.data.up import upright
 from mgs.evaluation import render_view
 from mgs.files import write_text
 from mgs.policy.criteria import GAIN_UNIT
@@ -176,7 +175,7 @@ def _view(label: str, run: Run, k: int, frame: Frame) -> dict[str, Any]:
         "name": view,
         "facts": facts,
         "pictures": [dict(zip(("name", "caption", "alt"), row, strict=True)) for row in pictures],
-        "eye": (upright(run.up) @ frame.camera.position).tolist(),
+        "eye": frame.camera.position.tolist(),
     }
 
 

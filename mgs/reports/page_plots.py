@@ -14,9 +14,8 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
-from mgs.data.up import upright
 from mgs.gaussians import Gaussians
-from mgs.reports.figures import Curves, axis_names, line_styles
+from mgs.reports.figures import Curves, line_styles
 from mgs.run.folder import Run
 
 SYMBOLS: dict[str | tuple[int, int, int], str] = {
@@ -140,17 +139,15 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     """The orbit in 3D: the model as points, all poses, seeds, and the chosen views, numbered and
     joined in their order.
 
-    The world is drawn turned so that +Z is up. The last trace, "shown above", marks the view of the
-    page's slider; the page moves it.
+    The last trace, "shown above", marks the view of the page's slider; the page moves it.
     """
     taken, frames = run.indices, run.dataset.frames
     seeds, chosen = taken[: run.settings.seeds], taken[run.settings.seeds :]
-    turn, order = upright(run.up), list(range(1, len(chosen) + 1))
+    order = list(range(1, len(chosen) + 1))
     names, cameras = zip(*((frame.name, frame.camera) for frame in frames), strict=True)
     eyes = np.array([camera.position for camera in cameras])
     middle = np.mean(run.gaussians.means, axis=0)
     length = FRUSTUM * float(np.linalg.norm(eyes - middle, axis=1).mean())
-    eyes = eyes @ turn.T
 
     def markers(name: str, which: list[int], texts: list[str], **marker: Any) -> dict[str, Any]:
         trace = _points(name, eyes[which], marker)
@@ -167,15 +164,14 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     path |= {"line": {"color": GREY, "width": 2}, "textfont": {"size": 11}}
     here = {"size": 12, "color": "#dd1111", "symbol": "circle-open"}
     traces = [
-        _model_points(run.gaussians, turn),
+        _model_points(run.gaussians),
         markers("candidates", left, [names[i] for i in left], **open_circle),
-        _frusta([cameras[i] for i in taken], length, turn),
+        _frusta([cameras[i] for i in taken], length),
         markers("seeds", seeds, [names[i] for i in seeds], **diamond),
         path,
         _points("shown above", eyes[taken[:1]], here) | {"hoverinfo": "skip"},
     ]
-    titles = axis_names(run.up, run.dataset.unit)
-    axes = {f"{a}axis": _axis(title) for a, title in zip("xyz", titles, strict=True)}
+    axes = {f"{a}axis": _axis(f"{a} ({run.dataset.unit})") for a in "xyz"}
     view = {"eye": {"x": 0.9, "y": 0.9, "z": 0.7}}
     alt = (
         f"Camera positions of {label} in 3D around the model. "
@@ -186,12 +182,12 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     return {"title": f"Orbit, {label}", "alt": alt, "data": traces, "layout": layout}
 
 
-def _model_points(model: Gaussians, turn: np.ndarray) -> dict[str, Any]:
-    """Trace of up to POINTS Gaussians of a model in their colours. turn: [3,3]."""
+def _model_points(model: Gaussians) -> dict[str, Any]:
+    """Trace of up to POINTS Gaussians of a model in their colours."""
     some = model[:: max(1, -(-len(model) // POINTS))]
     colours = np.round(srgb_from_linear(some.linear_rgb(some.rgb)) * 255).astype(int).tolist()
     marker = {"size": 2, "color": [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in colours]}
-    trace = _points("model", np.round(some.means.astype(float) @ turn.T, 4), marker)
+    trace = _points("model", np.round(some.means.astype(float), 4), marker)
     return trace | {"hoverinfo": "skip"}
 
 
@@ -210,11 +206,11 @@ def corners_at(camera: Camera, depth: float) -> np.ndarray:
     return depth * pixels @ np.linalg.inv(camera.K).T @ pose[:3, :3].T + pose[:3, 3]
 
 
-def _frusta(cameras: Sequence[Camera], length: float, turn: np.ndarray) -> dict[str, Any]:
-    """Trace of cameras as wire pyramids of this length. turn: [3,3], rotation of the world."""
+def _frusta(cameras: Sequence[Camera], length: float) -> dict[str, Any]:
+    """Trace of cameras as wire pyramids of this length."""
     lines: list[list[float | None]] = [[], [], []]
     for camera in cameras:
-        corners, eye = corners_at(camera, length) @ turn.T, turn @ camera.position
+        corners, eye = corners_at(camera, length), camera.position
         edges = [(eye, corner) for corner in corners]
         edges += zip(corners, np.roll(corners, -1, axis=0), strict=True)
         for a, b in edges:

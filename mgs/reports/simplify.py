@@ -14,6 +14,7 @@ from mgs.reports.evaluation import compare_models
 from mgs.run import inputs
 from mgs.run.folder import open_run
 from mgs.run.settings import NbvSettings
+from mgs.splat_places import to_source
 from mgs.splat_ply import write_ply
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def prune_run(
     smaller = gaussians[found.kept]
     say("comparing")
     views, psnr = compare_models([gaussians, smaller], opened)
-    write_ply(opened.folder / PRUNED, smaller)
+    write_ply(opened.folder / PRUNED, to_source(smaller, opened.dataset.world))
     return PrunedRun(len(gaussians), len(smaller), found.predicted, found.actual, views, psnr)
 
 
@@ -124,7 +125,7 @@ def refit_run(
     say("comparing")
     views, psnr = compare_models([own, found.whole, found.gaussians], opened)
     marks = {f"learned_{kind}": mask for kind, mask in found.learned.items()}
-    write_ply(path, found.gaussians, marks)
+    write_ply(path, to_source(found.gaussians, opened.dataset.world), marks)
     return RefittedRun(len(own) * parameters_of_each(settings), found, views, psnr)
 
 

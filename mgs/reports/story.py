@@ -87,8 +87,7 @@ def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], shown: Frame) ->
         figure.suptitle(title, fontsize=14, color=NEWEST)
         eyes = np.array([frame.camera.position for frame in run.dataset.frames])
         views = model.taken[:seeds], model.taken[seeds:]
-        up = run.up
-        draw_cameras(orbit, eyes, model.gaussians.means, *views, up, model.taken[-1])
+        draw_cameras(orbit, eyes, model.gaussians.means, *views, model.taken[-1])
         orbit.set_xlabel("cameras, from above")
         render.imshow(rgb[window], interpolation="nearest")
         render.set_xlabel(f"render of a new view: {psnr(rgb, truth):.1f} dB")

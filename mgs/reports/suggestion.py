@@ -11,7 +11,7 @@ import numpy as np
 from mgs.camera import opengl_from_opencv
 from mgs.data.dataset import write_transforms
 from mgs.data.frames import Frame
-from mgs.data.up import upright
+from mgs.data.world import World
 from mgs.files import write_json
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.reports.diagnostics import VISIBLE, picture, run_scalars, show_map, view_maps
@@ -38,9 +38,7 @@ def write_suggestion(out: Path, run: Run, found: Suggestion) -> None:
         Frame(view.name, view.camera, float(k), out / f"images/{view.name}.png", on_demand=True)
         for k, view in enumerate(found.plan)
     ]
-    up, unit = run.dataset.up, run.dataset.unit
-    notes, origin = {"convention": CONVENTION}, run.dataset.origin
-    write_transforms(out, frames, up, unit, notes, origin)
+    write_transforms(out, frames, run.dataset.world, {"convention": CONVENTION})
     draw_suggestion(out / "suggestions.png", run, found)
 
 
@@ -52,6 +50,7 @@ def numbers(run: Run, found: Suggestion) -> dict[str, Any]:
         "unknown": "mean share of the prior's variance left in what the picture shows",
         "distance": f"from the last image, {run.dataset.unit}",
     }
+    world = run.dataset.world
     return {
         "policy": run.label,
         "images": len(run.taken),
@@ -60,8 +59,8 @@ def numbers(run: Run, found: Suggestion) -> dict[str, Any]:
         "flight": {"metres": found.metres, "seconds": found.seconds},
         "certificate": _certificate(found),
         "dropped": found.dropped,
-        "plan": [_record(view) for view in found.plan],
-        "ranking": [_record(view) for view in found.ranking],
+        "plan": [_record(view, world) for view in found.plan],
+        "ranking": [_record(view, world) for view in found.ranking],
     }
 
 
@@ -74,9 +73,9 @@ def _certificate(found: Suggestion) -> dict[str, Any] | None:
     return asdict(found.certificate) | {"prices": prices}
 
 
-def _record(view: View) -> dict[str, Any]:
+def _record(view: View, world: World) -> dict[str, Any]:
     values = {key: value for key, value in asdict(view).items() if key != "camera"}
-    pose = opengl_from_opencv(view.camera.world_to_camera)
+    pose = opengl_from_opencv(world.leave(view.camera).world_to_camera)
     return values | {"transform_matrix": pose.tolist()}
 
 
@@ -108,10 +107,9 @@ def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
 
 def _from_above(axis: Any, run: Run, found: Suggestion) -> None:
     """Draw images, candidates by gain, and the planned way, from above."""
-    turn = upright(run.prior.up)
 
     def level(points: Any) -> np.ndarray:
-        return np.asarray(np.atleast_2d(points) @ turn.T)[:, :2]
+        return np.atleast_2d(points)[:, :2]
 
     images = level([frame.camera.position for frame in taken_in_order(run)])
     ranked = level([view.camera.position for view in found.ranking])

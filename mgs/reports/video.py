@@ -17,7 +17,6 @@ import numpy as np
 from mgs.camera import Camera, look_at
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Dataset
-from mgs.data.up import upright
 from mgs.errors import InputError
 from mgs.files import atomic_path
 from mgs.plotting import painted
@@ -38,26 +37,25 @@ UNKNOWN = "cividis"
 
 
 def camera_path(
-    dataset: Dataset, means: np.ndarray, up: Sequence[float], count: int, width: int
+    dataset: Dataset, means: np.ndarray, count: int, width: int
 ) -> list[Camera]:
     """Cameras of a turntable, at equal angles.
 
-    means: [N,3] of the Gaussians. up: of the world. count: of cameras. width: of their images,
-    pixels.
+    means: [N,3] of the Gaussians. count: of cameras. width: of their images, pixels.
     """
     first = dataset.frames[0].camera
-    turn, centre = upright((up[0], up[1], up[2])), np.median(means, axis=0)
+    centre = np.median(means, axis=0)
     eyes = np.array([frame.camera.position for frame in dataset.frames])
-    away = (eyes - centre) @ turn.T
+    away = eyes - centre
     distances = np.linalg.norm(away, axis=1)
     distance = float(np.median(distances))
     elevation = np.median(np.arcsin(np.clip(away[:, 2] / distances, -1, 1)))
     angle = np.arctan2(away[0, 1], away[0, 0]) + 2 * np.pi * np.arange(count) / count
     flat, rise = distance * np.cos(elevation), np.full(count, distance * np.sin(elevation))
-    places = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), rise]) @ turn + centre
+    places = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), rise]) + centre
     shape = first.resized(width + width % 2)
     shape = replace(shape, height=shape.height + shape.height % 2)  # encoders need even numbers
-    return [replace(shape, world_to_camera=look_at(eye, centre, up)) for eye in places]
+    return [replace(shape, world_to_camera=look_at(eye, centre)) for eye in places]
 
 
 def path_frames(run: Run, beside: str | None, count: int, width: int) -> Film:
@@ -74,8 +72,7 @@ def path_frames(run: Run, beside: str | None, count: int, width: int) -> Film:
             yield _side_by_side(truth, picture(view_maps(model, camera, {})))
         return
     scalars = {"uncertainty": run_scalars(run)["uncertainty"]} if beside else {}
-    up = run.up
-    for camera in camera_path(run.dataset, model.means, up, count, width):
+    for camera in camera_path(run.dataset, model.means, count, width):
         maps = view_maps(model, camera, scalars)
         right = [_unknown(maps)] if beside else []
         yield _side_by_side(picture(maps), *right)

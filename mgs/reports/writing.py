@@ -83,8 +83,8 @@ def _draw_choices(paths: Mapping[str, Path], runs: Mapping[str, Run]) -> None:
     for label, run in runs.items():
         seeds = run.settings.seeds
         choices[label] = run.indices[:seeds], run.indices[seeds:]
-    world = first.up, first.dataset.unit
-    figures.orbit_figure(paths["orbit"], positions, first.gaussians.means, choices, *world)
+    means, unit = first.gaussians.means, first.dataset.unit
+    figures.orbit_figure(paths["orbit"], positions, means, choices, unit)
     gains = step_curves(runs, "information_gain", x="step")
     title, y = "Information that each chosen view promised", f"information gain ({GAIN_UNIT})"
     figures.curves_figure(paths["gain"], title, {y: gains}, "chosen view", bottom=0)

@@ -1,6 +1,6 @@
 """Candidate poses of the next pictures: read from a file, or placed around the object.
 
-A candidate needs no image. Positions are in the world of the dataset, metres.
+A candidate needs no image. Files are in the world of the dataset's files, metres.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import load_cameras
 from mgs.data.meshes import Mesh, distances_to_mesh
-from mgs.data.up import upright
+from mgs.data.world import UPRIGHT, World
 from mgs.errors import InputError
 from mgs.files import read_csv
 from mgs.prior.build import Prior
@@ -42,11 +42,12 @@ Named = tuple[str, Camera]
 class Site:
     """The object, and the camera that looks at it.
 
-    like: camera whose intrinsics candidates have by default.
+    like: camera whose intrinsics candidates have by default. world: of files of poses.
     """
 
     prior: Prior
     like: Camera
+    world: World = UPRIGHT
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -55,7 +56,7 @@ class Site:
 
     def camera(self, eye: Sequence[float] | np.ndarray, target: np.ndarray | None = None) -> Camera:
         """A camera at `eye` [3] that looks at `target` [3], by default the middle of the object."""
-        pose = look_at(eye, self.centre if target is None else target, self.prior.up)
+        pose = look_at(eye, self.centre if target is None else target)
         return Camera(self.like.K, self.like.width, self.like.height, pose)
 
 
@@ -70,7 +71,8 @@ def read_poses(path: str | Path, site: Site) -> list[Named]:
     if path.suffix.lower() == ".csv":
         poses = _read_csv(path, site)
     else:
-        poses = [(Path(name).stem, camera) for name, camera in load_cameras(path, site.like)]
+        cameras = load_cameras(path, site.like)
+        poses = [(Path(name).stem, site.world.enter(camera)) for name, camera in cameras]
     if len(poses) > MOST_POSES:
         raise InputError(f"{path}: lists {len(poses):,} poses, more than {MOST_POSES:,}; thin them")
     names = [name for name, _ in poses]
@@ -116,7 +118,8 @@ def _csv_pose(where: str, index: int, columns: list[str], row: list[str], site: 
     if "qw" not in numbers:
         target = np.array([numbers[key] for key in TARGET]) if "target_x" in numbers else None
         try:
-            return name, site.camera(eye, target)
+            enter = site.world.enter
+            return name, site.camera(enter(eye), None if target is None else enter(target))
         except InputError:
             raise InputError(f"{where}: looks at its own position; correct it") from None
     quaternion = np.array([numbers[key] for key in QUATERNION])
@@ -125,7 +128,8 @@ def _csv_pose(where: str, index: int, columns: list[str], row: list[str], site: 
     pose = np.eye(4)
     pose[:3, :3] = rotmat_from_quat(quaternion).T
     pose[:3, 3] = -pose[:3, :3] @ eye
-    return name, Camera(site.like.K, site.like.width, site.like.height, pose)
+    camera = Camera(site.like.K, site.like.width, site.like.height, pose)
+    return name, site.world.enter(camera)
 
 
 def place_poses(
@@ -137,7 +141,7 @@ def place_poses(
     cubic lattice of the dome's radius. radius: metres. elevations: lowest and highest above the
     middle of the object, degrees. Raises InputError if the lattice has no place between them.
     """
-    turn, low, high = upright(site.prior.up), *elevations
+    low, high = elevations
     if shape == "grid":
         offsets = _lattice(count, radius, elevations)
         if not len(offsets):
@@ -150,7 +154,7 @@ def place_poses(
         orbit = Orbit(kind=kind, radius=radius, elevations=band, turns=1)  # type: ignore[arg-type]
         offsets = orbit_positions(orbit, count, np.zeros(3))
     digits = len(str(len(offsets) - 1))
-    eyes = site.centre + offsets @ turn
+    eyes = site.centre + offsets
     return [(f"{shape}_{i:0{digits}d}", site.camera(eye)) for i, eye in enumerate(eyes)]
 
 
@@ -199,7 +203,7 @@ def refusals(
     """
     eyes = np.stack([camera.position for _, camera in poses])
     mesh, centre = site.prior.mesh, site.centre
-    offset = (eyes - centre) @ upright(site.prior.up).T
+    offset = eyes - centre
     far = np.linalg.norm(offset, axis=1)
     rise = np.degrees(np.arcsin(np.clip(offset[:, 2] / np.maximum(far, 1e-12), -1, 1)))
     low, high = elevations or (-90.0, 90.0)

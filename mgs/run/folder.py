@@ -42,7 +42,7 @@ import numpy as np
 
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame
-from mgs.data.up import Up, unit_up, upright
+from mgs.data.world import PLUS_Z, Vector, unit_up
 from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, parsing, read_json, reading, write_json, write_text
 from mgs.gaussians import ARRAYS, Gaussians
@@ -54,6 +54,7 @@ from mgs.run.policy_file import label
 from mgs.run.records import Config, Metrics, Record, checked, read_checked
 from mgs.run.settings import NbvSettings, check_settings, validated
 from mgs.run.state import Checkpoint
+from mgs.splat_places import to_source
 from mgs.splat_ply import read_ply, write_ply
 
 CHECKPOINT, STEPS, POLICY_SOURCE = "checkpoint.npz", "steps.jsonl", "policy.py"
@@ -102,8 +103,7 @@ class Run:
         if not self.begun:
             return html(repr(self), [])
         taken, g = thumbnails([frame.image_path for frame in self.taken]), self.gaussians
-        turn = upright(self.prior.up)
-        return html(repr(self), [*taken, cloud(g.means @ turn.T, g.linear_rgb(g.rgb))])
+        return html(repr(self), [*taken, cloud(g.means, g.linear_rgb(g.rgb))])
 
     @property
     def label(self) -> str:
@@ -128,7 +128,7 @@ class Run:
     @cached_property
     def dataset(self) -> Dataset:
         """The dataset of the run."""
-        dataset = load_dataset(self.settings.dataset)
+        dataset = load_dataset(self.settings.dataset, up=up_of_prior(self.settings.prior))
         self.check_frames(dataset)
         return dataset
 
@@ -150,15 +150,6 @@ class Run:
         return load_prior(path)
 
     @cached_property
-    def up(self) -> Up:
-        """Up direction of the prior, or of the dataset if the prior's folder is gone."""
-        file = self.settings.prior / "prior.json"
-        numbers = read_json(file) if file.is_file() else None
-        if isinstance(numbers, dict) and "up" in numbers:
-            return unit_up(numbers["up"])
-        return self.dataset.up
-
-    @cached_property
     def steps(self) -> list[dict[str, Any]]:
         """Lines of the finished steps, those of steps.jsonl (`mgs.run.folder`)."""
         if "state" in self.__dict__:
@@ -170,6 +161,11 @@ class Run:
     def state(self) -> Checkpoint:
         """The state after the last finished step."""
         state = self._existing(read_checkpoint(self.folder))
+        if not state.upright and self.dataset.world.up != PLUS_Z:
+            raise InputError(
+                f"{self.folder}: an older mgs made it in a world that is not upright, which this "
+                "one does not read; start the run anew"
+            )
         if "ended" in state.steps[-1]:
             self._repair(state)
         return state
@@ -182,13 +178,13 @@ class Run:
 
     def _repair(self, state: Checkpoint) -> None:
         """Write gaussians.ply again where it is not the model of the checkpoint, and warn."""
-        path = self.folder / "gaussians.ply"
+        path, model = self.folder / "gaussians.ply", to_source(state.gaussians, self.dataset.world)
         try:
-            intact = read_ply(path) == state.gaussians
+            intact = read_ply(path) == model
         except InputError:
             intact = False
         if not intact:
-            write_ply(path, state.gaussians)
+            write_ply(path, model)
             warnings.warn(
                 Notice(f"{path}: was damaged; restored from checkpoint.npz"), stacklevel=3
             )
@@ -197,6 +193,11 @@ class Run:
     def gaussians(self) -> Gaussians:
         """The model after the last finished step."""
         return self.state.gaussians
+
+    @property
+    def model(self) -> Gaussians:
+        """`gaussians` in the world of the dataset's files, as gaussians.ply has them."""
+        return to_source(self.gaussians, self.dataset.world)
 
     @property
     def indices(self) -> list[int]:
@@ -226,6 +227,14 @@ class Run:
         """`metrics`, if they are of the model after the last step."""
         fresh = self.metrics is not None and self.metrics["images"] == len(self.indices)
         return self.metrics if fresh else None
+
+
+def up_of_prior(folder: Path) -> Vector | None:
+    """Upward direction by a prior's folder, in the world of its dataset's files; None where there
+    is none. A run goes by it before the dataset's own."""
+    file = folder / "prior.json"
+    numbers = read_json(file) if file.is_file() else None
+    return unit_up(numbers["up"]) if isinstance(numbers, dict) and "up" in numbers else None
 
 
 def open_run(folder: str | PathLike[str]) -> Run:
@@ -290,6 +299,7 @@ def write_checkpoint(out: Path, state: Checkpoint) -> None:
             "taken": state.taken,
             "steps": state.steps,
             "inputs": state.inputs,
+            "upright": True,
             "antialiased": state.gaussians.antialiased,
             "linear": state.gaussians.linear,
         },
@@ -364,7 +374,7 @@ def read_checkpoint(out: Path) -> Checkpoint | None:
         gaussians.check(f"{out / CHECKPOINT}: not a readable checkpoint")
         if H.ndim != 2 or surface.ndim != 2 or len(H) != len(gaussians):
             raise ValueError(f"H has shape {H.shape} of {len(gaussians)} Gaussians")
-    return Checkpoint(gaussians, H, surface, **record)
+    return Checkpoint(gaussians, H, surface, **{"upright": False} | record)
 
 
 def _member(file: zipfile.ZipFile, name: str, kind: str) -> np.ndarray:

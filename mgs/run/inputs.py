@@ -18,7 +18,6 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame
-from mgs.data.up import PLUS_Z
 from mgs.errors import InputError
 from mgs.run import policy_file
 
@@ -50,10 +49,9 @@ def file_digest(path: Path) -> str:
 
 
 def prior_digest(prior: Prior) -> str:
-    """Hash of what a run takes from a prior: points, normals, spacing, tolerance, backing, up."""
-    up = [np.array(prior.up)] if prior.up != PLUS_Z else []
+    """Hash of what a run takes from a prior: points, normals, spacing, tolerance, backing."""
     numbers = np.array([prior.spacing, prior.depth_tolerance, prior.backed])
-    return array_digest([prior.points, prior.normals, numbers, *up])
+    return array_digest([prior.points, prior.normals, numbers])
 
 
 def camera_digest(camera: Camera) -> str:

@@ -26,7 +26,7 @@ from mgs.data.importers import import_shot, silhouette_of
 from mgs.data.lens import Lens
 from mgs.data.shots import Shot
 from mgs.data.sources import record_camera
-from mgs.data.up import levelled
+from mgs.data.world import World
 from mgs.errors import InputError, Notice
 from mgs.files import below, read_json, remove_file, write_json
 from mgs.prior.build import Prior
@@ -85,13 +85,13 @@ def begin(folder: Path, poses: Dataset, prior: Prior) -> None:
         record |= {"file_path": f"images/{name}.png", "mask_path": f"masks/{name}.png"}
     demand = {"on_demand": True, "token": secrets.token_hex(4), "frames": records}
     write_json(folder / "transforms.json", data | demand)
-    frames = load_dataset(folder).frames
+    frames = load_dataset(folder, up=poses.world.up).frames
     silhouette = cache(lambda: silhouette_of(prior.mesh))
     for given, frame in zip(poses.frames, frames, strict=True):
         if not given.on_demand:
             image, depth, mask = given.image_path, given.depth_path, given.mask_path
             shot = Shot(frame.name, frame.camera, None, frame.timestamp, image, depth)
-            _commit(folder, frame, replace(shot, mask=mask), silhouette)
+            _commit(folder, frame, replace(shot, mask=mask), silhouette, poses.world)
 
 
 def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[[Frame], Frame]:
@@ -107,7 +107,7 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
     used = dict[Path, set[str]]()
 
     def capture(frame: Frame) -> Frame:
-        known = as_captured(frame)
+        known = as_captured(frame, dataset.world)
         if known.capture_path or known.given_up:
             return known
         if live is None:
@@ -121,7 +121,7 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
             try:
                 live.deliver(pose, out)
                 _warn_of_late(used)
-                received = _received(dataset.root, frame, out, live, centre, silhouette)
+                received = _received(dataset, frame, out, live, centre, silhouette)
                 used[out] = {*answers(out)}
                 return received
             except (InputError, OSError) as error:
@@ -131,7 +131,7 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
                 warnings.warn(Notice(said), stacklevel=2)
         if live.failure == "skip":
             write_json(capture_record(frame), {"given_up": reason})
-            return as_captured(frame)
+            return as_captured(frame, dataset.world)
         raise InputError(
             f"{frame.name}: no picture after {live.tries} tries ({reason}); "
             "mend it and resume the run"
@@ -167,20 +167,21 @@ def ask(
 
     Raises InputError where an answer lies there already though this pose was never asked for.
     """
-    heading, pitch = heading_and_pitch(frame.camera, levelled(dataset.up))
+    heading, pitch = heading_and_pitch(frame.camera)
+    camera = dataset.world.leave(frame.camera)
     name = f"{frame.name}-{token}" if token else frame.name
     asked = {
         "name": frame.name,
         "picture": f"{name}.png",
         "convention": CONVENTION,
         "unit": dataset.unit,
-        "up": list(dataset.up),
-        "transform_matrix": opengl_from_opencv(frame.camera.world_to_camera).tolist(),
-        "position": frame.camera.position.tolist(),
+        "up": list(dataset.world.up),
+        "transform_matrix": opengl_from_opencv(camera.world_to_camera).tolist(),
+        "position": camera.position.tolist(),
         "heading": heading,
         "pitch": pitch,
         "camera_model": "OPENCV",
-        **intrinsics(frame.camera),
+        **intrinsics(camera),
     }
     pose, out = folder / f"{name}.pose.json", folder / f"{name}.png"
     known: Any = read_json(pose) if pose.is_file() else {}
@@ -192,7 +193,7 @@ def ask(
 
 
 def _received(
-    root: Path,
+    dataset: Dataset,
     frame: Frame,
     out: Path,
     live: Live,
@@ -203,7 +204,7 @@ def _received(
     image, found = picture(out), answers(out)
     camera, lens = frame.camera, None
     if flown := found.get(".flown.json"):
-        camera, lens = _flown(flown, frame, image)
+        camera, lens = _flown(flown, frame, image, dataset.world)
     away = float(np.linalg.norm(camera.position - frame.camera.position))
     limit = live.distance
     if limit is None:
@@ -214,16 +215,16 @@ def _received(
     unit = DEPTH_UNIT if depth and depth.suffix == ".png" else 1.0
     mask = found.get(".mask.png")
     shot = Shot(frame.name, camera, lens, frame.timestamp, image, depth, unit, mask)
-    return _commit(root, frame, shot, silhouette)
+    return _commit(dataset.root, frame, shot, silhouette, dataset.world)
 
 
-def _flown(path: Path, frame: Frame, image: Path) -> tuple[Camera, Lens | None]:
+def _flown(path: Path, frame: Frame, image: Path, world: World) -> tuple[Camera, Lens | None]:
     """Camera and lens by a flown pose; the lens is that asked for where it says nothing."""
     record: Any = read_json(path)
     if not isinstance(record, dict) or "transform_matrix" not in record:
         raise InputError(f"{path}: has no transform_matrix")
     camera, lens, _ = record_camera(str(path), intrinsics(frame.camera) | record, image)
-    asked = frame.camera
+    asked, camera = frame.camera, world.enter(camera)
     same = (camera.width, camera.height) == (asked.width, asked.height) and all(
         np.allclose(one, other, rtol=0, atol=SAME)
         for one, other in (
@@ -239,23 +240,27 @@ def _commit(
     frame: Frame,
     shot: Shot,
     silhouette: Callable[[], Callable[[Camera], np.ndarray]],
+    world: World,
 ) -> Frame:
-    """Import a picture into the dataset, check it, and write its record."""
+    """Import a picture into the dataset, check it, and write its record, in this world."""
     remove_file(root, frame.image_path)  # of a picture that was refused or interrupted
     made = import_shot(shot, root, None if shot.mask else silhouette(), 1, lambda: None)
     if made.mask_path is None:
         raise InputError(f"{shot.mask}: is no mask")
     check_photograph(made)
-    camera = made.camera
+    camera = world.leave(made.camera)
     moved = {
         "K": camera.K.tolist(),
         "width": camera.width,
         "height": camera.height,
         "world_to_camera": camera.world_to_camera.tolist(),
     }
-    record = {"camera": None if camera == frame.camera else moved, "depth": shot.depth is not None}
+    record = {
+        "camera": None if made.camera == frame.camera else moved,
+        "depth": shot.depth is not None,
+    }
     write_json(capture_record(frame), record)
-    return as_captured(frame)
+    return as_captured(frame, world)
 
 
 def _set_aside(out: Path) -> None:

@@ -25,7 +25,16 @@ from mgs.prior.settings import PriorSettings
 from mgs.progress import Progress, listening, no_progress
 from mgs.run import recording
 from mgs.run.flight import check_seeds
-from mgs.run.folder import DATASET, FILES, POLICY_SOURCE, Run, holds_run, open_run, start
+from mgs.run.folder import (
+    DATASET,
+    FILES,
+    POLICY_SOURCE,
+    Run,
+    holds_run,
+    open_run,
+    start,
+    up_of_prior,
+)
 from mgs.run.live import Live, begin, live_capture
 from mgs.run.loop import first_views
 from mgs.run.planning import enough_views
@@ -144,8 +153,9 @@ def start_run(
     if (prior, gaussians, source) == (None,) * 3 and (root / "prior/prior.json").is_file():
         prior = root / "prior"
     loaded = dataset
-    if not isinstance(loaded, Dataset):
-        loaded = load_dataset(root, to_capture=live is not None)
+    up = up_of_prior(Path(prior)) if isinstance(prior, str | Path) else None
+    if not isinstance(loaded, Dataset) or (up and not np.allclose(up, loaded.world.up)):
+        loaded = load_dataset(root, to_capture=live is not None, up=up)
     if live is not None and not loaded.on_demand:
         raise InputError(f"{root}: all its images exist; leave out live capture")
     images = root if live is None else out / DATASET
@@ -274,7 +284,7 @@ def _check_near(prior: Prior, dataset: Dataset, where: Path) -> None:
     nearest = float(np.median(cKDTree(prior.points).query(positions)[0]))
     if nearest < NEAR:
         raise InputError(
-            f"{where}: the cameras are {nearest:.2g} {dataset.unit} from it, and nothing nearer "
+            f"{where}: the cameras are {nearest:.2g} from it, and nothing nearer "
             f"than {NEAR} is drawn; import the data with `unit`, the metres in a length of 1, "
             "and build the prior again"
         )

@@ -31,6 +31,7 @@ from mgs.run.policy_file import policy_of
 from mgs.run.settings import NbvSettings
 from mgs.run.state import Checkpoint
 from mgs.scene import Choice, Scene, State, captured
+from mgs.splat_places import to_source
 from mgs.splat_ply import write_ply
 
 Measure = Callable[[Gaussians, Sequence[int]], dict[str, float]]
@@ -84,7 +85,7 @@ def run(
         if checkpoint is None or "ended" not in checkpoint.steps[-1]:
             checkpoint = _go_on(out, recorder, state, checkpoint, on_step)
         write_steps(out, checkpoint)
-        write_ply(out / "gaussians.ply", checkpoint.gaussians)
+        write_ply(out / "gaussians.ply", to_source(checkpoint.gaussians, scene.dataset.world))
         return checkpoint
 
 

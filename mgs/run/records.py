@@ -90,6 +90,7 @@ class Record(_Strict, extra="forbid"):
     taken: list[int]
     steps: list[_Line]
     inputs: _Inputs
+    upright: bool = False
     antialiased: bool
     linear: bool = True
 

@@ -15,7 +15,7 @@ class Checkpoint:
     """State of a run after a step, as the run folder holds it.
 
     gaussians, H, surface, taken: as `mgs.scene.State`. steps: lines of steps.jsonl. inputs: hashes
-    of the inputs (`mgs.run.inputs`).
+    of the inputs (`mgs.run.inputs`). upright: whether the model's world has +Z up.
     """
 
     gaussians: Gaussians
@@ -24,3 +24,4 @@ class Checkpoint:
     taken: list[int]
     steps: list[dict[str, Any]] = field(default_factory=list)
     inputs: dict[str, Any] = field(default_factory=dict)
+    upright: bool = True

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from mgs.camera import Camera
 from mgs.colour import SH_C0
-from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
@@ -54,8 +53,8 @@ class View:
     score: the policy's. information_gain: Eq. 7 (`mgs.policy.criteria.d_optimal`). unseen, unknown:
     share of what it shows, by squared blending weight, that no image shows, and mean share of the
     prior's variance that is left there. distance: from the last image taken. azimuth, elevation:
-    from the middle of the object, degrees; azimuth 0 is +X. planned: place in the order of choice,
-    from 1; 0 if not planned.
+    from the middle of the object, degrees; azimuth 0 is +X of the upright world. planned: place in
+    the order of choice, from 1; 0 if not planned.
     """
 
     name: str
@@ -152,7 +151,7 @@ def suggest(
         worth = certificate(scene, state, rule, way[1:-1], order)
     radius, axis = mission.flight.no_fly or 0.0, scene.centre[:2]
     ends = scene.positions(state.frames)[way]
-    corners = [tour.leg_corners(a, b, axis, radius) @ scene.turn for a, b in pairwise(ends)]
+    corners = [tour.leg_corners(a, b, axis, radius) for a, b in pairwise(ends)]
     metres = tour.tour_length(flight_of(scene, state, mission).legs, way)
     seconds = metres / mission.flight.speed + mission.flight.hover * len(plan)
     return Suggestion(ranking, plan, metres, seconds, dropped, corners, worth)
@@ -300,7 +299,7 @@ def _coarse_scene(
 
     frames = [replace(frame, camera=small(frame.camera)) for frame in images]
     frames += [Frame(f"{name}/candidate", small(camera), 0.0, Path(name)) for name, camera in poses]
-    dataset = Dataset(run.dataset.root, tuple(frames), run.dataset.up, run.dataset.unit)
+    dataset = replace(run.dataset, frames=tuple(frames))
     count, ratio = len(images), images[0].camera.width / frames[0].camera.width
     scene = _CoarseScene(dataset, prior, settings, model=model, factor=ratio**2 * thinning)
     taken = (*range(1, count), 0)

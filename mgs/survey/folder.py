@@ -57,8 +57,8 @@ def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
     if tests := dataset.test_views():
         folder = out / TEST_FOLDER
         copied = [replace(_copied(folder, frame), depth_path=None) for frame in tests.frames]
-        write_transforms(folder, copied)
-    write_transforms(out, frames)
+        write_transforms(folder, copied, dataset.world)
+    write_transforms(out, frames, dataset.world)
     return load_dataset(out)
 
 

@@ -20,7 +20,6 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
-from mgs.data.up import upright
 from mgs.errors import InputError
 from mgs.reports.page_plots import FRUSTUM
 from mgs.view import layers
@@ -137,15 +136,15 @@ class Viewer:
         """Set up background, light, first camera, and mesh."""
         scene, subject, first = self.server.scene, self.subject, self.server.initial_camera
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        scene.set_up_direction(subject.up)
+        scene.set_up_direction((0.0, 0.0, 1.0))
         scene.configure_environment_map(None)
         scene.world_axes.visible = False
         scene.set_background_image(BLACK)
         centre, size = subject.extent
-        direction = upright(subject.up).T @ np.array([1.0, -1.0, 0.8])
+        direction = np.array([1.0, -1.0, 0.8])
         if subject.views:  # from above, so that no camera is before the object
             offset = subject.eyes[0] - centre
-            direction = offset + np.linalg.norm(offset) * np.array(subject.up)
+            direction = offset + np.linalg.norm(offset) * np.array([0.0, 0.0, 1.0])
             first.fov = _vertical_fov(subject.views[0].frame.camera)
         direction /= max(float(np.linalg.norm(direction)), 1e-9)
         first.look_at = centre

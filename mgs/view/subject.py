@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from mgs.data.frames import Frame
-from mgs.data.meshes import Mesh, read_mesh
-from mgs.data.up import PLUS_Z, Up
+from mgs.data.meshes import Mesh
+from mgs.data.world import World
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.reports.diagnostics import run_scalars
@@ -18,6 +18,7 @@ from mgs.reports.page_facts import step_facts
 from mgs.run.ending import RunEnd
 from mgs.run.folder import Run, open_run
 from mgs.splat_files import load_gaussians, upward
+from mgs.splat_places import from_source
 
 SCALARS = ("information", "uncertainty", "unobserved")
 """Scalars of `mgs.reports.diagnostics` that the viewer shows."""
@@ -43,7 +44,7 @@ class Subject:
     """Contents of the viewer.
 
     gaussians: the model; None before the first finished step. scalars: name -> [N], of SCALARS;
-    empty for a PLY. views: of the dataset, in its order; empty for a PLY. up, unit: of the world;
+    empty for a PLY. views: of the dataset, in its order; empty for a PLY. unit: of lengths;
     a PLY's unit is "unit". scale: all lengths over those of the world.
     """
 
@@ -52,7 +53,6 @@ class Subject:
     scalars: dict[str, np.ndarray] = field(default_factory=dict)
     views: list[View] = field(default_factory=list)
     mesh: Mesh | None = None
-    up: Up = PLUS_Z
     unit: str = "m"
     scale: float = 1.0
 
@@ -97,7 +97,8 @@ def read_subject(path: str | Path, follow: bool = False) -> Subject:
         raise InputError(f"{path}: `follow` needs the folder of a run")
     if not path.is_file():
         raise InputError(f"{path}: no such run folder or PLY file")
-    return scaled(Subject(path.name, load_gaussians(path), up=upward(path), unit="unit"))
+    upright = from_source(load_gaussians(path), World(upward(path)))
+    return scaled(Subject(path.name, upright, unit="unit"))
 
 
 def scaled(subject: Subject) -> Subject:
@@ -121,13 +122,12 @@ def scaled(subject: Subject) -> Subject:
 
 def _read_run(run: Run, follow: bool) -> Subject:
     """The subject of a run, in the world's lengths."""
-    name, mesh = run.folder.resolve().name, run.settings.prior / "mesh.ply"
+    name, prior = run.folder.resolve().name, run.settings.prior
     waiting = Subject(
         f"{name}: no finished step yet",
         None,
         views=[View(frame, "candidate", None, []) for frame in run.dataset.frames],
-        mesh=read_mesh(mesh) if mesh.is_file() else None,
-        up=run.up,
+        mesh=run.prior.mesh if (prior / "prior.json").is_file() else None,
         unit=run.dataset.unit,
     )
     if follow and not run.begun:

@@ -1,0 +1,125 @@
+"""Where data came from: the world of a dataset's files, and the upright one in which mgs works.
+
+`load_dataset` and `load_prior` turn what they read so that +Z is up; whatever leaves mgs is turned
+back. Between the two nothing names an upward direction. A world that is upright already is not
+touched, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+
+from mgs.camera import Camera
+from mgs.errors import InputError
+
+Thing = TypeVar("Thing", Camera, np.ndarray)
+
+Vector = tuple[float, float, float]
+
+PLUS_Z: Vector = (0.0, 0.0, 1.0)
+
+LEVEL = 0.1
+"""Least second singular value of the cameras' right-hand axes over the square root of their number.
+Below it the cameras look the same way, the direction across their axes is not unique, and the mean
+of their upward axes is taken."""
+
+
+@dataclass(frozen=True)
+class World:
+    """World of the files of a dataset.
+
+    up: unit vector that points upwards in it. unit: name of its unit of length, "m", or "unit" if
+    unknown. origin: position of its origin in the data that was imported.
+    """
+
+    up: Vector = PLUS_Z
+    unit: str = "m"
+    origin: Vector = (0.0, 0.0, 0.0)
+
+    @cached_property
+    def turn(self) -> np.ndarray:
+        """Rotation [3,3] from this world to the upright one."""
+        return levelled(self.up)
+
+    def enter(self, thing: Thing) -> Thing:
+        """Turn a camera, or points or directions [N,3], upright."""
+        return self._turned(thing, self.turn)
+
+    def leave(self, thing: Thing) -> Thing:
+        """Turn a camera, or points or directions [N,3], back into this world."""
+        return self._turned(thing, self.turn.T)
+
+    def _turned(self, thing: Thing, turn: np.ndarray) -> Thing:
+        if self.up == PLUS_Z:
+            return thing
+        return thing.turned(turn) if isinstance(thing, Camera) else thing @ turn.T
+
+
+UPRIGHT = World()
+"""A world with +Z up, in metres: nothing is turned."""
+
+
+def up_of_cameras(cameras: Sequence[Camera]) -> Vector:
+    """Common up vector of cameras: the direction most nearly orthogonal to all right-hand axes.
+
+    A level camera has a horizontal right-hand axis, however steeply it looks down. The result is
+    the last right singular vector of the stacked axes, on the side of the cameras' upward axes.
+    Raises InputError if these cancel.
+    """
+    right = np.stack([camera.world_to_camera[0, :3] for camera in cameras])
+    upward = -np.stack([camera.world_to_camera[1, :3] for camera in cameras]).mean(0)
+    values, axes = np.linalg.svd(right)[1:]
+    common = axes[2] if len(cameras) > 2 and values[1] > LEVEL * np.sqrt(len(cameras)) else upward
+    if np.linalg.norm(common) < 1e-6 or abs(common @ upward) < 1e-6:
+        raise InputError(
+            "up: the cameras are held every way round, and have no up in common; give `up` as X,Y,Z"
+        )
+    return unit_up(common * np.sign(common @ upward) / np.linalg.norm(common))
+
+
+def unit_up(vector: Sequence[float] | np.ndarray) -> Vector:
+    """The vector scaled to length 1. Raises InputError if it is none."""
+    try:
+        values = np.asarray(vector, np.float64)
+    except (TypeError, ValueError):
+        values = np.full(3, np.nan)
+    length = np.linalg.norm(values)
+    if values.shape != (3,) or not np.isfinite(values).all() or length == 0:
+        raise InputError(
+            "up: must be three finite numbers that are not all zero; "
+            "correct `up`, here or in transforms.json"
+        )
+    x, y, z = (values / length + 0.0).tolist()
+    return x, y, z
+
+
+def shortest_turn(up: Vector) -> np.ndarray:
+    """Shortest rotation [3,3] that turns `up` to +Z; exactly the identity for +Z."""
+    x, y, z = up
+    if z < -1 + 1e-12:  # the shortest rotation is not unique: turn by half about x first
+        half_turn = np.diag([1.0, -1.0, -1.0])
+        return np.asarray(shortest_turn((x, -y, -z)) @ half_turn)
+    above = 1 + z if z > -0.5 else (x * x + y * y) / (1 - z)  # near -1, 1 + z loses digits
+    across = np.array([[x * x, x * y, 0.0], [x * y, y * y, 0.0], [0.0, 0.0, 0.0]]) / above
+    return np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [x, y, z]]) - across
+
+
+def levelled(up: Vector) -> np.ndarray:
+    """Rotation [3,3] that turns `up` to +Z, and the level part of the world's +Y to +Y.
+
+    The world's +Z takes the place of its +Y if that is less than 45 degrees from the vertical.
+    """
+    turn = shortest_turn(up)
+    ahead = turn[:, 2 if abs(up[1]) > np.sqrt(0.5) else 1]
+    x, y = ahead[:2] / np.hypot(*ahead[:2])
+    return np.array([[y, -x, 0.0], [x, y, 0.0], [0.0, 0.0, 1.0]]) @ turn
+
+
+def degrees_between(a: Vector, b: Vector) -> float:
+    """Angle between two directions, degrees."""
+    return float(np.degrees(np.arccos(np.clip(np.dot(a, b), -1, 1))))
