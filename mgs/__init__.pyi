@@ -12,6 +12,7 @@ from .evaluation import evaluate_model as evaluate_model
 from .fit.settings import ModelSettings as ModelSettings
 from .fit.settings import TrainSettings as TrainSettings
 from .gaussians import Gaussians as Gaussians
+from .learning import learn as learn
 from .prior.build import Prior as Prior
 from .prior.build import build_prior as build_prior
 from .prior.build import load_prior as load_prior
@@ -24,9 +25,10 @@ from .reports.evaluation import evaluate as evaluate
 from .reports.evaluation import evaluate_run as evaluate_run
 from .reports.page import write_page as write_page
 from .reports.writing import report as report
+from .run.choosing import choose as choose
+from .run.directional import Directional as Directional
 from .run.folder import Run as Run
 from .run.folder import open_run as open_run
-from .run.loop import choose as choose
 from .run.loop import select_views as select_views
 from .run.nbv import nbv as nbv
 from .run.nbv import resume_nbv as resume_nbv
@@ -35,7 +37,6 @@ from .run.nbv import scene_of as scene_of
 from .run.nbv import start_run as start_run
 from .run.policies import Cover as Cover
 from .run.policies import Coverage as Coverage
-from .run.policies import Directional as Directional
 from .run.policies import DOptimal as DOptimal
 from .run.policies import Farthest as Farthest
 from .run.policies import FisherRF as FisherRF
@@ -47,7 +48,6 @@ from .run.settings import Mission as Mission
 from .run.state import Checkpoint as Checkpoint
 from .scene import Scene as Scene
 from .scene import State as State
-from .scene import learn as learn
 from .splat import ListCache as ListCache
 from .splat import as_drjit as as_drjit
 from .splat import fisher as fisher

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, TypeVar
 
@@ -20,14 +20,13 @@ from mgs.data.frames import Frame, as_asked
 from mgs.errors import InputError
 from mgs.fit.fitting import Fit, fit
 from mgs.fit.settings import ALPHA_WEIGHT, ModelSettings, TrainSettings
-from mgs.fit.stopping import DivergedError, StopReason
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, KEPT_BYTES, Deferred, kept_within, release
 from mgs.policy import criteria, poses
 from mgs.policy.visibility import Visibility
 from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of, without_gain
-from mgs.prior.initial import colours_of, initial_gaussians, pixel_on, warm_start
+from mgs.prior.initial import colours_of, initial_gaussians, pixel_on
 from mgs.progress import Stage, report
 from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups, render
@@ -311,90 +310,3 @@ class Scene:
         views = range(len(self.frames)) if among is None else among
         positions = self.positions([self.frames[i] for i in views])
         return [int(views[k]) for k in poses.seed_views(positions, self.centre, count)]
-
-
-def captured(scene: Scene, frames: tuple[Frame, ...], views: Sequence[int]) -> tuple[Frame, ...]:
-    """Capture the images of some views: the frames afterwards, up to the first given up."""
-    result = list(frames)
-    for done, i in enumerate(views):
-        report(Stage.CAPTURE, done, len(views))
-        result[i] = scene.capture(frames[i])
-        if result[i].given_up:
-            break
-    return tuple(result)
-
-
-def fit_views(
-    scene: Scene,
-    frames: Sequence[Frame],
-    taken: Sequence[int],
-    before: State | None = None,
-    train: TrainSettings | None = None,
-) -> tuple[Fit, np.ndarray | None]:
-    """Fit to the views taken; returns the fit, and the exposure of these views [V,3], if estimated.
-
-    frames: all frames, those taken as they were captured. before: the last state, where the fit
-    starts; by default it starts at the prior. train: settings of the fit, by default the scene's.
-    """
-    shown = tuple(frames[i] for i in taken)
-    gains = scene.measured_exposure(shown) if scene.settings.exposure else None
-    model, settings = scene.start(shown), scene.settings.train
-    if before is not None:
-        old = scene.start(tuple(frames[i] for i in before.taken))
-        model, settings = warm_start(before.gaussians, old, model), scene.settings.train_at(1)
-    return scene.fitted(model, shown, gains, train or settings), gains
-
-
-def learn(
-    scene: Scene,
-    taken: Sequence[int],
-    before: State | None = None,
-    frames: tuple[Frame, ...] | None = None,
-    choices: Sequence[Choice] = (),
-) -> State:
-    """Capture the views that are new in `taken`, fit to all of `taken`, and sum their information.
-
-    before: the last state, where the fit starts; by default it starts at the prior, and all of
-    `taken` are seeds. frames: those of `before`, by default, or as they are before any capture.
-    choices: recorded in the result. Raises DivergedError, and InputError if a frame cannot be read.
-    """
-    taken = tuple(taken)
-    seeds = before.seeds if before else len(taken)
-    if frames is None:
-        frames = before.frames if before else scene.frames
-    new = taken[len(before.taken) :] if before else taken
-    frames = captured(scene, frames, new)
-    for i in new:
-        scene.image(frames[i])
-    fit, exposure = fit_views(scene, frames, taken, before)
-    if fit.stop_reason == StopReason.DIVERGED:
-        raise DivergedError(len(taken) - seeds, fit.losses)
-    H = information(scene, fit.gaussians, [frames[i] for i in taken])
-    state = State(frames, taken, seeds, fit.gaussians, H, H, fit=fit, exposure=exposure)
-    surface = surface_information(scene, state, new, before)
-    return replace(state, surface=surface, choices=tuple(choices))
-
-
-def information(scene: Scene, model: Gaussians, frames: Sequence[Frame]) -> np.ndarray:
-    """Sum the Fisher information of frames at a model: H [N,P], diagonal of J^T J."""
-    H = np.zeros((len(model), len(scene.lam)))
-    for done, frame in enumerate(frames):
-        report(Stage.INFORMATION, done, len(frames))
-        H += scene.fisher(model, frame.camera, scene.settings.estimator)
-    return H
-
-
-def surface_information(
-    scene: Scene, state: State, new: Sequence[int], before: State | None = None
-) -> np.ndarray:
-    """`State.surface` after new views; it depends on poses and the prior alone."""
-    of_views = [scene.surface(state).information(i) for i in new]
-    if before is None:
-        return np.zeros((len(scene.prior.points), len(scene.surface_lam))) + sum(of_views)
-    return sum(of_views, before.surface)
-
-
-def with_view(scene: Scene, state: State, view: int, F: np.ndarray) -> State:
-    """The state as if a view were taken, its model unchanged. F: its information [N,P]."""
-    surface = surface_information(scene, state, [view], state)
-    return replace(state, taken=(*state.taken, view), H=state.H + F, surface=surface)

@@ -15,13 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from mgs.learning import fit_views
 from mgs.policy import tour
 from mgs.policy.poses import travel_cost
+from mgs.run.choosing import planned_flight, rated
+from mgs.run.directional import DIRECTIONAL_D
 from mgs.run.flight import flight_of, reachable
-from mgs.run.planning import planned_flight, rated
-from mgs.run.policies import DIRECTIONAL_D
 from mgs.run.settings import FlightLimits, Mission
-from mgs.scene import Scene, State, fit_views
+from mgs.scene import Scene, State
 from studies.case import Rock
 from studies.output import Content, Panel, draw_panels, table
 from studies.policies import angle

@@ -10,8 +10,9 @@ import numpy as np
 
 from mgs.data.dataset import Dataset
 from mgs.evaluation import psnr_measure
+from mgs.learning import fit_views
 from mgs.run.policies import Policy
-from mgs.scene import Scene, State, fit_views
+from mgs.scene import Scene, State
 from mgs.splat import ListCache
 
 

@@ -21,11 +21,12 @@ from mgs.fit.evidence import last_images, lean_fit
 from mgs.fit.pruning import prune
 from mgs.fit.settings import RATES, ModelSettings, TrainSettings
 from mgs.gaussians import Gaussians
+from mgs.learning import fit_views
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.policy.poses import seed_views
 from mgs.prior.build import load_prior
 from mgs.run.settings import NbvSettings
-from mgs.scene import Scene, State, fit_views
+from mgs.scene import Scene, State
 from mgs.splat import groups
 from studies.case import Case, Rock, Size, judge
 from studies.output import Content, Panel, draw_panels, table, write_table

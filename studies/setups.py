@@ -20,13 +20,15 @@ import numpy as np
 from mgs.data.dataset import load_dataset
 from mgs.data.frames import Frame
 from mgs.evaluation import psnr_over
+from mgs.learning import fit_views, learn, surface_information, with_view
 from mgs.policy.poses import path_length
 from mgs.prior.build import load_prior
+from mgs.run.choosing import choose
 from mgs.run.inputs import policy_record
-from mgs.run.loop import choose, finished, select_views
+from mgs.run.loop import finished, select_views
 from mgs.run.policy_file import label, policy_of
 from mgs.run.settings import Mission
-from mgs.scene import Scene, State, fit_views, learn, surface_information, with_view
+from mgs.scene import Scene, State
 from mgs.splat import ListCache
 from studies.case import Case, Rock, Size, test_views_of
 from studies.oracle import Oracle

@@ -12,14 +12,16 @@ from hypothesis import strategies as st
 from program import steps
 
 from mgs.colour import SH_C0
-from mgs.policy import criteria, directional, pool_gains
+from mgs.learning import learn
+from mgs.policy import criteria, directional, plans, pool_gains
 from mgs.policy.directional import Views, gains
-from mgs.policy.pool_gains import PoolGains, planned_path, planned_views
+from mgs.policy.plans import planned_path, planned_views
+from mgs.policy.pool_gains import PoolGains
+from mgs.policy.visibility import Visibility
 from mgs.run import flight
 from mgs.run import folder as run_folder
-from mgs.run.loop import choose
+from mgs.run.choosing import choose
 from mgs.run.policies import POLICIES
-from mgs.scene import learn
 from mgs.splat import reference
 
 LAM = (0.02 / 1.0) ** 2
@@ -130,7 +132,9 @@ def test_the_dome_stands_around_the_rock():
 
 
 def updated(points, pool, dome):
-    return pool_gains.pool_gains(points, LAM, lambda: pool, lambda: dome)
+    surface = Visibility([], lambda camera: camera, points, np.zeros(3), LAM)
+    surface.pool, surface.dome = (lambda: pool), (lambda: dome)
+    return surface.gains
 
 
 def anew(points, pool, dome, taken, left, degree, tau, over_dome):
@@ -274,7 +278,7 @@ def test_a_path_gains_as_much_as_any_within_reach(monkeypatch, taken):
     best = max(gain(taken, path) for path in paths)
     assert 0.99 < gain(taken, planned_path(held, reach, 4)) / best < 1.0001
     assert held.taken == taken
-    monkeypatch.setattr(pool_gains, "WIDTH", 1)
+    monkeypatch.setattr(plans, "WIDTH", 1)
     assert gain(taken, planned_path(held, reach, 4)) / best < 0.98
 
 

@@ -17,10 +17,10 @@ from refusals import occupied, refused
 
 from mgs.data.dataset import TEST_FOLDER
 from mgs.files import write_json
+from mgs.learning import fit_views
 from mgs.progress import no_progress
 from mgs.run.folder import read_checkpoint
 from mgs.run.policies import Poses
-from mgs.scene import fit_views
 from mgs.survey import flight
 from mgs.survey.flight import SurveySettings, fly
 from studies import case, certificate, flights, free_fit, results, setups, table1

@@ -16,7 +16,7 @@ ROOMS = [
     "memory", "notebook", "camera", "gaussians", "files", "images", "metrics", "plotting",
     "data", "synth", "survey", "prior", "splat",
     "splat_places", "splat_ply", "splat_gltf", "splat_files", "evaluation",
-    "policy", "fit", "scene", "run", "reports", "view",
+    "policy", "fit", "scene", "learning", "run", "reports", "view",
     "cli", "__main__",
 ]  # fmt: skip
 """All rooms; each may import from those before it."""

@@ -28,7 +28,7 @@ determinant lemma, Sherman-Morrison formula):
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, TypeVar
 
@@ -42,10 +42,6 @@ from mgs.synth.orbit import orbit_positions
 from mgs.synth.scene_file import Orbit
 
 Result = TypeVar("Result")
-
-Gains = Callable[[Sequence[int], Sequence[int], int, float, bool], NDArray[np.float64]]
-"""(views taken, candidates, SH degree, tau, over_dome) -> gain of each candidate [C]:
-I-optimality if over_dome, else D-optimality."""
 
 DOME = 48
 """Number of poses of the dome for I-optimality. A chosen constant."""

@@ -19,9 +19,8 @@ each entry: one kernel reads S and M once, and writes S once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
-from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -31,51 +30,12 @@ from numpy.typing import NDArray
 
 from mgs.memory import IMAGE_BYTES, padded
 from mgs.policy.criteria import Array
-from mgs.policy.directional import Gains, Views, gains, in_parts, information, of_points, precision
+from mgs.policy.directional import Views, in_parts, information, of_points, precision
 from mgs.splat.recording import one_at_a_time
 
 BYTES_OF_ENTRY, BYTES_OF_PAIR = 16, 40
 """Bytes of one entry of both matrices for a Gaussian, and of a pair of a pose and a Gaussian. S, g
 and q exist twice during an update."""
-
-BETTER = 1 + 1e-6
-"""Least ratio of gains for which views are exchanged: above rounding errors. A chosen constant."""
-
-WIDTH = 16
-"""Paths that `planned_path` keeps at each step. A chosen constant."""
-
-
-def pool_gains(
-    points: Array, lam: float, pool: Callable[[], Views], dome: Callable[[], Views]
-) -> Gains:
-    """A function that computes `mgs.policy.directional.gains` for the poses of a pool.
-
-    It is fast if the views taken begin with those of the call before. It keeps at most IMAGE_BYTES
-    for each degree; if more is needed, it computes every gain from scratch.
-
-    points: means of the Gaussians on the surface [N,3], metres. pool(), dome(): all poses, the
-    poses of the dome, and what they see.
-    """
-    known: dict[tuple[int, float, bool], PoolGains] = {}
-    fitting = cache(lambda degree: fits(points, pool(), degree))
-
-    def found(
-        taken: Sequence[int], candidates: Sequence[int], degree: int, tau: float, over_dome: bool
-    ) -> NDArray[np.float64]:
-        key, views, around = (degree, tau, over_dome), pool(), dome() if over_dome else None
-        if not fitting(degree):
-            before, after = (
-                Views(views.positions[list(some)], views.seen[list(some)])
-                for some in (taken, candidates)
-            )
-            return gains(points, lam, degree, tau, before, after, around)
-        kept = known.get(key)
-        if kept is None or kept.taken != list(taken[: len(kept.taken)]):
-            kept = known[key] = PoolGains(points, views, lam, degree, tau, around)
-        kept.take(taken[len(kept.taken) :])
-        return kept.of_poses(candidates)
-
-    return found
 
 
 def fits(points: Array, pool: Views, degree: int) -> bool:
@@ -83,57 +43,6 @@ def fits(points: Array, pool: Views, degree: int) -> bool:
     pairs = int(np.count_nonzero(pool.seen))
     entries = len(points) * len(_upper((degree + 1) ** 2))
     return pairs > 0 and BYTES_OF_ENTRY * entries + BYTES_OF_PAIR * pairs <= IMAGE_BYTES
-
-
-def planned_views(gains: PoolGains, candidates: Sequence[int], count: int) -> list[int]:
-    """Views to take next, as a set: greedily, then exchanged one by one until no exchange has a
-    larger gain (V. V. Fedorov, Theory of Optimal Experiments, 1972).
-
-    gains: after the views taken; changed. candidates: poses, more than `count`.
-    """
-    chosen: list[int] = []
-    for _ in range(count):
-        free = [view for view in candidates if view not in chosen]
-        chosen.append(free[int(gains.of_poses(free).argmax())])
-        gains.take(chosen[-1:])
-    improved = True
-    while improved:
-        improved = False
-        for k, view in enumerate(chosen):
-            gains.drop(view)
-            free = [view] + [other for other in candidates if other not in chosen]
-            found = gains.of_poses(free)
-            best = int(found.argmax())
-            if found[best] > BETTER * found[0]:
-                chosen[k], improved = free[best], True
-            gains.take([chosen[k]])
-    return chosen
-
-
-def planned_path(
-    gains: PoolGains, reach: Callable[[Sequence[int]], Sequence[int]], count: int
-) -> list[int]:
-    """Views to take next, in this order and each in reach: a beam search for the largest gain of
-    all together. Fewer than `count` where nothing is left in reach.
-
-    gains: after the views taken. reach(views): poses in reach after these views.
-    """
-    paths = [(0.0, gains)]
-    for _ in range(count):
-        found: dict[tuple[frozenset[int], int], tuple[float, int, PoolGains]] = {}
-        for total, path in paths:
-            near = reach(path.taken)
-            for view, gain in zip(near, path.of_poses(near), strict=True):
-                key = frozenset([*path.taken, view]), view
-                better = total + float(gain), view, path
-                found[key] = max(found.get(key, better), better, key=lambda one: one[0])
-        best = sorted(found.values(), key=lambda one: one[0], reverse=True)[:WIDTH]
-        if not best:
-            break
-        paths = [(total, path.copy()) for total, _, path in best]
-        for (_, path), (_, view, _) in zip(paths, best, strict=True):
-            path.take([view])
-    return paths[0][1].taken[len(gains.taken) :]
 
 
 class PoolGains:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache, cached_property
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,14 +11,15 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.memory import IMAGE_BYTES, kept_within
 from mgs.policy.criteria import Array
-from mgs.policy.directional import Gains, Views, dome_cameras, of_points, squared_weights
+from mgs.policy.directional import Views, dome_cameras, gains, of_points, squared_weights
+from mgs.policy.plans import planned_path, planned_views
 from mgs.policy.poses import nearest_poses
 
 if TYPE_CHECKING:
     from mgs.policy.pool_gains import PoolGains
 
 Model = tuple[int, float, bool]
-"""SH degree, tau and over_dome of gains (`mgs.policy.directional.Gains`)."""
+"""SH degree, tau, and whether gains are those of I-optimality over the dome, else D-optimality."""
 
 FEW = 500
 """About the number of Gaussians by which a flight is planned. A chosen constant."""
@@ -56,30 +57,50 @@ class Visibility:
         self.positions = np.array([camera.position for camera in cameras])
         self.seen, self.pool, self.dome = cache(self._seen), cache(self._pool), cache(self._dome)
         self.planned, self.path = cache(self._planned), cache(self._path)
+        self.held: dict[Model, PoolGains] = {}
         # A copy, because the kernel returns part of a larger array.
         self.information = kept_within(
             IMAGE_BYTES, lambda frame: np.array(exact(cameras[frame])), lambda F: F.nbytes
         )
 
-    @cached_property
-    def gains(self) -> Gains:
-        """Directional gains of the cameras."""
-        from mgs.policy.pool_gains import pool_gains  # imported here because it loads Dr.Jit
+    def gains(
+        self,
+        taken: Sequence[int],
+        candidates: Sequence[int],
+        degree: int,
+        tau: float,
+        over_dome: bool,
+    ) -> Array:
+        """Directional gain of each candidate after the views taken [C].
 
-        return pool_gains(self.points, self.lam, self.pool, self.dome)
+        It is fast if the views taken begin with those of the call before. Where gains do not fit
+        into the memory, they are computed from scratch.
+        """
+        model = degree, tau, over_dome
+        held = self.held.get(model)
+        if held is None or held.taken != list(taken[: len(held.taken)]):
+            held = self.plan_gains(model)
+            if held is None:
+                pool, dome = self.pool(), self.dome() if over_dome else None
+                before, after = (
+                    Views(pool.positions[list(some)], pool.seen[list(some)])
+                    for some in (taken, candidates)
+                )
+                return gains(self.points, self.lam, degree, tau, before, after, dome)
+            self.held[model] = held
+        held.take(taken[len(held.taken) :])
+        return held.of_poses(candidates)
 
     def _planned(
         self, taken: tuple[int, ...], candidates: tuple[int, ...], count: int, model: Model
     ) -> Sequence[int]:
         """Candidates to take next, as a set of at most `count` (`planned_views`); all where there
         are no `plan_gains`."""
-        from mgs.policy.pool_gains import planned_views
-
-        gains = self.plan_gains(model) if count < len(candidates) else None
-        if gains is None:
+        held = self.plan_gains(model) if count < len(candidates) else None
+        if held is None:
             return candidates
-        gains.take(taken)
-        return planned_views(gains, candidates, count)
+        held.take(taken)
+        return planned_views(held, candidates, count)
 
     def _path(
         self,
@@ -91,23 +112,22 @@ class Visibility:
     ) -> list[int]:
         """At most `count` candidates to take next, in order, each among the `nearest` to the one
         before (`planned_path`); none where there are no `plan_gains`."""
-        from mgs.policy.pool_gains import planned_path
 
         def reach(views: Sequence[int]) -> list[int]:
             left = [i for i in candidates if i not in views]
             near = nearest_poses(self.positions[left], self.positions[views[-1]], nearest)
             return [left[k] for k in near]
 
-        gains = self.plan_gains(model, FEW)
-        if gains is None:
+        held = self.plan_gains(model, FEW)
+        if held is None:
             return []
-        gains.take(taken)
-        return planned_path(gains, reach, count)
+        held.take(taken)
+        return planned_path(held, reach, count)
 
     def plan_gains(self, model: Model, most: int | None = None) -> PoolGains | None:
         """Gains of all cameras for about `most` of the Gaussians, by default all, before any view
         is taken; None where no camera sees any, or they do not fit into the memory."""
-        from mgs.policy.pool_gains import PoolGains, fits
+        from mgs.policy.pool_gains import PoolGains, fits  # here because it loads Dr.Jit
 
         degree, tau, over_dome = model
         some = slice(None, None, max(len(self.points) // most, 1) if most else None)

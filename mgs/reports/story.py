@@ -11,6 +11,7 @@ import numpy as np
 
 from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
+from mgs.learning import learn
 from mgs.metrics import psnr
 from mgs.plotting import NO_GRID, crop, new_figure
 from mgs.policy import criteria
@@ -20,7 +21,7 @@ from mgs.reports.figures import NEWEST, draw_cameras
 from mgs.reports.video import UNKNOWN, Film
 from mgs.run.folder import Run
 from mgs.run.nbv import scene_of
-from mgs.scene import Scene, State, learn
+from mgs.scene import Scene, State
 
 SIZE = (8.4, 3.1)
 """Width and height of a frame, inches."""

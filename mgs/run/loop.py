@@ -13,13 +13,14 @@ import numpy as np
 
 from mgs.data.frames import Frame
 from mgs.errors import InputError
+from mgs.learning import captured, learn, with_view
 from mgs.policy import criteria, poses
 from mgs.progress import report
-from mgs.run.flight import allowed, free, reachable, seed_views, views_left
-from mgs.run.planning import plan_flight, rated
+from mgs.run.choosing import choose
+from mgs.run.flight import allowed, reachable, seed_views, views_left
 from mgs.run.policies import Policy
 from mgs.run.settings import Mission
-from mgs.scene import Choice, Scene, State, captured, learn, with_view
+from mgs.scene import Choice, Scene, State
 
 
 def select_views(
@@ -108,28 +109,3 @@ def appraised(scene: Scene, state: State, view: int, score: float) -> tuple[Choi
     F = scene.information(state, view)
     after, gain = with_view(scene, state, view, F), criteria.d_optimal(F, state.H, scene.lam)
     return Choice(view, score, gain, criteria.coverage(after.surface, scene.surface_lam)), after
-
-
-def choose(
-    scene: Scene, state: State, policy: Policy, mission: Mission = Mission()
-) -> tuple[int, float]:
-    """Choose the next view: (its index, its score), of the largest score / travel cost in reach.
-
-    Of equal views, the one farthest from those taken is chosen. A policy with a `plan` chooses
-    among the views of its plan. If the flight has a limit, the result is the first stop of
-    `plan_flight`. Raises InputError if the policy returns no valid score.
-    """
-    if mission.flies:
-        return next(plan_flight(scene, state, policy, mission))
-    views = reachable(scene, state, mission)
-    cost: np.ndarray | None = None
-    plan = getattr(policy, "plan", None)
-    if mission.travel is not None:
-        positions = scene.positions(state.frames)
-        here = positions[state.taken[-1]]
-        cost = poses.travel_cost(positions[views], here, mission.travel)
-    elif plan is not None:
-        left = views_left(state, mission)
-        planned = plan(scene, state, free(scene, state, mission), left, mission.nearest)
-        views = [i for i in views if i in planned] or views
-    return rated(scene, state, policy, views, cost)[0]

@@ -18,6 +18,7 @@ from mgs.errors import InputError
 from mgs.files import THERE, Ours, atomic_folder, reading
 from mgs.fit.settings import ModelSettings, as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE
+from mgs.learning import information
 from mgs.memory import VIEW_BYTES
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.photographs import source_of as source_of_prior
@@ -37,7 +38,6 @@ from mgs.run.folder import (
 )
 from mgs.run.live import Live, begin, live_capture
 from mgs.run.loop import first_views
-from mgs.run.planning import enough_views
 from mgs.run.policies import Policy
 from mgs.run.policy_file import in_file, is_function, label, name_of, policy_of, source_of
 from mgs.run.settings import (
@@ -49,7 +49,8 @@ from mgs.run.settings import (
 )
 from mgs.run.state import Checkpoint
 from mgs.run.transports import Transport
-from mgs.scene import Scene, State, information
+from mgs.run.worth import enough_views
+from mgs.scene import Scene, State
 from mgs.splat.constants import NEAR
 
 FREE_PASSES = 30

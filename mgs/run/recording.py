@@ -17,6 +17,7 @@ from mgs.evaluation import psnr_measure
 from mgs.files import remove_file, working_in
 from mgs.fit.stopping import DivergedError
 from mgs.gaussians import Gaussians
+from mgs.learning import captured
 from mgs.policy import criteria
 from mgs.progress import Progress, Stage, listening, no_progress, report
 from mgs.run import inputs
@@ -25,12 +26,12 @@ from mgs.run.ending import RunEnd, diverged, run_end
 from mgs.run.flight import flight_of, free, reachable
 from mgs.run.folder import check_settings, read_checkpoint, write_checkpoint, write_steps
 from mgs.run.loop import select_views, uncertainty
-from mgs.run.planning import planned_certificate
 from mgs.run.policies import Policy
 from mgs.run.policy_file import policy_of
 from mgs.run.settings import NbvSettings
 from mgs.run.state import Checkpoint
-from mgs.scene import Choice, Scene, State, captured
+from mgs.run.worth import planned_certificate
+from mgs.scene import Choice, Scene, State
 from mgs.splat_places import to_source
 from mgs.splat_ply import write_ply
 

@@ -22,6 +22,7 @@ from mgs.colour import SH_C0
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
+from mgs.learning import information, surface_information
 from mgs.memory import VIEW_BYTES, kept_within
 from mgs.policy import criteria, tour
 from mgs.policy.certificate import Certificate
@@ -29,14 +30,15 @@ from mgs.policy.directional import squared_weights
 from mgs.prior.build import Prior
 from mgs.progress import Progress, listening, no_progress, report
 from mgs.run.candidates import Named, Site, refusals
+from mgs.run.choosing import plan_flight, rated
 from mgs.run.flight import allowed, flight_of, free, reachable
 from mgs.run.folder import Run
 from mgs.run.loop import appraised, choose_batch
-from mgs.run.planning import certificate, enough_views, plan_flight, rated
 from mgs.run.policies import Policy
 from mgs.run.policy_file import in_file, is_function, name_of, policy_of
 from mgs.run.settings import NbvSettings, check_settings, validated
-from mgs.scene import Choice, Scene, State, information, surface_information
+from mgs.run.worth import certificate, enough_views
+from mgs.scene import Choice, Scene, State
 
 COARSE = 8000
 """About the most Gaussians on the surface of the model that candidates are rated by. A chosen

@@ -1,4 +1,7 @@
-"""Rank candidates by a policy, and plan a flight over some, before any of their images is read."""
+"""Choose the next view: rank candidates by a policy, or plan a flight over some.
+
+No image of a candidate is read.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +11,38 @@ from dataclasses import replace
 import numpy as np
 
 from mgs.errors import InputError
+from mgs.learning import with_view
 from mgs.policy import poses, tour
-from mgs.policy.certificate import Certificate, certify, greedy
 from mgs.progress import Stage, report
 from mgs.run.flight import flight_of, free, reachable, views_left
 from mgs.run.policies import Policy
 from mgs.run.settings import Mission
-from mgs.scene import Scene, State, with_view
+from mgs.scene import Scene, State
 
-CERTIFY_NODES, CERTIFY_PAIRS = 20, 15_000_000
-"""Most nodes of the branch and bound of a certificate, and most nodes times pairs of a candidate
-and a Gaussian: seconds of work. Chosen constants."""
+
+def choose(
+    scene: Scene, state: State, policy: Policy, mission: Mission = Mission()
+) -> tuple[int, float]:
+    """Choose the next view: (its index, its score), of the largest score / travel cost in reach.
+
+    Of equal views, the one farthest from those taken is chosen. A policy with a `plan` chooses
+    among the views of its plan. If the flight has a limit, the result is the first stop of
+    `plan_flight`. Raises InputError if the policy returns no valid score.
+    """
+    if mission.flies:
+        return next(plan_flight(scene, state, policy, mission))
+    views = reachable(scene, state, mission)
+    cost: np.ndarray | None = None
+    plan = getattr(policy, "plan", None)
+    if mission.travel is not None:
+        positions = scene.positions(state.frames)
+        here = positions[state.taken[-1]]
+        cost = poses.travel_cost(positions[views], here, mission.travel)
+    elif plan is not None:
+        left = views_left(state, mission)
+        planned = plan(scene, state, free(scene, state, mission), left, mission.nearest)
+        views = [i for i in views if i in planned] or views
+    return rated(scene, state, policy, views, cost)[0]
 
 
 def rated(
@@ -29,7 +53,7 @@ def rated(
     cost: np.ndarray | float | None = None,
 ) -> list[tuple[int, float]]:
     """(view, score) by falling score / cost [C]; of equals, the farthest from the views taken comes
-    first. Raises InputError as `mgs.run.loop.choose`."""
+    first. Raises InputError as `choose`."""
     report(Stage.SCORE, 0, len(views))
     where, returned = f"policy {policy.name}: returned", policy(scene, state, views)
     try:
@@ -112,52 +136,3 @@ def planned_flight(scene: Scene, state: State, policy: Policy, mission: Mission)
         if plan[: len(done)] == done and plan[len(done) :]:
             return plan[len(done) :]
     return []
-
-
-def certificate(
-    scene: Scene, state: State, policy: Policy, plan: Sequence[int], views: Sequence[int]
-) -> Certificate | None:
-    """Certify a plan of some of `views` by the policy's criterion.
-
-    Returns None where the policy has no `relaxation`, or the plan has no view or all of them.
-    """
-    relaxation = getattr(policy, "relaxation", None)
-    if relaxation is None or not 0 < len(plan) < len(views):
-        return None
-    report(Stage.SCORE, 0, 1)
-    made = relaxation(scene, state, views)
-    if made is None:
-        return None
-    nodes = min(CERTIFY_NODES, CERTIFY_PAIRS // (len(views) * len(made.base)))
-    return certify(made, [views.index(i) for i in plan], policy.name, nodes)
-
-
-def planned_certificate(
-    scene: Scene, state: State, policy: Policy, mission: Mission
-) -> Certificate | None:
-    """`certificate` of all views that a run plans to take, also as a tour; None where it plans no
-    set of views."""
-    plan, left = getattr(policy, "plan", None), views_left(state, mission)
-    if plan is None or mission.travel is not None or mission.nearest is not None or left <= 0:
-        return None
-    views = free(scene, state, mission)
-    if mission.flies:
-        planned = planned_flight(scene, state, policy, mission)
-    else:
-        planned = plan(scene, state, views, left, None)
-    return certificate(scene, state, policy, planned, views)
-
-
-def enough_views(scene: Scene, state: State, policy: Policy, mission: Mission) -> int:
-    """Fewest views of a greedy plan that have the share `enough` of the gain of all candidates.
-
-    Raises InputError where the policy has no `relaxation`.
-    """
-    relaxation, views = getattr(policy, "relaxation", None), free(scene, state, mission)
-    made = relaxation(scene, state, views) if relaxation and views else None
-    if made is None:
-        raise InputError(
-            f"policy {policy.name}: has no bound by which a number of views could be enough; give "
-            "the number, or use directional-i, directional-d or d-optimal"
-        )
-    return len(greedy(made, mission.enough))
