@@ -11,10 +11,12 @@ from dataclasses import replace
 import numpy as np
 
 from mgs.data.frames import Frame
+from mgs.fit.evidence import Images
 from mgs.fit.fitting import Fit
 from mgs.fit.settings import TrainSettings
 from mgs.fit.stopping import DivergedError, StopReason
 from mgs.gaussians import Gaussians
+from mgs.policy.poses import azimuths
 from mgs.prior.initial import warm_start
 from mgs.progress import Stage, report
 from mgs.scene import Choice, Scene, State
@@ -105,3 +107,18 @@ def with_view(scene: Scene, state: State, view: int, F: np.ndarray) -> State:
     """The state as if a view were taken, its model unchanged. F: its information [N,P]."""
     surface = surface_information(scene, state, [view], state)
     return replace(state, taken=(*state.taken, view), H=state.H + F, surface=surface)
+
+
+def images_of(scene: Scene, frames: Sequence[Frame]) -> Images:
+    """Input of a fit to frames by `mgs.fit.evidence`: they start at the scene's prior, with colours
+    of degree 0. Raises InputError if a frame cannot be read."""
+    flat = replace(scene, settings=scene.settings.model_copy(update={"sh": 0}))
+    gains = scene.measured_exposure(frames) if scene.settings.exposure else None
+    around = azimuths(scene.positions(frames), scene.centre)
+
+    def start(views: Sequence[int]) -> Gaussians:
+        return flat.start(tuple(frames[i] for i in views))
+
+    cameras = [frame.camera for frame in frames]
+    order = np.argsort(around, kind="stable").tolist()
+    return Images(cameras, flat.targets(frames, gains), start, order)

@@ -22,7 +22,7 @@ from mgs.fit.fitting import Fit, fit
 from mgs.fit.settings import ALPHA_WEIGHT, ModelSettings, TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, KEPT_BYTES, Deferred, kept_within, release
-from mgs.policy import criteria, poses
+from mgs.policy import poses
 from mgs.policy.visibility import Visibility
 from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of, without_gain
@@ -151,9 +151,7 @@ class Scene:
     @cached_property
     def surface_lam(self) -> np.ndarray:
         """Lambda of the surface before training: without means and without the setting `lam`."""
-        kinds = {kind: columns for kind, columns in self.groups.items() if kind != "mean"}
-        settings = self.settings
-        return criteria.regularisation(kinds, settings.pixel_noise, settings.prior_std)
+        return self.settings.regularisation(groups(self.settings.sh), surface=True)
 
     @cached_property
     def cache(self) -> ListCache:
@@ -240,7 +238,7 @@ class Scene:
         the fit, by default those of the scene."""
         report(Stage.FIT, 0, 1)
         train = train or self.settings.train
-        lam = criteria.lam_by_kind(self.lam, self.groups)
+        lam = self.settings.lam_by_kind(self.groups)
         cameras = [frame.camera for frame in frames]
         on_pass = partial(report, Stage.FIT)
         targets, start = self.targets(frames, gains), self.start(tuple(frames))

@@ -17,15 +17,14 @@ from typing import Any
 import numpy as np
 
 from mgs.data.dataset import load_dataset
-from mgs.fit.evidence import last_images, lean_fit
+from mgs.fit.evidence import lean_fit
 from mgs.fit.pruning import prune
 from mgs.fit.settings import RATES, ModelSettings, TrainSettings
 from mgs.gaussians import Gaussians
-from mgs.learning import fit_views
+from mgs.learning import fit_views, images_of
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.policy.poses import seed_views
 from mgs.prior.build import load_prior
-from mgs.run.settings import NbvSettings
 from mgs.scene import Scene, State
 from mgs.splat import groups
 from studies.case import Case, Rock, Size, judge
@@ -185,13 +184,11 @@ def fit_lean_and_judge(
     root: Path, out: Path, dataset: str, prior: str, views: int, seeds: int
 ) -> dict[str, Any]:
     """Task: `mgs.fit.evidence.lean_fit` to as many views."""
-    data, known = load_dataset(root / dataset), load_prior(root / prior)
-    where: dict[str, Any] = {"dataset": root / dataset, "prior": root / prior}
-    settings = NbvSettings(**where, seeds=seeds, train=TrainSettings())
-    positions = np.array([frame.camera.position for frame in data.frames])
-    order = views_in_order(positions, known.points.mean(0), views, seeds)
-    frames = [data.frames[i] for i in order]
-    images, began = last_images(settings, known, frames, data.cameras), time.perf_counter()
+    settings = ModelSettings(train=TrainSettings())
+    scene = Scene(load_dataset(root / dataset), load_prior(root / prior), settings)
+    order = views_in_order(scene.positions(scene.frames), scene.centre, views, seeds)
+    frames = [scene.frames[i] for i in order]
+    images, began = images_of(scene, frames), time.perf_counter()
     found = lean_fit(images, settings)
     seconds = time.perf_counter() - began
     return _quality(found.gaussians, root / dataset) | {

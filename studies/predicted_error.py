@@ -26,13 +26,15 @@ from mgs.colour import SH_C0
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import write_json
-from mgs.fit.evidence import Images, fitted, last_images
+from mgs.fit.evidence import Images, fitted
 from mgs.gaussians import Gaussians, learned, sh_from_rgb
 from mgs.images import write_exr
+from mgs.learning import images_of
 from mgs.memory import padded
 from mgs.provenance import versions
 from mgs.run.folder import Run, open_run
 from mgs.run.settings import NbvSettings
+from mgs.scene import Scene
 from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit, fisher, groups, jvp, render
 from studies.calibration import NORMAL, Calibration, fit_calibration, judged
@@ -214,7 +216,7 @@ def calibrate_run(
         return Pixels.joined(parts)
 
     folds = []
-    images = last_images(settings, opened.prior, frames, opened.dataset.cameras)
+    images = images_of(Scene(opened.dataset, opened.prior, settings), frames)
     for fold in range(FOLDS):
         kept = [i for i in range(len(frames)) if i % FOLDS != fold]
         found = _fitted_to(images, kept, frames, settings)

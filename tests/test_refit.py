@@ -14,6 +14,7 @@ from program import change_settings, command
 from refusals import refused
 from scipy.stats import multivariate_normal
 
+from mgs import learning
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
 from mgs.fit.evidence import (
@@ -22,7 +23,6 @@ from mgs.fit.evidence import (
     Images,
     Worth,
     kinds,
-    last_images,
     lean_fit,
     paying,
     regularisation,
@@ -37,6 +37,7 @@ from mgs.reports.simplify import REFITTED, refit_run
 from mgs.run.folder import open_run
 from mgs.run.nbv import run_nbv
 from mgs.run.settings import NbvSettings
+from mgs.scene import Scene
 from mgs.splat import render
 from mgs.splat_ply import read_ply
 from studies.bench import surface_camera, surface_gaussians
@@ -263,8 +264,7 @@ def test_a_run_is_pruned_beside_its_model(run, capsys):
 
 def test_the_images_of_the_last_fit_are_those_of_the_run(run):
     opened = open_run(run)
-    cameras = [frame.camera for frame in opened.dataset.frames]
-    images = last_images(opened.settings, opened.prior, opened.taken, cameras)
+    images = learning.images_of(Scene(opened.dataset, opened.prior, opened.settings), opened.taken)
     positions = np.array([images.cameras[i].position for i in images.order])
     around = np.unwrap(np.arctan2(positions[:, 1], positions[:, 0]))
     assert (np.diff(around) > 0).all()

@@ -24,8 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mgs.camera import Camera
-from mgs.data.dataset import target_of
-from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.evaluation import render_view
 from mgs.fit.fitting import fit
@@ -34,11 +32,7 @@ from mgs.fit.settings import ModelSettings
 from mgs.fit.stopping import StopReason
 from mgs.gaussians import Gaussians
 from mgs.memory import Deferred
-from mgs.policy.criteria import LEARN_LOSS, lam_by_kind
-from mgs.policy.poses import azimuths
-from mgs.prior.build import Prior
-from mgs.prior.exposure import exposure_of, without_gain
-from mgs.prior.initial import initial_gaussians, pixel_on
+from mgs.policy.criteria import LEARN_LOSS
 from mgs.splat import ListCache, as_drjit, groups
 
 DIRECTIONAL = "directional"
@@ -100,31 +94,6 @@ class LeanModel:
     learned: dict[str, Mask]
     parameters: int
     left_out: LeftOut | None
-
-
-def last_images(
-    settings: ModelSettings, prior: Prior, frames: Sequence[Frame], cameras: Sequence[Camera]
-) -> Images:
-    """Input of the last fit of a run. frames: those taken, in their order, so the seeds first.
-    cameras: `Dataset.cameras`. Raises InputError if a frame cannot be read."""
-    gains = exposure_of(prior)(frames) if settings.exposure else np.ones((len(frames), 3))
-    with_alpha = settings.train.alpha_weight > 0
-    pixel = pixel_on(prior, cameras)
-
-    def start(views: Sequence[int]) -> Gaussians:
-        train = settings.train
-        how = pixel, gains[list(views)], None, train.antialiased, train.space == "linear"
-        return initial_gaussians(prior, [frames[i] for i in views], *how)[0]
-
-    def target(view: int) -> np.ndarray:
-        return without_gain(target_of(frames[view], with_alpha), gains[view])
-
-    cameras = [frame.camera for frame in frames]
-    positions = np.array([camera.position for camera in cameras])
-    around = azimuths(positions, prior.points.mean(axis=0))
-    order = np.argsort(around, kind="stable").tolist()
-    targets = Deferred(range(len(frames)), target)
-    return Images(cameras, targets, start, order)
 
 
 def kinds(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
@@ -283,7 +252,7 @@ def objective_of(
         images.cameras,
         images.targets,
         images.start(range(len(images))).with_degree(degree),
-        lam_by_kind(regularisation(settings, degree), groups(degree, train.means)),
+        settings.lam_by_kind(groups(degree, train.means)),
         cache,
         train.means,
         train.alpha_weight,
@@ -316,7 +285,7 @@ def fitted(
         train,
         cache=cache,
         start=start,
-        lam=lam_by_kind(regularisation(settings, degree), groups(degree, train.means)),
+        lam=settings.lam_by_kind(groups(degree, train.means)),
         learns=None if kept is None else _masks(kept, start.sh.shape[1]),
     )
     if found.stop_reason == StopReason.DIVERGED:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from mgs.errors import InputError
-from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD, regularisation
+from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD, lam_by_kind, regularisation
 
 RATES = {"colour": 0.02, "scale": 0.04, "rotation": 0.02, "opacity": 0.1}
 """Learning rates of the optimiser, about the longest step, in the unit of each kind of parameter:
@@ -133,15 +133,22 @@ class ModelSettings(BaseModel):
         passes = min(self.warm_passes, self.train.passes)
         return self.train.model_copy(update={"rates": rates, "passes": passes})
 
-    def regularisation(self, groups: dict[str, slice]) -> NDArray[np.float64]:
+    def regularisation(
+        self, groups: dict[str, slice], surface: bool = False
+    ) -> NDArray[np.float64]:
         """lambda [P] of the columns of the Fisher information; groups: columns by kind.
 
-        Raises InputError where `prior_std` lacks one of these kinds.
+        surface: of the Gaussians on the surface before training, which the setting `lam` does not
+        concern. Raises InputError where `prior_std` lacks one of these kinds.
         """
         if missing := [kind for kind in groups if kind not in self.prior_std]:
             raise InputError(f"prior_std: has no number for {missing[0]}; give one, metres")
         by_kind = regularisation(groups, self.pixel_noise, self.prior_std)
-        return by_kind if self.lam is None else np.full_like(by_kind, self.lam)
+        return by_kind if surface or self.lam is None else np.full_like(by_kind, self.lam)
+
+    def lam_by_kind(self, groups: dict[str, slice]) -> dict[str, Any]:
+        """lambda as `mgs.fit.fitting.fit` takes it (`criteria.lam_by_kind`)."""
+        return lam_by_kind(self.regularisation(groups), groups)
 
 
 def as_3dgs(extent: float) -> dict[str, Any]:

@@ -62,8 +62,8 @@ def run_scalars(run: Run) -> dict[str, np.ndarray]:
     }
     scalars["information"] = 0.5 * np.log1p(H / lam).sum(axis=1)
     scalars["uncertainty"] = criteria.uncertainty(H, lam)
-    prior_lam = criteria.regularisation(groups(degree), settings.pixel_noise, settings.prior_std)
-    unseen = ~criteria.observed(run.state.surface, prior_lam)
+    surface_lam = settings.regularisation(groups(degree), surface=True)
+    unseen = ~criteria.observed(run.state.surface, surface_lam)
     scalars["unobserved"] = np.zeros(len(H))
     scalars["unobserved"][: len(unseen)] = unseen
     return scalars

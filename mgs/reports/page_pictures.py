@@ -18,7 +18,7 @@ import numpy as np
 from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
 from mgs.plotting import crop, painted
-from mgs.policy.criteria import regularisation, uncertainty
+from mgs.policy.criteria import uncertainty
 from mgs.reports.diagnostics import VISIBLE, view_maps
 from mgs.run.folder import Run
 
@@ -129,9 +129,8 @@ def draw_taken(album: Album, label: str, run: Run, drawn: Callable[[], None]) ->
     """
     from mgs.splat import fisher, groups
 
-    gaussians, settings = run.gaussians, run.settings
-    columns = groups(gaussians.sh_degree)
-    lam = regularisation(columns, settings.pixel_noise, settings.prior_std)
+    gaussians = run.gaussians
+    lam = run.settings.regularisation(groups(gaussians.sh_degree), surface=True)
     H = np.zeros((len(gaussians), len(lam)))
     for frame in run.taken:
         before = uncertainty(H, lam)

@@ -101,7 +101,9 @@ def refit_run(
     leave nothing to choose, for a loss that is not from 0 to LARGEST_LOSS, for a run whose density
     is not fixed, and if the prior or the images are not those of the run.
     """
-    from mgs.fit.evidence import last_images, lean_fit
+    from mgs.fit.evidence import lean_fit
+    from mgs.learning import images_of
+    from mgs.scene import Scene
 
     if not 0 <= loss <= LARGEST_LOSS:
         raise InputError(f"loss {loss}: must be from 0 to {LARGEST_LOSS:g} dB")
@@ -120,7 +122,7 @@ def refit_run(
     own, settings, prior = opened.state.gaussians, opened.settings, opened.prior
     digest = inputs.prior_digest(prior)
     inputs.check_unchanged(opened.folder, opened.state.inputs, digest, settings, opened.dataset)
-    images = last_images(settings, prior, opened.taken, opened.dataset.cameras)
+    images = images_of(Scene(opened.dataset, prior, settings), opened.taken)
     found = lean_fit(images, settings, learn, sh, loss, say=say)
     say("comparing")
     views, psnr = compare_models([own, found.whole, found.gaussians], opened)
