@@ -27,6 +27,7 @@ from .reports.page import write_page as write_page
 from .reports.writing import report as report
 from .run.choosing import choose as choose
 from .run.directional import Directional as Directional
+from .run.folder import Checkpoint as Checkpoint
 from .run.folder import Run as Run
 from .run.folder import open_run as open_run
 from .run.loop import select_views as select_views
@@ -45,7 +46,6 @@ from .run.policies import Random as Random
 from .run.policies import TOptimal as TOptimal
 from .run.policies import Uniform as Uniform
 from .run.settings import Mission as Mission
-from .run.state import Checkpoint as Checkpoint
 from .scene import Scene as Scene
 from .scene import State as State
 from .splat import ListCache as ListCache

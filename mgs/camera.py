@@ -171,44 +171,32 @@ class Camera:
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return Camera(scale @ self.K, width, height, self.world_to_camera)
 
-    def seen_from(self, origin: Sequence[float]) -> Camera:
+    def seen_from(self, origin: ArrayLike) -> Camera:
         """Same camera in a world whose coordinates count from `origin` [3], metres."""
-        if not any(origin):
+        origin = np.asarray(origin, np.float64)
+        if not origin.any():
             return self
         if self.traced:
             raise InputError(
                 "camera: Dr.Jit values need Gaussians whose origin is 0; move the means there"
             )
-        pose = self.world_to_camera.copy()
-        pose[:3, 3] += pose[:3, :3] @ origin
-        return Camera(
-            self.K,
-            self.width,
-            self.height,
-            pose,
-            self.film and self.film.seen_from(origin),
-            self.corner,
-        )
+        R, t = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return self._posed(R, t + R @ origin, self.film and self.film.seen_from(origin))
 
     def scaled(self, factor: float) -> Camera:
         """Same camera in a world whose lengths are multiplied by a factor."""
-        pose = self.world_to_camera.copy()
-        pose[:3, 3] *= factor
-        film = self.film and self.film.scaled(factor)
-        return Camera(self.K, self.width, self.height, pose, film, self.corner)
-
-    def moved(self, offset: ArrayLike) -> Camera:
-        """Same camera in a world whose positions are moved by an offset [3]."""
-        pose = self.world_to_camera.copy()
-        pose[:3, 3] = -pose[:3, :3] @ (self.position + np.asarray(offset, np.float64))
-        film = self.film and self.film.moved(offset)
-        return Camera(self.K, self.width, self.height, pose, film, self.corner)
+        R, t = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return self._posed(R, factor * t, self.film and self.film.scaled(factor))
 
     def turned(self, turn: ArrayLike) -> Camera:
         """Same camera in a world that is turned by a rotation [3,3]."""
-        pose = self.world_to_camera.copy()
-        pose[:3, :3] = pose[:3, :3] @ np.transpose(turn)
-        film = self.film and self.film.turned(turn)
+        R, t = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return self._posed(R @ np.transpose(turn), t, self.film and self.film.turned(turn))
+
+    def _posed(self, R: ArrayLike, t: ArrayLike, film: Camera | None) -> Camera:
+        """Same camera with another pose and film."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = R, t
         return Camera(self.K, self.width, self.height, pose, film, self.corner)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:

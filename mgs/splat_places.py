@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mgs.data.world import World
+from mgs.data.world import PLUS_Z, World
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.rotation import rotmat_from_quat
@@ -81,21 +81,19 @@ def moved(g: Gaussians, matrix: np.ndarray, where: object) -> Gaussians:
 def to_source(g: Gaussians, world: World) -> Gaussians:
     """Gaussians of an upright world in that of the files it was read from, except for its origin:
     the only way out for models."""
-    return g if np.array_equal(world.turn, np.eye(3)) else moved(g, _turn(world.turn.T), "model")
+    return _turned(g, world, world.turn.T)
 
 
 def from_source(g: Gaussians, world: World) -> Gaussians:
     """Gaussians in the world of a dataset's files as that dataset's upright world has them. Those
     without an origin of their own count from that of the dataset already."""
-    g = g.counted_from(world.origin)
-    return g if np.array_equal(world.turn, np.eye(3)) else moved(g, _turn(world.turn), "model")
+    return _turned(g.counted_from(world.origin), world, world.turn)
 
 
-def _turn(rotation: np.ndarray) -> np.ndarray:
-    """Transform [4,4] of a rotation [3,3]."""
+def _turned(g: Gaussians, world: World, turn: np.ndarray) -> Gaussians:
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    return matrix
+    matrix[:3, :3] = turn
+    return g if world.up == PLUS_Z else moved(g, matrix, "model")
 
 
 def settled(g: Gaussians, means: np.ndarray, origin: np.ndarray) -> Gaussians:

@@ -20,8 +20,8 @@ import numpy as np
 from mgs.data.dataset import load_dataset
 from mgs.fit.settings import COLOURS_ALONE, PASSES, WARM_PASSES
 from mgs.plotting import drawing
+from mgs.run.folder import Checkpoint
 from mgs.run.nbv import run_nbv
-from mgs.run.state import Checkpoint
 from studies.case import Case, Rock, Size, judge, test_views_of
 from studies.output import Content, group_styles, logarithmic, table, write_table
 from studies.statistics import pareto_front

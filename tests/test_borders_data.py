@@ -398,6 +398,6 @@ def test_cameras_of_metashape_that_are_disabled_are_left_out(data, tmp_path):
 def test_a_moved_camera_sees_the_same():
     camera = synthetic.orbit_cameras(3)[1]
     points, offset = np.random.default_rng(0).normal(size=(5, 3)), np.array([1.0, -2, 3])
-    moved = camera.moved(offset)
+    moved = camera.seen_from(np.negative(offset))
     assert isinstance(moved, Camera)
     assert np.allclose(moved.project(points + offset)[0], camera.project(points)[0])

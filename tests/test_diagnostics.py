@@ -15,9 +15,8 @@ from mgs.images import read_exr
 from mgs.policy import criteria
 from mgs.reports import diagnostics
 from mgs.run import folder as run_folder
-from mgs.run.folder import Run
+from mgs.run.folder import Checkpoint, Run
 from mgs.run.settings import NbvSettings
-from mgs.run.state import Checkpoint
 from mgs.splat import groups
 
 CHANNELS = {

@@ -21,9 +21,8 @@ from mgs.prior.exposure import DARK, GAIN_STD, RATIO_STD, SATURATED, solve_gains
 from mgs.prior.settings import PriorSettings
 from mgs.reports.evaluation import evaluate_run
 from mgs.reports.tables import markdown_table
-from mgs.run.folder import read_checkpoint
+from mgs.run.folder import Checkpoint, read_checkpoint
 from mgs.run.nbv import resume_nbv, run_nbv
-from mgs.run.state import Checkpoint
 
 
 def normalised(gains: np.ndarray) -> np.ndarray:

@@ -29,8 +29,8 @@ from mgs.progress import Stage, report
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
 from mgs.run import recording
+from mgs.run.folder import Checkpoint
 from mgs.run.settings import NbvSettings
-from mgs.run.state import Checkpoint
 from mgs.scene import Scene
 
 FRAMES, POINTS, WIDTH, HEIGHT = 12, 40, 16, 12

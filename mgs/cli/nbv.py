@@ -16,9 +16,8 @@ from mgs.run.settings import NbvSettings, Positive, settings_in, validated
 
 if TYPE_CHECKING:
     from mgs.cli.terminal import Terminal
-    from mgs.run.folder import Run
+    from mgs.run.folder import Checkpoint, Run
     from mgs.run.live import Live
-    from mgs.run.state import Checkpoint
 
 NAMES = f"Names (docs/nbv.md): {', '.join(POLICIES)}."
 

@@ -12,7 +12,7 @@ from rich.table import Table
 from mgs.cli.terminal import Terminal
 
 if TYPE_CHECKING:
-    from mgs.run.state import Checkpoint
+    from mgs.run.folder import Checkpoint
 
 GROUPS = {"test": "test", "all": "all", "held_out": "held out"}
 """Sets of views -> their names in the headings of `print_quality`."""

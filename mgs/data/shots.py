@@ -89,7 +89,7 @@ class Source:
         extent = max(float(np.linalg.norm(eyes - eyes.mean(0), axis=1).max()), 1.0)
         if np.abs(centre).max() < FAR * extent:
             return self
-        shots = [replace(shot, camera=shot.camera.moved(-centre)) for shot in self.shots]
+        shots = [replace(shot, camera=shot.camera.seen_from(centre)) for shot in self.shots]
         x, y, z = centre.tolist()
         sparse = self.sparse and replace(self.sparse, points=self.sparse.points - centre)
         return replace(self, shots=shots, sparse=sparse, origin=(x, y, z))

@@ -98,26 +98,16 @@ def unit_up(vector: Sequence[float] | np.ndarray) -> Vector:
     return x, y, z
 
 
-def shortest_turn(up: Vector) -> np.ndarray:
-    """Shortest rotation [3,3] that turns `up` to +Z; exactly the identity for +Z."""
-    x, y, z = up
-    if z < -1 + 1e-12:  # the shortest rotation is not unique: turn by half about x first
-        half_turn = np.diag([1.0, -1.0, -1.0])
-        return np.asarray(shortest_turn((x, -y, -z)) @ half_turn)
-    above = 1 + z if z > -0.5 else (x * x + y * y) / (1 - z)  # near -1, 1 + z loses digits
-    across = np.array([[x * x, x * y, 0.0], [x * y, y * y, 0.0], [0.0, 0.0, 0.0]]) / above
-    return np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [x, y, z]]) - across
-
-
 def levelled(up: Vector) -> np.ndarray:
     """Rotation [3,3] that turns `up` to +Z, and the level part of the world's +Y to +Y.
 
     The world's +Z takes the place of its +Y if that is less than 45 degrees from the vertical.
     """
-    turn = shortest_turn(up)
-    ahead = turn[:, 2 if abs(up[1]) > np.sqrt(0.5) else 1]
-    x, y = ahead[:2] / np.hypot(*ahead[:2])
-    return np.array([[y, -x, 0.0], [x, y, 0.0], [0.0, 0.0, 1.0]]) @ turn
+    z = np.array(up)
+    y = np.eye(3)[2 if abs(up[1]) > np.sqrt(0.5) else 1]
+    y = y - (y @ z) * z
+    y /= np.linalg.norm(y)
+    return np.stack([np.cross(y, z), y, z])
 
 
 def degrees_between(a: Vector, b: Vector) -> float:

@@ -36,9 +36,7 @@ UNKNOWN = "cividis"
 """Colour map of what is unknown: blue is known, yellow unknown."""
 
 
-def camera_path(
-    dataset: Dataset, means: np.ndarray, count: int, width: int
-) -> list[Camera]:
+def camera_path(dataset: Dataset, means: np.ndarray, count: int, width: int) -> list[Camera]:
     """Cameras of a turntable, at equal angles.
 
     means: [N,3] of the Gaussians. count: of cameras. width: of their images, pixels.

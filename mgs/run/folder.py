@@ -33,6 +33,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -53,7 +54,6 @@ from mgs.run.ending import RunEnd
 from mgs.run.policy_file import label
 from mgs.run.records import Config, Metrics, Record, checked, read_checked
 from mgs.run.settings import NbvSettings, check_settings, validated
-from mgs.run.state import Checkpoint
 from mgs.splat_places import to_source
 from mgs.splat_ply import read_ply, write_ply
 
@@ -67,6 +67,23 @@ FILES = [
 
 DATASET = "dataset"
 """Folder of a run that holds its dataset, where its pictures are taken (`mgs.run.live`)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """State of a run after a step, as the run folder holds it.
+
+    gaussians, H, surface, taken: as `mgs.scene.State`. steps: lines of steps.jsonl. inputs: hashes
+    of the inputs (`mgs.run.inputs`). upright: whether the model's world has +Z up.
+    """
+
+    gaussians: Gaussians
+    H: np.ndarray
+    surface: np.ndarray
+    taken: list[int]
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    inputs: dict[str, Any] = field(default_factory=dict)
+    upright: bool = True
 
 
 class Run:

@@ -30,6 +30,7 @@ from mgs.run.folder import (
     DATASET,
     FILES,
     POLICY_SOURCE,
+    Checkpoint,
     Run,
     holds_run,
     open_run,
@@ -47,7 +48,6 @@ from mgs.run.settings import (
     validated,
     with_defaults,
 )
-from mgs.run.state import Checkpoint
 from mgs.run.transports import Transport
 from mgs.run.worth import enough_views
 from mgs.scene import Scene, State
