@@ -1,13 +1,11 @@
 """Plans against upper bounds of all sets of views, and the criterion against PSNR.
 
 After the seeds, plans of several sizes and other sets are compared with the bound of
-`mgs.policy.certificate`. Then fits to random sets and to sets of growing size show what a share of
-the criterion is worth in dB.
+`mgs.policy.certificate`. Then fits to sets show what a share of the criterion is worth in dB.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +18,7 @@ from mgs.learning import fit_views
 from mgs.policy import certificate, poses
 from mgs.policy.relaxation import Relaxation
 from mgs.run.directional import DIRECTIONAL_D, Directional
-from mgs.scene import Scene, State
+from mgs.scene import Scene, State, fit_views, learn
 from studies.case import Rock
 from studies.output import Content, Panel, draw_panels, table
 from studies.setups import SETUPS, Found, SetupSize, before_any_fit, case_of, shared_scene
@@ -32,69 +30,123 @@ SETUP = SETUPS["hemisphere"]
 
 POLICIES = {policy.name: policy for policy in (Directional(), DIRECTIONAL_D)}
 
+TRAINING = tuple(Rock(scene) for scene in ("boulder", "contact-binary", "low-sun", "pebbles"))
+"""Rocks that chose the default of `enough`."""
+
 COUNTS = (4, 8)
 """Sizes of plans."""
 
-GROWING = (1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 24)
-"""Sizes of the sets of the curve, and of those that are fitted."""
+SHARES = (0.8, 0.85, 0.9, 0.95, 0.98)
+"""Shares of the gain of all candidates at which greedy sets end."""
 
-NODES, DRAWS, SETS, SIZE = 40, 20, 40, 8
-"""Nodes of branch and bound; random sets by the criterion; random sets that are fitted, and their
-size."""
+NODES, DRAWS, SIZE = 40, 20, 8
+"""Nodes of branch and bound; random sets by the criterion; views of a random set that is fitted."""
 
-KINDS = ("bound", "plan", "farthest", "random")
-"""Keys of the curve."""
+BATCHES, BATCH, GAUSSIANS = 4, 50, 6000
+"""Cells of random sets that are fitted, sets in each, and Gaussians of the priors of fits."""
+
+KINDS = ("bound", "plan", "even", "random")
+"""Keys of `mgs.policy.certificate.curve`."""
 
 
 def cells_of(size: SetupSize, rocks: Iterable[Rock]) -> list[Cell]:
-    """A cell for each rock, with its dataset and prior."""
-    cells = []
-    for rock in rocks:
-        case = case_of(rock, SETUP, size)
-        name = f"certificate/{rock.name}/{size.width}x{size.height}"
-        *data, last = case.with_task(name, f"{__name__}:certified", seed=rock.index)
-        cells += [*data, replace(last, about={"rock": rock.name, "scene": rock.scene})]
+    """Cells of each rock: its dataset, prior, plans and fits. "part" of the last: plans, training,
+    growing or random."""
+    cells, rocks = [], list(rocks)
+    parts: list[tuple[str, str, dict[str, Any], Sequence[Rock]]]
+    parts = [("training", "growing", {}, TRAINING), ("growing", "growing", {}, rocks)]
+    parts.append(("plans", "planned", {}, rocks))
+    parts += [("random", "randomised", {"batch": k}, rocks) for k in range(BATCHES)]
+    for part, task, arguments, some in parts:
+        for rock in some:
+            name = "/".join(["certificate", rock.name, part, *map(str, arguments.values())])
+            one = size if part == "plans" else replace(size, gaussians=GAUSSIANS // size.fewer)
+            case = case_of(rock, SETUP, one)
+            *data, last = case.with_task(name, f"{__name__}:{task}", seed=rock.index, **arguments)
+            about = {"rock": rock.name, "scene": rock.scene, "part": part}
+            cells += [*data, replace(last, about=about)]
     return cells
 
 
-def certified(root: Path, out: Path, dataset: str, prior: str, seed: int) -> dict[str, Any]:
-    """Task: "plans", a row for each policy and size; "curve", a row for each of GROWING, as shares
-    of the gain of all candidates; "sets", criterion and PSNR of sets. Gains are those after the
-    seeds."""
+def _of_rock(
+    root: Path, dataset: str, prior: str, start: Callable[[Scene], State]
+) -> tuple[Scene, State, list[int], dict[str, Relaxation], Any]:
+    """Scene, state after the seeds, candidates, relaxations by policy, and PSNR of a model."""
     scene, tests, _, _ = shared_scene(root / dataset, root / prior, root / dataset, None)
-    state, rng = before_any_fit(scene, SETUP.seeds), np.random.default_rng(seed)
+    state = start(scene)
     free = [i for i in range(len(scene.frames)) if i not in state.taken]
     made = {name: policy.relaxation(scene, state, free) for name, policy in POLICIES.items()}
+    return scene, state, free, made, tests
 
-    def planned(name: str, k: int) -> list[int]:
+
+def planned(root: Path, out: Path, dataset: str, prior: str, seed: int) -> dict[str, Any]:
+    """Task: "plans", a row for each policy and size; "curve", that of the first policy."""
+    rng = np.random.default_rng(seed)
+
+    def start(scene: Scene) -> State:
+        return before_any_fit(scene, SETUP.seeds)
+
+    scene, state, free, made, _ = _of_rock(root, dataset, prior, start)
+
+    def plan(name: str, k: int) -> list[int]:
         return [free.index(i) for i in POLICIES[name].plan(scene, state, free, k, None)]
 
-    plans, curve = [], []
+    positions, seeds = scene.positions(state.frames), list(state.taken)
+    even = poses.spread(positions[free], positions[seeds], scene.centre)
+    plans = []
     for name, one in made.items():
         for k in COUNTS:
-            others = spread(scene, state, free, k), draws(rng, len(free), k, DRAWS)
-            plans.append({"policy": name} | compared(one, planned(name, k), *others))
+            others = even[:k], draws(rng, len(free), k, DRAWS)
+            plans.append({"policy": name} | compared(one, plan(name, k), *others))
     name, one = next(iter(made.items()))
-    for k in GROWING:
-        gains = {
-            "bound": certificate.upper_bound(one, k).value,
-            "plan": one.gain(planned(name, k)),
-            "farthest": one.gain(spread(scene, state, free, k)),
-            "random": float(np.mean([one.gain(some) for some in draws(rng, len(free), k, 5)])),
-        }
-        every = one.gain(range(len(free)))
-        curve.append({"views": k} | {key: gain / every for key, gain in gains.items()})
-    sets = [("greedy", certificate.greedy(one, 1.0, most=k)) for k in GROWING]
-    sets += [("random", some) for some in draws(rng, len(free), SIZE, SETS)]
-    sets.append(("all", list(range(len(free)))))
+    curve = certificate.curve(one, plan(name, max(COUNTS)), even)
+    return {"gaussians": len(scene.prior.points), "plans": plans, "curve": curve}
+
+
+def _psnr_of(
+    root: Path, dataset: str, prior: str, sets_of: Callable[..., list[dict[str, Any]]]
+) -> dict[str, Any]:
+    """PSNR on test views of fits to sets, which start at the model of the seeds as in a run; and
+    the sets' gains by policy."""
+
+    def start(scene: Scene) -> State:
+        return learn(scene, scene.seeds(SETUP.seeds))
+
+    scene, state, free, made, tests = _of_rock(root, dataset, prior, start)
     rows = []
-    for kind, views in sets:
+    for row in sets_of(made, len(free)):
+        views = row.pop("set")
         frames = [*state.taken, *(free[v] for v in views)]
-        psnr = tests(fit_views(scene, scene.frames, frames)[0].gaussians)["psnr"]
+        psnr = tests(fit_views(scene, scene.frames, frames, state)[0].gaussians)["psnr"]
         gains = {name: one.gain(views) for name, one in made.items()}
-        rows.append({"kind": kind, "views": len(views), "psnr": float(psnr.mean())} | gains)
-    count = len(scene.prior.points)
-    return {"gaussians": count, "plans": plans, "curve": curve, "sets": rows}
+        rows.append(row | {"views": len(views), "psnr": float(psnr.mean())} | gains)
+    return {"sets": rows}
+
+
+def growing(root: Path, out: Path, dataset: str, prior: str, seed: int) -> dict[str, Any]:
+    """Task: "sets", the greedy sets of each policy that end at SHARES, and all candidates."""
+
+    def sets_of(made: dict[str, Relaxation], count: int) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = [
+            {"policy": name, "share": share, "set": certificate.greedy(one, share)}
+            for name, one in made.items()
+            for share in SHARES
+        ]
+        return [*rows, {"policy": "", "share": 1.0, "set": list(range(count))}]
+
+    return _psnr_of(root, dataset, prior, sets_of)
+
+
+def randomised(
+    root: Path, out: Path, dataset: str, prior: str, seed: int, batch: int
+) -> dict[str, Any]:
+    """Task: "sets", BATCH random sets of SIZE."""
+    rng = np.random.default_rng([seed, batch])
+
+    def sets_of(_: dict[str, Relaxation], count: int) -> list[dict[str, Any]]:
+        return [{"set": some} for some in draws(rng, count, SIZE, BATCH)]
+
+    return _psnr_of(root, dataset, prior, sets_of)
 
 
 def draws(rng: np.random.Generator, count: int, k: int, number: int) -> list[list[int]]:
@@ -102,121 +154,124 @@ def draws(rng: np.random.Generator, count: int, k: int, number: int) -> list[lis
     return [rng.choice(count, k, replace=False).tolist() for _ in range(number)]
 
 
-def spread(scene: Scene, state: State, free: Sequence[int], k: int) -> list[int]:
-    """The k candidates that the policy `farthest` takes after the seeds."""
-    taken, positions = list(state.taken), scene.positions(state.frames)
-    for _ in range(k):
-        others = [i for i in free if i not in taken]
-        apart = poses.farthest_pose(positions[others], positions[taken], scene.centre)
-        taken.append(others[int(apart.argmax())])
-    return [free.index(i) for i in taken[len(state.taken) :]]
-
-
 def compared(
     made: Relaxation, plan: Sequence[int], even: Sequence[int], random: Sequence[Sequence[int]]
 ) -> Row:
-    """Gains of a plan and of other sets of as many views, their bounds, and CPU seconds."""
-    k, start = len(plan), time.process_time()
-    bound = certificate.upper_bound(made, k)
-    seconds = time.process_time() - start
+    """Gains of a plan and of other sets of as many views, and their bounds."""
+    k = len(plan)
     best = certificate.best_set(made, plan, most=NODES)
     gains = [made.gain(some) for some in random]
     return {
         "views": k,
-        "candidates": made.candidates,
         "plan": made.gain(plan),
         "greedy": made.gain(certificate.greedy(made, 1.0, most=k)),
         "farthest": made.gain(even),
         "random": float(np.mean(gains)),
         "random_best": float(np.max(gains)),
-        "relaxed": bound.value,
-        "gap": bound.gap,
+        "relaxed": certificate.upper_bound(made, k).value,
         "bound": best.bound,
         "best": best.gain,
         "nodes": best.nodes,
         "fewer": certificate.upper_bound(made, k - 1).value,
-        "all": made.gain(range(made.candidates)),
-        "bound_seconds": seconds,
-        "seconds": time.process_time() - start,
     }
 
 
 def rows_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
-    """A row for each rock, policy and size of a plan: gains as shares of the bound; "correlation"
-    of the criterion and PSNR over random sets; "loss" of PSNR, dB, at the first greedy set with 80,
-    90 and 95 % of the gain of all, interpolated."""
+    """A row for each rock, policy and size of a plan: gains as shares of the bound, and
+    "correlation" of the criterion and PSNR over the rock's random sets."""
     rows: list[Row] = []
-    for cell in (cell for cell in cells if cell.about):
-        found = results[cell.name]
-        for plan in found["plans"]:
+    for cell in _of_part("plans", cells):
+        others = [
+            one for one in _of_part("random", cells) if one.about["rock"] == cell.about["rock"]
+        ]
+        sets = [row for one in others for row in results[one.name]["sets"]]
+        for plan in results[cell.name]["plans"]:
             keys = ("plan", "greedy", "farthest", "random", "random_best", "best")
             shares = {key: plan[key] / plan["bound"] for key in keys}
             shares["relaxed"] = plan["plan"] / plan["relaxed"]
             shares["fewer"] = plan["fewer"] / plan["plan"]
-            more = {key: plan[key] for key in ("policy", "views", "nodes", "bound_seconds")}
-            rows.append(
-                dict(cell.about) | more | shares | _in_decibels(found["sets"], plan["policy"])
+            rank = spearmanr(
+                *zip(*((row[plan["policy"]], row["psnr"]) for row in sets), strict=True)
             )
+            more = {key: plan[key] for key in ("policy", "views", "nodes")}
+            about = {key: cell.about[key] for key in ("rock", "scene")}
+            rows.append(about | more | shares | {"correlation": float(rank.statistic)})
     return rows
 
 
-def _in_decibels(sets: Sequence[Row], policy: str) -> Row:
-    """Correlation and losses of `rows_of`."""
-    random = [one for one in sets if one["kind"] == "random"]
-    growing, every = [one for one in sets if one["kind"] == "greedy"], sets[-1]
-    share = [one[policy] / every[policy] for one in growing]
-    loss = [every["psnr"] - one["psnr"] for one in growing]
-    rank = spearmanr([one[policy] for one in random], [one["psnr"] for one in random])
-    losses = {f"loss_{p}": float(np.interp(p / 100, share, loss)) for p in (80, 90, 95)}
-    return {"correlation": float(rank.statistic)} | losses
+def losses_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
+    """Rows with "part" (training or growing), rock, scene, policy, share, views, and "loss" against
+    all candidates, dB."""
+    rows: list[Row] = []
+    for cell in [*_of_part("training", cells), *_of_part("growing", cells)]:
+        *sets, every = results[cell.name]["sets"]
+        for one in sets:
+            numbers = {key: one[key] for key in ("policy", "share", "views")}
+            rows.append(dict(cell.about) | numbers | {"loss": every["psnr"] - one["psnr"]})
+    return rows
 
 
-def text_of(rows: Sequence[Row]) -> str:
-    """A line for each policy and size: means over scenes with 95 % intervals."""
-    lines: dict[tuple[str, int], list[Row]] = {}
+def _of_part(part: str, cells: Sequence[Cell]) -> list[Cell]:
+    return [cell for cell in cells if cell.about.get("part") == part]
+
+
+def _mean(rows: Sequence[Row], key: str, form: str) -> str:
+    """Mean over scenes with its 95 % interval."""
+    scenes: dict[str, list[float]] = {}
+    for row in rows:
+        scenes.setdefault(row["scene"], []).append(row[key])
+    values = [float(np.mean(of)) for of in scenes.values()]
+    ends, middle = interval(values), format(float(np.mean(values)), form)
+    return middle if ends is None else f"{middle} [{ends[0]:{form}}, {ends[1]:{form}}]"
+
+
+def text_of(rows: Sequence[Row], losses: Sequence[Row]) -> str:
+    """Tables of plans, bounds, correlation and losses: means over scenes, 95 % intervals."""
+    lines: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         lines.setdefault((row["policy"], row["views"]), []).append(row)
+    shares: dict[tuple[Any, ...], list[Row]] = {}
+    for row in losses:
+        shares.setdefault((row["policy"], row["share"]), []).append(row)
 
-    def mean(key: str, form: str) -> Callable[[Row], str]:
-        def cell(line: Row) -> str:
-            scenes: dict[str, list[float]] = {}
-            for row in line["of"]:
-                scenes.setdefault(row["scene"], []).append(row[key])
-            values = [float(np.mean(of)) for of in scenes.values()]
-            ends, middle = interval(values), format(float(np.mean(values)), form)
-            return middle if ends is None else f"{middle} [{ends[0]:{form}}, {ends[1]:{form}}]"
+    def of(key: str, form: str, part: str = "") -> Callable[[Row], str]:
+        return lambda line: _mean(
+            [row for row in line["of"] if not part or row["part"] == part], key, form
+        )
 
-        return cell
-
-    shares = ("plan", "greedy", "farthest", "random", "random_best")
     names = ("plan", "greedy", "farthest", "random, mean", f"random, best of {DRAWS}")
+    keys = ("plan", "greedy", "farthest", "random", "random_best")
     of_sets: dict[str, Content] = {"policy": "policy", "views": "views:d"}
-    of_sets |= {name: mean(key, ".3f") for name, key in zip(names, shares, strict=True)}
+    of_sets |= {name: of(key, ".3f") for name, key in zip(names, keys, strict=True)}
     of_plans: dict[str, Content] = {
         "policy": "policy",
         "views": "views:d",
-        "plan / relaxation": mean("relaxed", ".3f"),
-        "one view less / plan": mean("fewer", ".3f"),
-        "CPU s of the relaxation": mean("bound_seconds", ".2f"),
+        "plan / relaxation": of("relaxed", ".3f"),
+        "one view less / plan": of("fewer", ".3f"),
     }
-    of_psnr: dict[str, Content] = {
+    of_ranks: dict[str, Content] = {
         "policy": "policy",
-        f"rank correlation, {SETS} sets of {SIZE}": mean("correlation", ".2f"),
-        "dB lost at 80 %": mean("loss_80", ".2f"),
-        "at 90 %": mean("loss_90", ".2f"),
-        "at 95 %": mean("loss_95", ".2f"),
+        f"rank correlation, {BATCHES * BATCH} sets of {SIZE}": of("correlation", ".2f"),
     }
-    every = [{"policy": name, "views": k, "of": of} for (name, k), of in lines.items()]
+    of_losses: dict[str, Content] = {
+        "policy": "policy",
+        "share of all": "share:.2f",
+        "views": of("views", ".1f", "growing"),
+        "dB lost, training rocks": of("loss", ".2f", "training"),
+        "dB lost, others": of("loss", ".2f", "growing"),
+    }
+    every = [{"policy": name, "views": k, "of": some} for (name, k), some in lines.items()]
     last = [line for line in every if line["views"] == max(COUNTS)]
-    return "\n".join([table(of_sets, every), table(of_plans, every), table(of_psnr, last)])
+    ends = [{"policy": name, "share": k, "of": some} for (name, k), some in shares.items()]
+    made = ((of_sets, every), (of_plans, every), (of_ranks, last), (of_losses, ends))
+    return "\n".join(table(*one) for one in made)
 
 
 def curve_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
     """Rows of the curve: rock, scene, views, kind (of KINDS), percent of the gain of all."""
     return [
         dict(cell.about) | {"views": row["views"], "kind": kind, "percent": 100 * row[kind]}
-        for cell in cells
-        if cell.about
+        for cell in _of_part("plans", cells)
         for row in results[cell.name]["curve"]
         for kind in KINDS
     ]

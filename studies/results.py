@@ -160,14 +160,16 @@ def write_flights(work: Work) -> list[Path]:
 
 
 def write_certificate(work: Work) -> list[Path]:
-    """certificate.csv, .json, .md and .png, and certificate-curve.csv."""
+    """certificate.csv, .json, .md and .png, and certificate-curve.csv and -losses.csv."""
     rows = certificate.rows_of(work.results, work.cells)
+    losses = certificate.losses_of(work.results, work.cells)
     curve = certificate.curve_of(work.results, work.cells)
     certificate.draw(work.out / "certificate.png", curve)
-    text = certificate.text_of(rows)
+    text = certificate.text_of(rows, losses)
     written = write_table(work.out, "certificate", rows, text, work.command, rocks=work.count)
-    more = write_csv(work.out / "certificate-curve.csv", curve)
-    return [*written, more, work.out / "certificate.png"]
+    more = [("curve", curve), ("losses", losses)]
+    written += [write_csv(work.out / f"certificate-{name}.csv", of) for name, of in more]
+    return [*written, work.out / "certificate.png"]
 
 
 def _runs_cells(runs: Iterable[Run]) -> list[Cell]:

@@ -116,7 +116,8 @@ def test_setups_are_made_once_and_compare_a_policy_of_ones_own(
 
 
 def test_no_set_of_a_study_is_above_its_bound(quick, tmp_path, capsys, monkeypatch):
-    small = {"COUNTS": (2,), "GROWING": (1, 2, 3), "SETS": 4, "SIZE": 2, "DRAWS": 3}
+    small = {"COUNTS": (2,), "BATCH": 2, "BATCHES": 2, "SIZE": 2, "DRAWS": 3}
+    small |= {"SHARES": (0.8,), "GAUSSIANS": 400, "TRAINING": certificate.TRAINING[:1]}
     for name, value in small.items():
         monkeypatch.setattr(certificate, name, value)
     out = tmp_path / "out"

@@ -15,7 +15,7 @@ from __future__ import annotations
 import heapq
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,9 @@ TOLERANCE = 1e-3
 
 CLOSE = 1e-2
 """Gap at which `best_set` stops, as a share of the bound."""
+
+CURVE = (1, 2, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
+"""Numbers of views of `curve`."""
 
 NODES = 1000
 """Most nodes of `best_set`. A chosen constant."""
@@ -118,7 +121,7 @@ def best_set(
         if len(views := _last_view(relaxation, lo, hi, k)):
             closed = max(closed, _noted(gains, relaxation, views))
             continue
-        bound = _bound(relaxation, x, (lo, hi), TOLERANCE, until, enough)
+        bound = _bound(relaxation, x, (lo, hi), CLOSE / 4, until, enough)
         bound = bound._replace(value=min(bound.value, -parent))
         _noted(gains, relaxation, np.argsort(-bound.weights, kind="stable")[:k])
         if bound.value <= (enough := max(gains.values()) / (1 - gap)):
@@ -234,7 +237,7 @@ def _bound(
     once the bound is at most `enough`, too.
     """
     if len(relaxation.base) > 2 * len(relaxation.coarse.base):
-        x = _bound(relaxation.coarse, x, box, tolerance / 10, until).weights
+        x = _bound(relaxation.coarse, x, box, tolerance, until).weights
     k, best, lower = round(float(x.sum())), None, -np.inf
     (value, slope), stopped = relaxation.tangent(x), "steps"
     for _ in range(STEPS):
@@ -297,7 +300,7 @@ class Certificate:
     criterion: name of the policy. views, candidates: k and C.
     share: gain of the plan over the bound of any k. fewer: bound of any k - 1 over that gain; None
     for one view. of_all: gain of the plan over that of all candidates. prices: of the bound of any
-    k [C] (`Bound`), over its value.
+    k [C] (`Bound`), over its value. curve: see `curve`.
     """
 
     criterion: str
@@ -307,6 +310,7 @@ class Certificate:
     fewer: float | None
     of_all: float
     prices: list[float]
+    curve: list[dict[str, float]] = field(default_factory=list)
 
     def sentence(self) -> str:
         """The certificate in words; shares are rounded to the safe side."""
@@ -334,6 +338,31 @@ def certify(
     of_all = gain / relaxation.gain(range(count))
     prices = (best.prices / best.bound).tolist()
     return Certificate(criterion, k, count, gain / best.bound, fewer, of_all, prices)
+
+
+def curve(
+    relaxation: Relaxation, plan: Sequence[int], even: Sequence[int]
+) -> list[dict[str, float]]:
+    """Rows with "views", and shares of the gain of all candidates: "bound" of any set of as many,
+    "plan" (for other sizes greedy), "even" and "random".
+
+    even: candidates in the order in which even spacing takes them. The last two shares are those of
+    `Relaxation.coarse`.
+    """
+    count, coarse, rng = relaxation.candidates, relaxation.coarse, np.random.default_rng(0)
+    every, about = (one.gain(range(count)) for one in (relaxation, coarse))
+    order, draws = greedy(coarse, 1.0), [rng.permutation(count) for _ in range(5)]
+    rows = []
+    for k in sorted(k for k in {*CURVE, len(plan)} if k < count):
+        taken = plan if k == len(plan) else order[:k]
+        shares = {
+            "bound": min(upper_bound(relaxation, k, CLOSE / 4).value / every, 1.0),
+            "plan": relaxation.gain(taken) / every,
+            "even": coarse.gain(even[:k]) / about,
+            "random": float(np.mean([coarse.gain(some[:k]) for some in draws])) / about,
+        }
+        rows.append({"views": k} | shares)
+    return rows
 
 
 def greedy(relaxation: Relaxation, share: float, most: int | None = None) -> list[int]:

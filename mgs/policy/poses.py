@@ -35,6 +35,15 @@ def farthest_pose(candidates: Array, taken: Array, centre: Array) -> Array:
     return _rounded(distance.min(axis=1))
 
 
+def spread(candidates: Array, taken: Array, centre: Array) -> list[int]:
+    """Order in which `farthest_pose` takes all candidates [C,3] after the cameras taken [T,3]."""
+    order, left = list[int](), list(range(len(candidates)))
+    while left:
+        so_far = np.concatenate([taken, candidates[order]])
+        order.append(left.pop(int(farthest_pose(candidates[left], so_far, centre).argmax())))
+    return order
+
+
 def angles(ours: Array, theirs: Array, centre: Array) -> NDArray[np.float64]:
     """Angles [A,B] at `centre` between camera centres [A,3] and [B,3], radians."""
     a, b = (

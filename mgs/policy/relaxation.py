@@ -61,17 +61,24 @@ class Relaxation:
         return replace(self, vectors=vectors, base=base, over=over, scale=scale)
 
     @cached_property
-    def nothing(self) -> float:
-        """Sum of phi without a candidate."""
+    def before(self) -> Floats:
+        """phi of each Gaussian without a candidate [N]."""
 
-        def part(some: slice) -> float:
+        def part(some: slice) -> Floats:
             return self._phi(self.base[some], some)[0]
 
-        return float(sum(in_parts(len(self.base), part)))
+        return np.concatenate(in_parts(len(self.base), part))
 
     def gain(self, views: Iterable[int]) -> float:
         """f of a set of candidates."""
-        return self.tangent(self._taken(views))[0]
+        taken = np.flatnonzero(self._taken(views))
+
+        def part(some: slice) -> float:
+            z = self.vectors(some)[:, taken]
+            A = self.base[some] + z.transpose(0, 2, 1) @ z
+            return float((self._phi(A, some)[0] - self.before[some]).sum())
+
+        return sum(in_parts(len(self.base), part))
 
     def tangent(self, x: Floats) -> tuple[float, Floats]:
         """f at weights x [C], and its gradient [C]."""
@@ -79,10 +86,10 @@ class Relaxation:
         def part(some: slice) -> tuple[float, Floats]:
             z, A = self._at(x, some)
             value, slope, _ = self._phi(A, some)
-            return value, np.einsum("nvk,nvk->v", z @ slope, z)
+            return float((value - self.before[some]).sum()), np.einsum("nvk,nvk->v", z @ slope, z)
 
         values, slopes = zip(*in_parts(len(self.base), part), strict=True)
-        return sum(values) - self.nothing, sum(slopes)
+        return sum(values), sum(slopes)
 
     def curvature(self, x: Floats) -> Floats:
         """Minus the Hessian of f [C,C]."""
@@ -119,15 +126,15 @@ class Relaxation:
         z = self.vectors(some)
         return z, self.base[some] + (z * x[:, None]).transpose(0, 2, 1) @ z
 
-    def _phi(self, A: Floats, some: slice) -> tuple[float, Floats, tuple[Floats, Floats]]:
-        """Sum of phi at A [n,K,K]; P [n,K,K] with d phi = trace(P dA); and Q, R [n,K,K] with
+    def _phi(self, A: Floats, some: slice) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
+        """phi at A [n,K,K]; P [n,K,K] with d phi = trace(P dA); and Q, R [n,K,K] with
         d^2 phi = -(z_u^T Q z_v) (z_u^T R z_v) for views u and v."""
         S = np.asarray(np.linalg.inv(A), np.float64)
         if self.over is None:
-            value = self.scale * float(np.linalg.slogdet(A)[1].sum())
+            value = self.scale * np.linalg.slogdet(A)[1]
             return value, self.scale * S, (S, self.scale * S)
         M = self.over[some]
-        slope, value = self.scale * (S @ M @ S), -self.scale * float((S * M).sum())
+        slope, value = self.scale * (S @ M @ S), -self.scale * np.einsum("nkl,nkl->n", S, M)
         return value, slope, (S, 2 * slope)
 
 

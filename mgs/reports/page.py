@@ -39,7 +39,14 @@ from mgs.reports.page_pictures import (
     draw_taken,
     new_album,
 )
-from mgs.reports.page_plots import METRIC_NAMES, line_plot, orbit_plot, timing_plot, views_plot
+from mgs.reports.page_plots import (
+    METRIC_NAMES,
+    curve_plot,
+    line_plot,
+    orbit_plot,
+    timing_plot,
+    views_plot,
+)
 from mgs.reports.runs import compare_runs, least_trained, step_curves
 from mgs.reports.writing import shown_view
 from mgs.run.folder import Run
@@ -220,6 +227,9 @@ def _plots(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     for key, (title, axis, zero) in of_steps.items():
         plots.append((title, step_curves(runs, key), axis, zero))
     drawn = [line_plot(title, curves, axis, zero) for title, curves, axis, zero in plots if curves]
+    for label, run in runs.items():
+        if curve := run.steps[0].get("certificate", {}).get("curve"):
+            drawn.append(curve_plot(label, curve))
     views = {label: measured_views(run) for label, run in runs.items() if run.measured}
     if views:
         masked = all(any(one.get("psnr_mask") is not None for one in of) for of in views.values())

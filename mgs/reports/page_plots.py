@@ -135,9 +135,35 @@ def views_plot(metric: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> 
     return _plot(title, alt, traces, {"xaxis": axis, "yaxis": _axis(name)})
 
 
+CURVES = {
+    "bound": "upper bound of any views",
+    "plan": "planned views",
+    "even": "evenly spaced",
+    "random": "random",
+}
+"""Keys of `mgs.policy.certificate.curve` -> names."""
+
+
+def curve_plot(label: str, curve: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+    """Share of the gain of all candidates against the number of views, after the seeds."""
+    traces = [
+        {
+            "name": name,
+            "x": [row["views"] for row in curve],
+            "y": [100 * row[key] for row in curve],
+            "mode": "lines+markers",
+        }
+        for key, name in CURVES.items()
+    ]
+    title = f"Gain that a number of views can have, {label}"
+    alt = f"{title}: the upper bound of all sets, the plan, evenly spaced and random views."
+    axes = {"xaxis": _axis("views after the seeds"), "yaxis": _axis("gain of all candidates (%)")}
+    return _plot(title, alt, traces, axes)
+
+
 def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     """The orbit in 3D: the model as points, all poses, seeds, and the chosen views, numbered and
-    joined in their order.
+    joined in their order. Other candidates have the colours of their prices, if the run has them.
 
     The last trace, "shown above", marks the view of the page's slider; the page moves it.
     """
@@ -154,7 +180,14 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
         return trace | {"hovertext": texts, "hoverinfo": "text+x+y+z"}
 
     left = [i for i in range(len(eyes)) if i not in taken]
-    open_circle = {"size": 3, "color": "#9a9a9a", "symbol": "circle-open"}
+    prices = run.steps[0].get("certificate", {}).get("prices", {})
+    circle: dict[str, Any] = {"size": 3, "color": "#9a9a9a", "symbol": "circle-open"}
+    others = "candidates"
+    if left and all(names[i] in prices for i in left):
+        bar = {"title": {"text": "price"}, "thickness": 12, "len": 0.6, "x": -0.1}
+        colours = {"color": [prices[names[i]] for i in left], "colorscale": "Cividis"}
+        circle = {"size": 5, **colours, "showscale": True, "colorbar": bar}
+        others = "candidates, by price"
     diamond = {"size": 6, "color": "#D55E00", "symbol": "diamond"}
     bar = {"title": {"text": "step"}, "thickness": 12, "len": 0.6}
     scale = {"colorscale": "Viridis", "showscale": bool(chosen), "colorbar": bar}
@@ -165,7 +198,7 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     here = {"size": 12, "color": "#dd1111", "symbol": "circle-open"}
     traces = [
         _model_points(run.gaussians),
-        markers("candidates", left, [names[i] for i in left], **open_circle),
+        markers(others, left, [names[i] for i in left], **circle),
         _frusta([cameras[i] for i in taken], length),
         markers("seeds", seeds, [names[i] for i in seeds], **diamond),
         path,

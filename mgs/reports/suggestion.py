@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from mgs.data.world import World
 from mgs.files import write_json
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.reports.diagnostics import VISIBLE, picture, run_scalars, show_map, view_maps
+from mgs.reports.page_plots import CURVES
 from mgs.run.folder import Run
 from mgs.run.suggest import Suggestion, View, taken_in_order
 
@@ -80,14 +82,21 @@ def _record(view: View, world: World) -> dict[str, Any]:
 
 
 def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
-    """Draw the site from above, and for the first planned views what the model shows from there and
-    how uncertain it is. Raises InputError if the figure cannot be written."""
+    """Draw the site from above, for the first planned views what the model shows from there and how
+    uncertain it is, and the curve of the certificate.
+
+    Raises InputError if the figure cannot be written.
+    """
     from mgs.plotting import NO_GRID, crop, drawing
 
     views = found.plan[:MOST_PICTURES]
     scalars = {"uncertainty": run_scalars(run)["uncertainty"]}
-    with drawing(path, 4.0 + 1.7 * len(views), 4.2, NO_GRID, dpi=120) as figure:
-        grid = figure.add_gridspec(2, 1 + len(views), width_ratios=[3.6, *[1.7] * len(views)])
+    curve = found.certificate.curve if found.certificate else []
+    widths = [3.6, *[1.7] * len(views), *[3.2] * bool(curve)]
+    with drawing(path, 0.4 + sum(widths), 4.2, NO_GRID, dpi=120) as figure:
+        grid = figure.add_gridspec(2, len(widths), width_ratios=widths)
+        if curve:
+            _curve(figure.add_subplot(grid[:, -1]), curve)
         _from_above(figure.add_subplot(grid[:, 0]), run, found)
         for k, view in enumerate(views, 1):
             small = view.camera.resized(min(view.camera.width, PICTURE_WIDTH))
@@ -103,6 +112,15 @@ def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
                 axis.set_anchor("N")
         figure.colorbar(shown, ax=below, shrink=0.8, aspect=16, label="variance left")
         figure.legend(loc="outside lower left", ncols=3)
+
+
+def _curve(axis: Any, curve: Sequence[Mapping[str, float]]) -> None:
+    """Draw `mgs.policy.certificate.curve`."""
+    for key, name in CURVES.items():
+        shares = [100 * row[key] for row in curve]
+        axis.plot([row["views"] for row in curve], shares, marker="o", markersize=3, label=name)
+    axis.set(xlabel="views", title="gain of all candidates (%)", ylim=(0, 102))
+    axis.legend(loc="lower right")
 
 
 def _from_above(axis: Any, run: Run, found: Suggestion) -> None:

@@ -50,6 +50,7 @@ class _Certificate(_Strict):
     fewer: float | None
     of_all: float
     prices: dict[str, float]
+    curve: list[dict[str, float]] = []
 
 
 class _Line(_Strict, extra="allow"):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from mgs.errors import InputError
-from mgs.policy.certificate import Certificate, certify, greedy
+from mgs.policy.certificate import Certificate, certify, curve, greedy
+from mgs.policy.poses import spread
 from mgs.progress import Stage, report
 from mgs.run.choosing import planned_flight
 from mgs.run.flight import free, views_left
@@ -13,9 +15,12 @@ from mgs.run.policies import Policy
 from mgs.run.settings import Mission
 from mgs.scene import Scene, State
 
-CERTIFY_NODES, CERTIFY_PAIRS = 20, 15_000_000
+CERTIFY_NODES, CERTIFY_PAIRS = 10, 10_000_000
 """Most nodes of the branch and bound of a certificate, and most nodes times pairs of a candidate
 and a Gaussian: seconds of work. Chosen constants."""
+
+CURVE_PAIRS = 3_000_000
+"""Most pairs of a candidate and a Gaussian with which the curve of a certificate is computed."""
 
 
 def certificate(
@@ -32,8 +37,13 @@ def certificate(
     made = relaxation(scene, state, views)
     if made is None:
         return None
-    nodes = min(CERTIFY_NODES, CERTIFY_PAIRS // (len(views) * len(made.base)))
-    return certify(made, [views.index(i) for i in plan], policy.name, nodes)
+    pairs, chosen = len(views) * len(made.base), [views.index(i) for i in plan]
+    worth = certify(made, chosen, policy.name, min(CERTIFY_NODES, CERTIFY_PAIRS // pairs))
+    if pairs > CURVE_PAIRS:
+        return worth
+    positions = scene.positions(state.frames)
+    even = spread(positions[list(views)], positions[list(state.taken)], scene.centre)
+    return replace(worth, curve=curve(made, chosen, even))
 
 
 def planned_certificate(
