@@ -97,7 +97,8 @@ def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
         grid = figure.add_gridspec(2, len(widths), width_ratios=widths)
         if curve:
             _curve(figure.add_subplot(grid[:, -1]), curve)
-        _from_above(figure.add_subplot(grid[:, 0]), run, found)
+        site = figure.add_subplot(grid[:, 0])
+        _from_above(site, run, found)
         for k, view in enumerate(views, 1):
             small = view.camera.resized(min(view.camera.width, PICTURE_WIDTH))
             maps = view_maps(run.state.gaussians, small, scalars)
@@ -111,7 +112,8 @@ def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
             for axis in (top, below):
                 axis.set_anchor("N")
         figure.colorbar(shown, ax=below, shrink=0.8, aspect=16, label="variance left")
-        figure.legend(loc="outside lower left", ncols=3)
+        legend = site.get_legend_handles_labels()
+        figure.legend(*legend, loc="outside lower left", ncols=3)
 
 
 def _curve(axis: Any, curve: Sequence[Mapping[str, float]]) -> None:
@@ -120,7 +122,7 @@ def _curve(axis: Any, curve: Sequence[Mapping[str, float]]) -> None:
         shares = [100 * row[key] for row in curve]
         axis.plot([row["views"] for row in curve], shares, marker="o", markersize=3, label=name)
     axis.set(xlabel="views", title="gain of all candidates (%)", ylim=(0, 102))
-    axis.legend(loc="lower right")
+    axis.legend(fontsize=7, handlelength=1, labelspacing=0.3)
 
 
 def _from_above(axis: Any, run: Run, found: Suggestion) -> None:
