@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from mgs.learning import fit_views
+from mgs.learning import fit_views, learn
 from mgs.policy import certificate, poses
 from mgs.policy.relaxation import Relaxation
 from mgs.run.directional import DIRECTIONAL_D, Directional
-from mgs.scene import Scene, State, fit_views, learn
+from mgs.scene import Scene, State
 from studies.case import Rock
 from studies.output import Content, Panel, draw_panels, table
 from studies.setups import SETUPS, Found, SetupSize, before_any_fit, case_of, shared_scene
