@@ -19,6 +19,9 @@ EXTRAS = {
     "plotly": "page",
     "jinja2": "page",
     "viser": "view",
+    "gsply": "export",
+    "imageio_ffmpeg": "video",
+    "rosbags": "ros",
 }
 """Modules that only some commands need -> extra of pyproject.toml that installs them."""
 

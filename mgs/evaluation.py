@@ -15,6 +15,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,10 +27,11 @@ from mgs.data.dataset import TEST_FOLDER, Dataset
 from mgs.data.frames import Frame, as_captured
 from mgs.data.world import UPRIGHT, World
 from mgs.files import atomic_path
-from mgs.gaussians import Gaussians
+from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import PNG_LEVEL
 from mgs.memory import IMAGE_BYTES, kept_within
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_psnr, compare_surface
+from mgs.rotation import rotmat_from_quat
 
 if TYPE_CHECKING:
     from mgs.splat import ListCache
@@ -63,6 +65,26 @@ def render_view(
     image = render(gaussians, camera, cache=cache)
     rgb = gaussians.linear_rgb(np.asarray(image.rgb))
     return rgb, np.asarray(image.alpha), np.asarray(image.depth)
+
+
+def normals(gaussians: Gaussians, camera: Camera, cache: ListCache | None = None) -> np.ndarray:
+    """Unit normals of a view in the world's axes, towards the camera, float32 [H,W,3]; 0 where
+    nothing is drawn.
+
+    The normal of a Gaussian is its shortest axis, and that of a pixel their mean by blending
+    weight. Raises InputError as `render`.
+    """
+    from mgs.splat import render
+
+    axes, shortest = rotmat_from_quat(gaussians.quats), np.argmin(gaussians.log_scales, 1)
+    n = np.take_along_axis(axes, np.asarray(shortest)[:, None, None], 2)[..., 0]
+    eye = camera.seen_from(gaussians.origin).position
+    n *= np.where(((gaussians.means - eye) * n).sum(1, keepdims=True) > 0, -1, 1)
+    # Colours are at least 0, so (n + 1) / 2 is drawn: sum w n = 2 sum w (n + 1) / 2 - sum w.
+    image = render(replace(gaussians, sh=sh_from_rgb((n + 1) / 2)), camera, cache=cache)
+    mean = 2 * np.asarray(image.rgb, np.float64) - np.asarray(image.alpha)[..., None]
+    length = np.linalg.norm(mean, axis=2, keepdims=True)
+    return np.where(length > 0, mean / np.where(length > 0, length, 1), 0).astype(np.float32)
 
 
 def psnr_measure(

@@ -18,7 +18,7 @@ from mgs.camera import Camera
 from mgs.data.dataset import Dataset, target_of
 from mgs.data.frames import Frame, as_asked
 from mgs.errors import InputError
-from mgs.fit.fitting import Fit, fit
+from mgs.fit.fitting import Fit, fit_gaussians
 from mgs.fit.settings import ALPHA_WEIGHT, ModelSettings, TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, KEPT_BYTES, Deferred, kept_within, release
@@ -243,7 +243,7 @@ class Scene:
         on_pass = partial(report, Stage.FIT)
         targets, start = self.targets(frames, gains), self.start(tuple(frames))
         release(KEPT_BYTES)  # what scores took, and then what the fit took
-        fit_ = fit(model, cameras, targets, train, on_pass, self.cache, start, lam)
+        fit_ = fit_gaussians(model, cameras, targets, train, on_pass, self.cache, start, lam)
         release(KEPT_BYTES)
         return fit_
 

@@ -18,7 +18,7 @@ from typing import Any
 from mgs.camera import extent_of
 from mgs.data.dataset import load_dataset, target_of
 from mgs.evaluation import evaluate_model
-from mgs.fit.fitting import fit
+from mgs.fit.fitting import fit_gaussians
 from mgs.fit.settings import TrainSettings, as_3dgs
 from mgs.memory import IMAGE_BYTES, Deferred, kept_within
 from mgs.prior.build import load_prior
@@ -56,7 +56,7 @@ def _fit(dataset: Path, prior: Path, settings: dict[str, Any]) -> dict[str, Any]
     start = replace(start, antialiased=train.antialiased)
     kept = kept_within(IMAGE_BYTES, lambda i: target_of(frames[i]), lambda target: target.nbytes)
     targets = Deferred(range(len(frames)), kept)
-    model = fit(start, cameras, targets, train).gaussians
+    model = fit_gaussians(start, cameras, targets, train).gaussians
     seconds, peak = time.perf_counter() - began, peak_megabytes()
     tests = test_views_of(data).frames
     metrics = evaluate_model(model, frames, [frame.name for frame in frames], test_frames=tests)

@@ -11,6 +11,7 @@ import gc
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from graphlib import TopologicalSorter
@@ -119,8 +120,8 @@ def run_cells(
 
     workers: number of processes, which share the cores; one: this process. scheduler: address of a
     Dask scheduler whose workers are used instead; they must see `root` under the same path and have
-    one thread each. Raises what a cell raises; InputError if the scheduler does not answer or its
-    workers do not fit, and if a cell's worker is killed repeatedly. Finished cells are kept.
+    one thread each. Raises what a cell raises; InputError if the scheduler does not answer or is
+    lost, its workers do not fit, or a cell's worker is killed repeatedly. Finished cells are kept.
     """
     root = root.resolve()  # workers may have another current folder
     by_name = {cell.name: cell for cell in cells}
@@ -136,7 +137,13 @@ def run_cells(
     elif left:
         threads = None if scheduler else max(1, len(os.sched_getaffinity(0)) // workers)
         with _client(workers, scheduler) as client:
-            _run_in_workers(root, left, results, report, client, threads)
+            try:
+                _run_in_workers(root, left, results, report, client, threads)
+            except CancelledError:
+                raise InputError(
+                    "the connection to the Dask scheduler is lost; finished cells are kept: run "
+                    "the same command again when the scheduler is there"
+                ) from None
     return {cell.name: results[cell.name] for cell in ordered}
 
 
@@ -154,7 +161,8 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
         "distributed.nanny.pre-spawn-environ.OMP_WAIT_POLICY": "passive",
     }
     silent = logging.CRITICAL + 1  # killed workers are retried, and errors of cells are raised
-    loggers = [logging.getLogger(name) for name in ("distributed", "tornado.application")]
+    names = ("distributed", "distributed.client", "tornado.application")
+    loggers = [logging.getLogger(name) for name in names]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(silent)

@@ -8,7 +8,7 @@ import pytest
 from mgs.errors import InputError
 from mgs.fit import density, fitting
 from mgs.fit.density import Slopes, adapt
-from mgs.fit.fitting import fit
+from mgs.fit.fitting import fit_gaussians
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.rotation import rotmat_from_quat
 from mgs.splat import reference, render
@@ -113,7 +113,7 @@ def test_slopes_are_those_of_the_reference(scene, monkeypatch):
     monkeypatch.setattr(fitting, "slopes_of", lambda sums, *_: found.append(sums) or 1 / 0)
     train = TrainSettings(means="free", density="adaptive", rates=RATES | {"mean": 0.0}, passes=4)
     with pytest.raises(ZeroDivisionError):
-        fit(model, [camera], [target], train)
+        fit_gaussians(model, [camera], [target], train)
     ((norms, drawn),) = found
     projected = reference.project(model, camera)
 
@@ -158,7 +158,7 @@ def test_a_fit_of_changing_number_repeats_bitwise(scene, monkeypatch, optimiser)
         directional_rate=0.5,
     )
     prior = {"scale": 1.0, "colour": np.full((1, 4, 1), 0.1)}
-    one, two = (fit(start, [camera], [target], train, lam=prior) for _ in range(2))
+    one, two = (fit_gaussians(start, [camera], [target], train, lam=prior) for _ in range(2))
     assert one.gaussians == two.gaussians
     assert one.losses == two.losses
     assert 300 < len(one.gaussians) <= 420
@@ -166,4 +166,4 @@ def test_a_fit_of_changing_number_repeats_bitwise(scene, monkeypatch, optimiser)
     assert np.abs(one.gaussians.sh[:, 1:]).max() > 0
     learns = {"colour": np.ones((300, 1, 1))}  # masks of Gaussians that may be removed
     with pytest.raises(InputError, match="all learn"):
-        fit(start, [camera], [target], train, learns=learns)
+        fit_gaussians(start, [camera], [target], train, learns=learns)

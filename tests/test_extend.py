@@ -6,20 +6,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
-import tiny
-
-from mgs.data.dataset import load_dataset
-
 ROOT = Path(__file__).parent.parent
 USE = """
-import sys
 import numpy as np
-from pathlib import Path
 from mgs import runtime
 runtime.start()
 import mitsuba as mi
-from mgs.data.sources import read_source
 from mgs.fit.losses import LOSSES
 from mgs.metrics import METRICS, compare
 from mgs.run.policies import POLICIES
@@ -30,8 +22,6 @@ assert scores.tolist() == [1, 3]
 one, two = mi.Float([1, 2, 3]), mi.Float([1, 4, 0])
 assert LOSSES["absolute"](one, two, mi.Float(1), (1, 1, 3), True).numpy().tolist() == [0, 2, 3]
 assert "halved" in ESTIMATORS
-shots = read_source(Path(sys.argv[1])).shots
-assert len(shots) == 12
 white = np.ones((16, 16, 4))
 metrics = compare(white, np.zeros((16, 16, 3)), np.ones((16, 16), bool), np.ones((16, 16)))
 assert list(metrics) == list(METRICS)
@@ -42,17 +32,10 @@ assert abs(metrics["mae"] - 1) < 1e-6
 def test_each_diff_touches_one_file_and_what_they_add_works(tmp_path):
     page = (ROOT / "docs/howto/extend.md").read_text()
     diffs = re.findall(r"```diff\n(.*?)```", page, re.DOTALL)
-    assert len(diffs) == 5
+    assert len(diffs) == 4
     shutil.copytree(ROOT / "mgs", tmp_path / "mgs", ignore=shutil.ignore_patterns("__pycache__"))
     for diff in diffs:
         assert diff.count("\n+++ ") == 1
         command = ["git", "apply", "--unidiff-zero", "-"]
         subprocess.run(command, input=diff, text=True, cwd=tmp_path, check=True)
-    root = tiny.write_dataset(tmp_path / "data")
-    lines = []
-    for frame in load_dataset(root).frames:
-        pose = np.linalg.inv(frame.camera.world_to_camera)[:3].ravel()
-        lines.append(" ".join([f"images/{frame.name}.png", *map(repr, pose.tolist())]))
-    (root / "poses.cams").write_text("\n".join(lines))
-    command = [sys.executable, "-c", USE, root / "poses.cams"]
-    subprocess.run(command, cwd=tmp_path, check=True)
+    subprocess.run([sys.executable, "-c", USE], cwd=tmp_path, check=True)

@@ -39,6 +39,7 @@ def test_every_extra_names_its_packages_and_all_has_them():
         package = DISTRIBUTIONS.get(module, module).lower().replace("_", "-")
         assert package in packages(extras[extra])
         assert package not in packages(PROJECT["dependencies"])
+    assert set(EXTRAS.values()) == set(extras) - {"all"}  # `mgs doctor` lists them
     (every,) = extras["all"]
     assert set(every[4:-1].split(",")) == set(extras) - {"all"}
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import correlate1d
 
 from mgs.colour import srgb_from_linear
-from mgs.fit.fitting import fit
+from mgs.fit.fitting import fit_gaussians
 from mgs.fit.losses import LOSSES, similarity
 from mgs.fit.settings import TrainSettings
 from mgs.memory import padded
@@ -92,7 +92,9 @@ def test_a_fit_lowers_l1_and_dssim():
     rgb = np.asarray(render(model, camera).rgb)
     target = np.dstack([rgb, np.ones(rgb.shape[:2])]).astype(np.float32)
     model.sh[:] = 0
-    found = fit(model, [camera], [target], TrainSettings(loss="l1-dssim", passes=8, tolerance=0))
+    found = fit_gaussians(
+        model, [camera], [target], TrainSettings(loss="l1-dssim", passes=8, tolerance=0)
+    )
     grey = np.asarray(render(model, camera).rgb, np.float64)
     assert found.losses[0] == pytest.approx(
         slow_loss(grey, rgb, np.ones_like(rgb)).mean(), rel=1e-4

@@ -12,7 +12,7 @@ from mgs import scene as scene_module
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
-from mgs.fit.fitting import fit
+from mgs.fit.fitting import fit_gaussians
 from mgs.fit.objective import objective
 from mgs.fit.settings import MEAN_RATE, TrainSettings
 from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
@@ -77,12 +77,12 @@ LAM = {
 def fitted(begun, cameras, targets, train, start=None):
     """A fit from `begun`; start: the mean of the prior, by default the same."""
     start = begun if start is None else start
-    return fit(begun, cameras, targets, train, start=start, lam=LAM)
+    return fit_gaussians(begun, cameras, targets, train, start=start, lam=LAM)
 
 
 def test_frozen_is_the_default_and_ignores_the_lam_of_means(cameras, targets):
     start, lam = ball(0.05), {kind: value for kind, value in LAM.items() if kind != "mean"}
-    plain = fit(start, cameras, targets, TrainSettings(passes=3), start=start, lam=lam)
+    plain = fit_gaussians(start, cameras, targets, TrainSettings(passes=3), start=start, lam=lam)
     frozen = fitted(start, cameras, targets, settings("frozen", 3))
     assert plain.gaussians == frozen.gaussians
     assert plain.losses == frozen.losses
@@ -126,7 +126,7 @@ def test_displaced_means_move_back_to_the_surface(cameras, targets):
 
 def test_a_rate_that_is_missing_is_named(cameras, targets):
     with pytest.raises(InputError, match=r"train.rates: has no rate of mean"):
-        fit(ball(), cameras, targets, TrainSettings(means="free"))
+        fit_gaussians(ball(), cameras, targets, TrainSettings(means="free"))
     wanted = NbvSettings(dataset=".", prior=".", train=TrainSettings(means="free"))
     with pytest.raises(InputError, match="prior_std: has no number for mean"):
         wanted.regularisation(groups(0, "free"))
@@ -185,7 +185,7 @@ def test_criteria_see_the_means_and_coverage_does_not(files, whole):
 
 def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, monkeypatch):
     out, state = whole
-    real, calls = scene_module.fit, []
+    real, calls = scene_module.fit_gaussians, []
 
     def struck(*arguments):
         calls.append(1)
@@ -193,7 +193,7 @@ def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, mon
             raise KeyboardInterrupt
         return real(*arguments)
 
-    monkeypatch.setattr(scene_module, "fit", struck)
+    monkeypatch.setattr(scene_module, "fit_gaussians", struck)
     with pytest.raises(KeyboardInterrupt):
         run_nbv(files[0], tmp_path / "run", **options(files, "free"))
     resumed = resume_nbv(tmp_path / "run").state

@@ -7,7 +7,7 @@ import pytest
 
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
-from mgs.fit.fitting import fit
+from mgs.fit.fitting import fit_gaussians
 from mgs.fit.objective import objective
 from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians, learned
@@ -124,9 +124,9 @@ def test_a_start_in_the_memory_of_the_model_is_kept_apart():
     model = surface_gaussians(50)
     images = model, [surface_camera(model, 24, 20)], [UNSEEN]
     settings = TrainSettings(optimiser="adam", passes=1, rates={"colour": 0.01})
-    fit(*images, settings, start=model, lam={"colour": 1.0})
+    fit_gaussians(*images, settings, start=model, lam={"colour": 1.0})
     other = replace(model, sh=model.sh - 0.2)
-    moved = fit(*images, settings, start=other, lam={"colour": 1.0}).gaussians
+    moved = fit_gaussians(*images, settings, start=other, lam={"colour": 1.0}).gaussians
     assert np.allclose(moved.sh - model.sh, -0.01, rtol=0.02)
 
 
@@ -144,7 +144,7 @@ def test_a_lam_for_each_degree_of_the_colours():
     diagonal = np.asarray(goal.diagonal(as_drjit(blind))[0])
     assert np.allclose(diagonal, np.broadcast_to(lam, away.shape))
     settings = TrainSettings(passes=40, rates={"colour": 0.2})
-    found = fit(model, [camera], [UNSEEN], settings, start=start, lam={"colour": lam})
+    found = fit_gaussians(model, [camera], [UNSEEN], settings, start=start, lam={"colour": lam})
     assert found.losses[0] == pytest.approx((lam * away**2).sum() / UNSEEN[..., :3].size, rel=1e-5)
     assert found.loss < 0.05 * found.losses[0]
 

@@ -11,6 +11,7 @@ import pytest
 import synthetic
 
 import mgs
+from mgs.data.sources import RECORDINGS
 from mgs.run.policies import POLICIES
 from mgs.splat import ESTIMATORS
 from mgs.synth import rendering
@@ -56,7 +57,7 @@ def quick(monkeypatch, coarse_arena, coarse_priors, short_fits):
 @pytest.fixture
 def tables_restored():
     """Remove the rows and the module that a page adds."""
-    tables = [(table, dict(table)) for table in (POLICIES, ESTIMATORS)]
+    tables = [(table, dict(table)) for table in (POLICIES, ESTIMATORS, RECORDINGS)]
     yield
     for table, rows in tables:
         table.clear()
@@ -95,10 +96,12 @@ def test_the_tutorial_prints_the_words_that_it_shows(pages, tmp_path):
 
 
 def test_the_notebooks_are_their_pages(pages):
-    """Their code cells are the blocks that the tests of the pages execute."""
+    """Their code cells are the blocks that the tests of the pages execute; commands run by the
+    kernel's Python, whatever its PATH is."""
     for page in pages.NOTEBOOKS:
         made = pages.notebook(page.read_text())
         assert page.with_suffix(".ipynb").read_text() == made, "run python tools/pages.py --write"
+        assert not re.search(r'"!(mgs|python)\b', made)
 
 
 @pytest.mark.parametrize("page", HOWTO, ids=lambda page: page.stem)

@@ -28,7 +28,7 @@ from mgs.fit.evidence import (
     regularisation,
     worth,
 )  # fmt: skip
-from mgs.fit.fitting import fit
+from mgs.fit.fitting import fit_gaussians
 from mgs.fit.settings import TrainSettings
 from mgs.gaussians import LEARNED
 from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD
@@ -121,15 +121,15 @@ def test_only_those_gaussians_learn_a_kind_that_are_asked_to(optimiser):
     train = TrainSettings(passes=3, optimiser=optimiser)
     some, n = np.arange(len(start)) % 3 == 0, len(start)
     masks = {"scale": some[:, None], "opacity": some}
-    found = fit(start, cameras, targets, train, learns=masks).gaussians
-    whole = fit(start, cameras, targets, train).gaussians
+    found = fit_gaussians(start, cameras, targets, train, learns=masks).gaussians
+    whole = fit_gaussians(start, cameras, targets, train).gaussians
     assert np.array_equal(found.log_scales[~some], start.log_scales[~some])
     assert np.array_equal(found.logit_opacities[~some], start.logit_opacities[~some])
     moved = (whole.log_scales != start.log_scales).any(axis=1)
     assert moved.sum() > 100
     assert np.array_equal((found.log_scales != start.log_scales).any(axis=1), moved & some)
     everyone = {"scale": np.ones((n, 1), bool), "colour": np.ones((n, 1, 1), bool)}
-    assert fit(start, cameras, targets, train, learns=everyone).gaussians == whole
+    assert fit_gaussians(start, cameras, targets, train, learns=everyone).gaussians == whole
 
 
 def test_scales_are_learned_where_they_are_wrong():

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from importlib import import_module
 
@@ -243,3 +244,25 @@ def test_a_scheduler_whose_workers_will_not_do_is_one_clear_line(
         pytest.raises(InputError, match=fault),
     ):
         run_cells(tmp_path, [cell("a", x=1)], silent, scheduler=cluster.scheduler_address)
+
+
+SLEEP = Cell("sleep", "test_sweep:sleep")
+
+
+def sleep(root, out):
+    """A task that outlives its scheduler."""
+    time.sleep(3)
+    return {}
+
+
+def test_a_lost_scheduler_is_one_line(tmp_path, caplog):
+    options = {"n_workers": 1, "threads_per_worker": 1, "host": "127.0.0.1", "memory_limit": 0}
+    silence = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL + 1}
+    with LocalCluster(**options, **silence) as cluster:
+
+        def lose(*_):
+            threading.Timer(0.2, cluster.close).start()
+
+        with pytest.raises(InputError, match="the connection to the Dask scheduler is lost"):
+            run_cells(tmp_path, [SLEEP], lose, scheduler=cluster.scheduler_address)
+    assert [one.name for one in caplog.records if one.name == "distributed.client"] == []

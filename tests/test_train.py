@@ -8,7 +8,7 @@ import pytest
 
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
-from mgs.fit.fitting import COLOUR_MIN, fit
+from mgs.fit.fitting import COLOUR_MIN, fit_gaussians
 from mgs.fit.optimisers import ADAM_EPSILON
 from mgs.fit.settings import TrainSettings
 from mgs.fit.stopping import LOSS_FLOOR, StopReason, stop_reason
@@ -69,7 +69,9 @@ def derivative(start: Gaussians, camera: Camera, target: np.ndarray, i: int) -> 
 
 def test_fit_lowers_the_loss_a_hundredfold_and_reports_it(truth, cameras, targets):
     start, rates = grey(truth), rates_of(0.05, 0.01, 0.01, 0.02)
-    found = fit(start, cameras, targets, TrainSettings(passes=60, tolerance=0.0, rates=rates))
+    found = fit_gaussians(
+        start, cameras, targets, TrainSettings(passes=60, tolerance=0.0, rates=rates)
+    )
     assert found.stop_reason == "pass-limit"
     assert (found.passes, found.iterations) == (60, 180)
     after = mean_square(found.gaussians, cameras, targets)
@@ -87,7 +89,7 @@ def test_alpha_as_a_channel_makes_alpha_right(truth, cameras, targets):
 
     def error(weight):
         settings = TrainSettings(passes=20, tolerance=0.0, alpha_weight=weight)
-        found = fit(start, cameras, with_alpha, settings).gaussians
+        found = fit_gaussians(start, cameras, with_alpha, settings).gaussians
         drawn = [np.asarray(render(found, camera).alpha) for camera in cameras]
         return float(np.mean([np.abs(d - a).mean() for d, a in zip(drawn, alphas, strict=True)]))
 
@@ -98,7 +100,7 @@ def test_one_step_is_adam_on_the_gradient_of_the_summed_squared_error(truth, cam
     """The first step is minus the rate times g / (|g| + epsilon)."""
     start = grey(truth)
     settings = TrainSettings(optimiser="adam", passes=1, rates=rates_of(0.02))
-    found = fit(start, cameras[:1], targets[:1], settings)
+    found = fit_gaussians(start, cameras[:1], targets[:1], settings)
     step = (found.gaussians.sh - start.sh)[:, 0, 0]
     for i in np.argsort(-np.abs(step))[:3]:
         g = derivative(start, cameras[0], targets[0], i)
@@ -117,7 +119,7 @@ def test_one_step_is_natural_on_the_gradient_of_the_objective(truth, cameras, ta
         sh=np.full_like(truth.sh, 0.2),
     )
     settings, camera, target = TrainSettings(passes=1, rates=rates_of(0.01)), cameras[0], targets[0]
-    found = fit(begun, [camera], [target], settings, start=start, lam=lam)
+    found = fit_gaussians(begun, [camera], [target], settings, start=start, lam=lam)
     prior = sum(
         weight * ((getattr(begun, name) - getattr(start, name)) ** 2).sum()
         for name, weight in zip(LEARNED, lam.values(), strict=True)
@@ -137,7 +139,7 @@ def test_one_step_is_natural_on_the_gradient_of_the_objective(truth, cameras, ta
 
 def test_what_no_image_shows_stays_where_the_prior_put_it(truth, cameras, targets):
     start = grey(truth)
-    found = fit(start, cameras[:1], targets[:1], TrainSettings(passes=1))
+    found = fit_gaussians(start, cameras[:1], targets[:1], TrainSettings(passes=1))
     hidden = fisher(start, cameras[0])[:, 0] == 0
     assert hidden.sum() > 20
     for name in LEARNED:
@@ -151,17 +153,19 @@ def test_colours_learn_one_more_sh_degree_after_some_steps(truth, cameras, targe
     """As in 3DGS; here after each pass."""
     start = grey(truth).with_degree(2)
     train = TrainSettings(passes=degree + 1, tolerance=0, sh_steps=len(cameras))
-    learned = (fit(start, cameras, targets, train).gaussians.sh != start.sh).any(axis=(0, 2))
+    learned = (fit_gaussians(start, cameras, targets, train).gaussians.sh != start.sh).any(
+        axis=(0, 2)
+    )
     assert np.array_equal(learned, np.arange(9) < (degree + 1) ** 2)
 
 
 def test_fit_repeats_bitwise_and_owes_nothing_to_a_used_cache(truth, cameras, targets):
     settings, cache = TrainSettings(passes=5), ListCache()
-    first = fit(grey(truth), cameras, targets, settings, cache=cache)
-    again = fit(grey(truth), cameras, targets, settings, cache=cache)
+    first = fit_gaussians(grey(truth), cameras, targets, settings, cache=cache)
+    again = fit_gaussians(grey(truth), cameras, targets, settings, cache=cache)
     assert first.loss == again.loss
     assert same(first.gaussians, again.gaussians)
-    other = fit(grey(truth), cameras, targets, TrainSettings(passes=5, seed=1))
+    other = fit_gaussians(grey(truth), cameras, targets, TrainSettings(passes=5, seed=1))
     assert not np.array_equal(first.gaussians.sh, other.gaussians.sh)
 
 
@@ -172,7 +176,7 @@ def faster(factor: float, **values) -> TrainSettings:
 
 
 def test_a_fit_whose_loss_rises_has_diverged(truth, cameras, targets):
-    found = fit(grey(truth), cameras, targets, faster(1000))
+    found = fit_gaussians(grey(truth), cameras, targets, faster(1000))
     assert found.stop_reason == StopReason.DIVERGED
     assert found.losses[0] == pytest.approx(mean_square(grey(truth), cameras, targets), rel=1e-5)
     assert min(found.losses[-5:]) > 1.5 * found.losses[0]
@@ -183,7 +187,7 @@ def test_a_fit_whose_loss_rises_has_diverged(truth, cameras, targets):
 @pytest.mark.parametrize("views", [1, 3])
 def test_a_fit_that_leaves_the_numbers_returns_what_it_was_given(truth, cameras, targets, views):
     start = grey(truth)
-    found = fit(start, cameras[:views], targets[:views], faster(1e40, optimiser="adam"))
+    found = fit_gaussians(start, cameras[:views], targets[:views], faster(1e40, optimiser="adam"))
     assert (found.stop_reason, found.passes) == (StopReason.DIVERGED, 1)
     assert np.isnan(found.losses[1])
     assert found.loss == found.losses[0]
@@ -191,11 +195,11 @@ def test_a_fit_that_leaves_the_numbers_returns_what_it_was_given(truth, cameras,
 
 
 def test_the_model_of_the_lowest_loss_is_kept(truth, cameras, targets):
-    long = fit(grey(truth), cameras, targets, faster(50, passes=8, decay=1.0))
+    long = fit_gaussians(grey(truth), cameras, targets, faster(50, passes=8, decay=1.0))
     best = int(np.argmin(long.losses[1:])) + 1
     assert best < long.passes
     assert long.loss == long.losses[best] < long.losses[-1]
-    short = fit(grey(truth), cameras, targets, faster(50, passes=best, decay=1.0))
+    short = fit_gaussians(grey(truth), cameras, targets, faster(50, passes=best, decay=1.0))
     assert short.losses == long.losses[: best + 1]
     assert same(short.gaussians, long.gaussians)
 
@@ -235,7 +239,7 @@ def test_what_is_refused_for_another_reason_than_its_numbers_is_no_divergence(
 ):
     monkeypatch.setattr("mgs.splat.blocks.MAX_PAIRS", 4)
     with pytest.raises(InputError, match="pairs"):
-        fit(grey(truth), cameras, targets, TrainSettings(passes=1))
+        fit_gaussians(grey(truth), cameras, targets, TrainSettings(passes=1))
 
 
 def test_colours_stay_above_zero_and_none_is_dead(truth, cameras, targets):
@@ -243,12 +247,12 @@ def test_colours_stay_above_zero_and_none_is_dead(truth, cameras, targets):
     start = grey(truth)
     black = [np.zeros_like(target) for target in targets]
     fast = TrainSettings(passes=40, tolerance=0.0, rates=rates_of(0.2))
-    dark = fit(start, cameras, black, fast).gaussians
+    dark = fit_gaussians(start, cameras, black, fast).gaussians
     seen = sum(fisher(start, camera)[:, 0] for camera in cameras) > 1
     rgb = 0.5 + 0.28209479 * dark.sh[:, 0]
     assert rgb.min() == pytest.approx(COLOUR_MIN, rel=0.01)
     assert np.allclose(rgb[seen], COLOUR_MIN, rtol=0.01)
-    bright = fit(dark, cameras, targets, fast).gaussians
+    bright = fit_gaussians(dark, cameras, targets, fast).gaussians
     assert mean_square(bright, cameras, targets) < 0.05 * mean_square(dark, cameras, targets)
     assert (0.5 + 0.28209479 * bright.sh[seen, 0]).min() >= 0.99 * COLOUR_MIN
 
@@ -256,7 +260,7 @@ def test_colours_stay_above_zero_and_none_is_dead(truth, cameras, targets):
 def test_a_start_of_another_shape_is_refused(truth, cameras, targets):
     richer = replace(truth, sh=np.zeros((len(truth), 4, 3)))
     with pytest.raises(InputError, match="start: has colours of shape"):
-        fit(truth, cameras, targets, TrainSettings(passes=1), start=richer)
+        fit_gaussians(truth, cameras, targets, TrainSettings(passes=1), start=richer)
 
 
 @pytest.mark.parametrize(
@@ -271,4 +275,4 @@ def test_a_start_of_another_shape_is_refused(truth, cameras, targets):
 )
 def test_unusable_settings_are_refused(truth, values, words):
     with pytest.raises(InputError, match=words):
-        fit(truth, [], [], TrainSettings(**values))
+        fit_gaussians(truth, [], [], TrainSettings(**values))

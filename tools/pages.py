@@ -122,8 +122,11 @@ def alike(shown: str, printed: str) -> bool:
 
 
 def notebook(page: str) -> str:
-    """Return a page as a Jupyter notebook: its blocks are code cells with their output. A file is
-    written by `%%writefile`, a command runs after `!`."""
+    """Return a page as a Jupyter notebook: its blocks are code cells with their output.
+
+    A file is written by `%%writefile`. Commands run after `!` by the kernel's own Python, since its
+    PATH may lead to none or another.
+    """
     cells: list[dict[str, Any]] = []
 
     def add(kind: str, source: str, **more: Any) -> None:
@@ -143,7 +146,9 @@ def notebook(page: str) -> str:
             if match["title"] is not None:
                 body = f"%%writefile {match['title']}\n{body}"
             elif match["language"] == "sh":
-                body = re.sub(r"^(?=\S)", "!", body, flags=re.MULTILINE)
+                body = re.sub(r"^mgs ", '!"{sys.executable}" -m mgs ', body, flags=re.MULTILINE)
+                body = re.sub(r"^python ", '!"{sys.executable}" ', body, flags=re.MULTILINE)
+                body = "import sys\n\n" + body
             add("code", body, execution_count=None, outputs=[])
         end = match.end()
     add("markdown", page[end:])

@@ -17,7 +17,7 @@ from mgs.data.clouds import write_cloud
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, resumes, write_transforms
 from mgs.data.frames import Frame
 from mgs.data.lens import Undo, read_fitting, shrunk, undistorter
-from mgs.data.meshes import Mesh
+from mgs.data.meshes import Mesh, read_mesh
 from mgs.data.rock_image import premultiplied, write_rock_image
 from mgs.data.shots import Shot, Source
 from mgs.data.sources import find_image
@@ -67,9 +67,8 @@ def import_source(
         shots = [replace(shot, mask=None, rock=None) for shot in shots]
         from mgs.data.raycast import mesh_in_sight  # imported here because it loads Mitsuba
 
-        silhouette = silhouette_of(
-            mesh_in_sight(mesh, [shot.camera for shot in shots], World(origin=source.origin))
-        )
+        cameras, world = [shot.camera for shot in shots], World(origin=source.origin)
+        silhouette = silhouette_of(mesh_in_sight(read_mesh(mesh), cameras, world, mesh))
     asked = {
         "kind": source.kind,
         "frames": len(shots),

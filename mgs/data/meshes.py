@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -101,7 +102,7 @@ def load_mesh(path: str | Path, coloured: bool = True) -> trimesh.Trimesh:
     return mesh
 
 
-def _check(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+def _check(path: object, vertices: np.ndarray, faces: np.ndarray) -> None:
     """Raise InputError as `load_mesh` for unusable vertices and faces."""
     if len(faces) == 0:
         raise InputError(f"{path}: has no faces; give a triangle mesh, not points or lines")
@@ -185,14 +186,24 @@ def read_mesh(path: str | Path) -> Mesh:
     wound as their neighbours, and outwards. Raises InputError as `load_mesh`.
     """
     path = Path(path)
-    if known := _plain_ply(path):
-        _check(path, *known)
-    else:
+    known = _plain_ply(path)
+    if not known:
         mesh = load_mesh(path, coloured=False)
         known = mesh.vertices, mesh.faces
-    vertices, faces = np.asarray(known[0], np.float64), np.asarray(known[1], np.int64)
+    vertices, faces = known
     if path.suffix.lower() in GLTF:
         vertices = vertices @ WORLD_FROM_GLTF[:3, :3].T
+    return mesh_of(vertices, faces, path)
+
+
+def mesh_of(corners: ArrayLike, triangles: ArrayLike, where: object = "mesh") -> Mesh:
+    """One clean surface of vertices [V,3] and faces [F,3], as `read_mesh`. where: begins a
+    message."""
+    try:
+        vertices, faces = np.array(corners, np.float64), np.array(triangles, np.int64)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: vertices and faces must be arrays of numbers") from None
+    _check(where, vertices, faces)
     faces = faces[distinct_faces(vertices, faces)]
     place = _places(vertices)
     faces = np.where(_wound_against(place[faces])[:, None], faces[:, ::-1], faces)

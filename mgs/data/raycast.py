@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +13,7 @@ from mgs import runtime
 from mgs.camera import Camera
 from mgs.data.clouds import towards
 from mgs.data.lens import shrunk_to
-from mgs.data.meshes import Mesh, read_mesh
+from mgs.data.meshes import Mesh
 from mgs.data.world import World
 from mgs.errors import InputError
 from mgs.memory import padded
@@ -23,14 +22,15 @@ SMALL = 40_000
 """Pixels of a picture in which a mesh is searched."""
 
 
-def mesh_in_sight(path: Path, cameras: Sequence[Camera], world: World) -> Mesh:
-    """Read a mesh, move it to a dataset of this world (`towards`, `World.enter`), and check that it
-    is in some picture.
+def mesh_in_sight(
+    mesh: Mesh, cameras: Sequence[Camera], world: World, where: object = "mesh"
+) -> Mesh:
+    """Move a mesh to a dataset of this world (`towards`, `World.enter`), and check that it is in
+    some picture.
 
-    Raises InputError as `read_mesh`, and if none of a few cameras sees the mesh, or all are inside,
-    as happens with another unit or other axes.
+    where: begins a message. Raises InputError if none of a few cameras sees the mesh, or all are
+    inside, as happens with another unit or other axes.
     """
-    mesh = read_mesh(path)
     mesh = replace(mesh, vertices=world.enter(towards(mesh.vertices, world.origin)))
     depth, some = mesh_depth(mesh), cameras[:: max(1, len(cameras) // 4)]
     hits = [depth(shrunk_to(camera, SMALL)[0]) > 0 for camera in some]
@@ -41,7 +41,7 @@ def mesh_in_sight(path: Path, cameras: Sequence[Camera], world: World) -> Mesh:
     size = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     near = min(float(np.linalg.norm(camera.position - mesh.vertices.mean(0))) for camera in some)
     raise InputError(
-        f"{path}: the mesh is in no picture, or around all cameras: it is {size:.3g} across, and "
+        f"{where}: the mesh is in no picture, or around all cameras: it is {size:.3g} across, and "
         f"the nearest camera is {near:.3g} from its middle; give it in the cameras' unit and axes"
     )
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.evaluation import render_view
-from mgs.fit.fitting import fit
+from mgs.fit.fitting import fit_gaussians
 from mgs.fit.objective import Objective, Vector, objective
 from mgs.fit.settings import ModelSettings
 from mgs.fit.stopping import StopReason
@@ -50,7 +50,7 @@ class Images:
     """Input of a fit to V views.
 
     targets: of each view, [H,W,4] with the weights of the pixels, or [H,W,5] with alpha after them
-    (`mgs.fit.fitting.fit`). start(views): the Gaussians before training, of degree 0, in the
+    (`mgs.fit_gaussians`). start(views): the Gaussians before training, of degree 0, in the
     colours of these views (indices). order: [V] indices of the views by azimuth.
     """
 
@@ -274,11 +274,11 @@ def fitted(
 ) -> Gaussians:
     """Fit some views (indices) from the start; return the Gaussians.
 
-    kept: as `LeanModel.learned`; None: all is learned. Raises InputError as `mgs.fit.fitting.fit`,
+    kept: as `LeanModel.learned`; None: all is learned. Raises InputError as `mgs.fit_gaussians`,
     and if the fit diverges.
     """
     start, train = images.start(views).with_degree(degree), settings.train
-    found = fit(
+    found = fit_gaussians(
         start,
         [images.cameras[i] for i in views],
         Deferred(views, lambda i: images.targets[i]),

@@ -17,7 +17,7 @@ from mgs.camera import Camera
 from mgs.colour import SH_C0
 from mgs.errors import InputError, row_named
 from mgs.fit.density import DENSITIES, controlled, slopes_of
-from mgs.fit.losses import LOSSES
+from mgs.fit.losses import LOSSES, Loss, loss_name
 from mgs.fit.objective import (
     Objective,
     ParameterPrior,
@@ -121,7 +121,7 @@ def _step(
     return _in_bounds(replace(model, **moved)), kept, dr.detach(loss), slopes
 
 
-def fit(
+def fit_gaussians(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     targets: Sequence[np.ndarray],
@@ -131,6 +131,7 @@ def fit(
     start: Gaussians | None = None,
     lam: Mapping[str, float | np.ndarray] | None = None,
     learns: Mapping[str, np.ndarray] | None = None,
+    loss: Loss | None = None,
 ) -> Fit:
     """Fit Gaussians to images by lowering Phi (`mgs.fit.objective`). The result depends on the
     arguments alone, bitwise.
@@ -147,6 +148,9 @@ def fit(
     learns: masks of the Gaussians that learn a kind of parameter, broadcast to its shape ([N],
         [N,1] or, for colours, [N,K,1]). The others keep their values, except colours below
         COLOUR_MIN. Default: all learn.
+    loss: a function in place of `settings.loss` (`mgs.fit.losses.Loss`): loss(drawn, pixels,
+        weights, size, linear) of Dr.Jit arrays, which differentiates it. It is recorded once, so it
+        must depend on its arguments alone.
 
     Raises InputError if a parameter is not finite, optimiser or loss are unknown, `start` has
     another shape, means are to move without a rate, or a required alpha is missing.
@@ -162,7 +166,9 @@ def fit(
             f"train.rates: has no rate of {missing[0]}, which is learned; give one, metres"
         )
     model, how = as_drjit(gaussians), (settings.means, settings.alpha_weight)
-    goal = objective(gaussians, cameras, targets, start, lam, cache, *how, settings.loss)
+    goal = objective(
+        gaussians, cameras, targets, start, lam, cache, *how, loss_name(loss or settings.loss)
+    )
     buffers = [
         [dr.zeros(mi.TensorXf, offset.shape) for _ in range(optimiser.buffers)]
         for offset, _ in goal.offsets(model)
@@ -191,12 +197,12 @@ def fit(
         rates = _rates(settings, shapes, learns or {}, done, len(cameras))
         order = rng.permutation(len(goal.photos))
         learning = buffers, information, rates, slopes
-        model, buffers, loss, slopes = _pass(
+        model, buffers, mean, slopes = _pass(
             goal, settings.optimiser, model, order, *learning, done * len(order)
         )
-        if loss <= min(losses[1:], default=np.inf):  # false for NaN
+        if mean <= min(losses[1:], default=np.inf):  # false for NaN
             best = model
-        losses.append(loss)
+        losses.append(mean)
         if on_pass:
             on_pass(done + 1, settings.passes)
         tolerance = 0.0 if done < end else settings.tolerance
@@ -214,7 +220,8 @@ def _rates(
     images: int,
 ) -> list[Any]:
     """Rate of each kind of parameter, of these shapes, after some passes over the images: a Float
-    of one number or one per parameter. learns: as in `fit`."""
+    of one number or one per parameter. learns: as in
+    `fit_gaussians`."""
     fall, found = settings.decay ** (done / max(settings.passes - 1, 1)), []
     for kind, shape in shapes.items():
         rate: Any = settings.rates[kind] * (1.0 if kind in settings.steady_rates else fall)

@@ -57,6 +57,16 @@ LOSSES: dict[str, Loss] = {"squared": squared, "l1-dssim": l1_dssim}
 """Losses by name."""
 
 
+def loss_name(loss: str | Loss) -> str:
+    """Name of a loss. A function is added to LOSSES, since recorded kernels have a loss by its
+    name."""
+    if isinstance(loss, str):
+        return loss
+    name = f"{getattr(loss, '__name__', 'loss')} {id(loss)}"
+    LOSSES.setdefault(name, loss)
+    return name
+
+
 def _encoded(values: Any, size: Size) -> Any:
     """Colours, linear RGB, as sRGB. The curve goes on above 1, where a render can be."""
     curve = 1.055 * dr.power(dr.maximum(values, 0.0031308), 1 / 2.4) - 0.055

@@ -51,7 +51,7 @@ Vector = list[Any]
 class Target:
     """Target of a fit as the kernels take it.
 
-    values: mi.Float [H*W*S], with S = 3 to 5 channels as in `mgs.fit.fitting.fit`.
+    values: mi.Float [H*W*S], with S = 3 to 5 channels as in `mgs.fit.fitting.fit_gaussians`.
     alpha_factor: factor of the differences in alpha, mi.Float [1]; None: alpha is not compared.
     stored: S.
     """
@@ -279,7 +279,7 @@ def objective(
     alpha_weight: float = 0.0,
     error: str = "squared",
 ) -> Objective:
-    """The objective of `mgs.fit.fitting.fit`, from the same arguments and settings.
+    """The objective of `mgs.fit.fitting.fit_gaussians`, from the same arguments and settings.
 
     error: a name in LOSSES. Raises InputError if it is unknown, the start does not fit the
     Gaussians, or `means` is not a name in `mgs.splat.MEANS`. A target without alpha, where
@@ -288,7 +288,7 @@ def objective(
     groups(gaussians.sh_degree, means)  # raises if the name is unknown
     row_named(LOSSES, error, "loss")
     if len(cameras) != len(targets):
-        raise ValueError(f"there are {len(cameras)} cameras, but {len(targets)} targets")
+        raise InputError(f"fit: there are {len(cameras)} cameras, but {len(targets)} targets")
 
     def photo(i: int) -> Photo:
         return _photo(gaussians, cameras[i], targets[i], alpha_weight)
@@ -325,9 +325,13 @@ def filled(values: float | np.ndarray, shape: tuple[int, ...]) -> Any:
 
 
 def _photo(gaussians: Gaussians, camera: Camera, target: np.ndarray, alpha_weight: float) -> Photo:
-    """A `Photo` from a target of `fit`, in the space in which the Gaussians are blended. Raises
-    InputError if alpha has a weight and the target has no alpha."""
-    factor, stored = None, target.shape[-1]
+    """A `Photo` from a target of a fit, in the space in which the Gaussians are blended. Raises
+    InputError if its shape is not that of the camera, or alpha has a weight and it has no alpha."""
+    factor, target = None, np.asarray(target)
+    if target.ndim != 3 or target.shape[:2] != (camera.height, camera.width):
+        size = f"[{camera.height},{camera.width},3 to 5], that of its camera"
+        raise InputError(f"target: has shape {list(target.shape)}, expected {size}")
+    stored = target.shape[-1]
     if alpha_weight:
         if stored < 5:
             raise InputError(

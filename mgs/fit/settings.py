@@ -53,7 +53,7 @@ def complete(given: Any, defaults: Mapping[str, float]) -> Any:
 
 
 class TrainSettings(BaseModel):
-    """Settings of `mgs.fit.fitting.fit`."""
+    """Settings of `mgs.fit.fitting.fit_gaussians`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 

@@ -69,7 +69,7 @@ def regularisation(
 
 
 def lam_by_kind(lam: Array, groups: dict[str, slice]) -> dict[str, float | Array]:
-    """lam [P] by kind of parameter, as `mgs.fit.fitting.fit` takes it: a number; for colours of
+    """lam [P] by kind of parameter, as `mgs.fit_gaussians` takes it: a number; for colours of
     degrees above 0 an array [1,K,3]. groups: as in `regularisation`."""
     by_kind: dict[str, float | Array] = {kind: float(lam[of][0]) for kind, of in groups.items()}
     colour = lam[groups["colour"]].reshape(1, -1, 3)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from plyfile import PlyData
 from scipy.ndimage import binary_dilation, binary_erosion
 
@@ -21,7 +22,7 @@ from mgs.data.clouds import SparseCloud, write_cloud
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame
 from mgs.data.lens import shrunk_to
-from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
+from mgs.data.meshes import Mesh, distances_to_mesh, mesh_of, read_mesh
 from mgs.data.visibility import in_mask, visible
 from mgs.data.world import UPRIGHT, World, unit_up
 from mgs.errors import InputError
@@ -259,30 +260,37 @@ def _samples(
 
 
 def prior_from_mesh(
-    path: str | Path, settings: PriorSettings, dataset: Dataset | None = None
+    source: str | Path | tuple[ArrayLike, ArrayLike],
+    settings: PriorSettings,
+    dataset: Dataset | None = None,
 ) -> Prior:
-    """Sample a mesh file in the coordinates of the dataset's files, all over.
+    """Sample a mesh in the coordinates of the dataset's files, all over.
 
-    The cameras of the dataset decide the number of Gaussians if the settings do not. Without a
-    dataset the mesh has +Z up, and lengths are metres. Raises InputError if the mesh cannot be read
-    or sampled, if no camera sees it, and for settings that only a cloud has: poisson_depth and
-    density.
+    source: a file, or vertices [V,3], metres, and faces [F,3], indices of vertices. The cameras of
+    the dataset decide the number of Gaussians if the settings do not. Without a dataset the mesh
+    has +Z up, and lengths are metres. Raises InputError if the mesh cannot be read or sampled, if
+    no camera sees it, and for settings that only a cloud has: poisson_depth and density.
     """
     settings.refuse_shaping("`mesh` gives one")
     from mgs.data.raycast import mesh_in_sight  # imported here because it loads Mitsuba
 
+    if isinstance(source, tuple):
+        where, mesh = "arrays", mesh_of(*source)
+    else:
+        where, mesh = str(source), read_mesh(source)
     cameras = [frame.camera for frame in dataset.frames] if dataset else []
-    mesh = mesh_in_sight(Path(path), cameras, dataset.world) if dataset else read_mesh(path)
+    if dataset:
+        mesh = mesh_in_sight(mesh, cameras, dataset.world, where)
     if settings.density is not None:
         raise InputError(
-            f"{path}: a density is relative to the voxels of a cloud, and a mesh has none; "
+            f"{where}: a density is relative to the voxels of a cloud, and a mesh has none; "
             "give a number or a spacing"
         )
     points, normals, spacing, sampled = _samples(mesh, settings, cameras)
     used = {key: getattr(settings, key) for key in ("gaussians", "spacing", "seed", "backing")}
     numbers = {
         "from": "mesh",
-        "mesh": str(path),
+        "mesh": where,
         "depth_tolerance": spacing,
         **sampled,
         **_place(dataset or Dataset(Path(), ())),

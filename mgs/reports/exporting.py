@@ -84,13 +84,13 @@ def refit_in_srgb(run: Run, progress: Callable[[int, int], None]) -> Gaussians:
     progress(done, all) is called after each pass. Raises InputError if a file of a frame or, where
     exposures differ, of the prior cannot be read.
     """
-    from mgs.fit.fitting import fit
+    from mgs.fit.fitting import fit_gaussians
 
     frames = run.taken
     gains = exposure_of(run.prior)(frames) if run.settings.exposure else np.ones((len(frames), 3))
     targets = Deferred(range(len(frames)), lambda i: without_gain(target_of(frames[i]), gains[i]))
     cameras = [frame.camera for frame in frames]
-    return fit(in_srgb(run.state.gaussians), cameras, targets, REFIT, progress).gaussians
+    return fit_gaussians(in_srgb(run.state.gaussians), cameras, targets, REFIT, progress).gaussians
 
 
 def difference(one: Gaussians, other: Gaussians) -> float:

@@ -70,11 +70,11 @@ class ByMean:
 class Moments:
     """Sums over pixels, Dr.Jit Float64 [N].
 
-    w2: of w^2. squared: moments with |s|^2. mixed: for r, g, b, moments with w s_c; empty if not
-    needed.
+    w2: for r, g, b, of w^2, the same unless pixels are weighted. squared: moments with |s|^2.
+    mixed: for r, g, b, moments with w s_c; empty if not needed.
     """
 
-    w2: Any
+    w2: list[Any]
     squared: Polynomial
     mixed: list[Polynomial]
 
@@ -197,11 +197,9 @@ def mean_product(mean: ByMean, q: Polynomial, sums: Moments) -> Any:
 def means_product(a: ByMean, b: ByMean, sums: Moments) -> Any:
     """Sum over pixels and channels of the product of the derivatives by two means."""
     total = product_sum(a.log_alpha, b.log_alpha, sums.squared)
-    for g, h, mixed in zip(a.colour, b.colour, sums.mixed, strict=False):
+    for g, h, mixed, w2 in zip(a.colour, b.colour, sums.mixed, sums.w2, strict=False):
         # sum over pixels of (s_c q_a + w g)(s_c q_b + w h), without the first term, above.
         total += (
-            h * weighted_sum(a.log_alpha, mixed)
-            + g * weighted_sum(b.log_alpha, mixed)
-            + g * h * sums.w2
+            h * weighted_sum(a.log_alpha, mixed) + g * weighted_sum(b.log_alpha, mixed) + g * h * w2
         )
     return total

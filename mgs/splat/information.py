@@ -10,18 +10,18 @@ r g b in each), 3 log-scales, 4 of the quaternion, 1 opacity logit; then 0 or 3 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mgs.camera import Camera
 from mgs.errors import InputError, row_named
 from mgs.gaussians import LEARNED, Gaussians
-from mgs.memory import check_room
+from mgs.memory import check_room, padded
 from mgs.splat import kernels
 from mgs.splat.derivatives import (
     ByMean,
@@ -33,17 +33,24 @@ from mgs.splat.derivatives import (
     product_sum,
     weighted_sum,
 )
-from mgs.splat.projection import camera_array, project64
+from mgs.splat.jacobian import vjp
+from mgs.splat.projection import camera_array, project64, projected
 from mgs.splat.recording import frozen, one_at_a_time
-from mgs.splat.rendering import ListCache, as_colour, as_drjit, render, splats_and_lists
+from mgs.splat.rendering import (
+    ListCache,
+    as_colour,
+    as_drjit,
+    by_block,
+    splats_and_lists,
+)
 from mgs.splat.walking import pack, packet_count, sums_by_splat
 
 MEANS = {"frozen": 0, "free": 3}
 """Number of columns of the means: frozen, or free (x, y, z in the world, metres)."""
 
-ALPHA_WEIGHT_MAX = 1e12
-"""Largest (sigma_rgb / sigma_alpha)^2, (linear RGB)^2. Beyond it, sums over pixels might leave
-the range of float32."""
+WEIGHT_MAX = 1e12
+"""Largest weight of a pixel and channel, also (sigma_rgb / sigma_alpha)^2. Beyond it, sums over
+pixels might leave the range of float32."""
 
 MAX_SUMS = 1 << 31
 """Most sums of all (splat, block) pairs of a view; kernels index them with 31 bits."""
@@ -53,7 +60,7 @@ BLOCK_BYTES = 1800
 measured."""
 
 EXACT = ("exact", "block")
-"""Estimators that support means and alpha."""
+"""Estimators with all options of `fisher`."""
 
 
 def groups(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
@@ -73,65 +80,111 @@ def groups(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
 @one_at_a_time
 def fisher(
     gaussians: Gaussians,
-    camera: Camera,
+    camera: Camera | Sequence[Camera],
     estimator: str = "exact",
     background: Any = (0.0, 0.0, 0.0),
     cache: ListCache | None = None,
     means: str = "frozen",
     alpha_weight: float = 0.0,
+    weights: ArrayLike | Sequence[ArrayLike] | None = None,
+    chosen: Any = None,
 ) -> np.ndarray:
     """Fisher information of one view about each Gaussian: float32 [N,P], or [N,P,P] for the
-    estimator `block`.
+    estimator `block`; of V cameras, [V,N,P] or [V,N,P,P].
 
-    It is the diagonal of J^T J (or its blocks), where J is the Jacobian of the image, in (linear
-    RGB / unit of the parameter)^2. The order of the P parameters is that of docs/notation.md. The
-    result depends on model and pose alone, not on the camera's image. The array may be a view of a
-    larger one (padded rows).
+    It is the diagonal of J^T W J (or its blocks), where J is the Jacobian of the image, in (linear
+    RGB / unit of the parameter)^2. The order of the P parameters is that of docs/notation.md
+    (`groups`). The result depends on model and pose alone, not on the camera's image. The array may
+    be a view of a larger one (padded rows).
 
     - gaussians, background, cache: as in `render`.
     - estimator: a name in `ESTIMATORS`.
     - means: "frozen" or "free": 0 or 3 columns of the means, after the others.
     - alpha_weight: (sigma_rgb / sigma_alpha)^2, up to 1e12, if a pixel's alpha is observed beside
       its colour; 0: it is not.
+    - weights: W, from 0 to 1e12, of pixels [H,W] (0 leaves one out), or of what broadcasts to
+      pixels and channels [H,W,3], as [1, 0, 0] for red alone; [H,W,4] if alpha is observed. Of
+      several cameras, one for each.
+    - chosen: indices, mask or slice of M Gaussians whose rows are returned, [M,...]; the others
+      still hide them. `fisher(gaussians[chosen], ...)` would be of a scene without the others.
 
     Raises InputError for an unknown estimator; as `render`; for blocks of 2^31 numbers or more, or
-    too large for the memory; for unusable means or alpha_weight, or an estimator that does not
-    support them; and with means for too many pairs (`MAX_SUMS`).
+    too large for the memory; for unusable means, alpha_weight, weights or indices, or an estimator
+    that does not support them; and with means for too many pairs (`MAX_SUMS`).
     """
+    if not isinstance(camera, Camera):
+        model, cache = as_drjit(gaussians), cache or ListCache()
+        each = [None] * len(camera) if weights is None else weights
+        if len(each) != len(camera):  # type: ignore[arg-type]
+            raise InputError(f"fisher: weights must be {len(camera)} arrays, one for each camera")
+        how = estimator, background, cache, means, alpha_weight
+        pairs = zip(camera, each, strict=True)  # type: ignore[arg-type]
+        return np.stack([fisher(model, one, *how, weight, chosen) for one, weight in pairs])
     compute = row_named(ESTIMATORS, estimator, "estimator")
     if dr.grad_enabled(camera.traced):
         raise InputError(
             "fisher: information has no derivative by the camera; take differences of moved cameras"
         )
     gaussians.check_shapes()
-    n, size = len(gaussians), list(groups(gaussians.sh_degree, means).values())[-1].stop
-    if not 0 <= alpha_weight <= ALPHA_WEIGHT_MAX:
-        raise InputError(
-            f"fisher: alpha_weight {alpha_weight} must be from 0 to {ALPHA_WEIGHT_MAX:.0e}"
-        )
+    size = list(groups(gaussians.sh_degree, means).values())[-1].stop
+    if not 0 <= alpha_weight <= WEIGHT_MAX:
+        raise InputError(f"fisher: alpha_weight {alpha_weight} must be from 0 to {WEIGHT_MAX:.0e}")
     options: dict[str, Any] = {}
-    if MEANS[means] or alpha_weight:
+    n = len(gaussians)
+    if MEANS[means] or alpha_weight or weights is not None or chosen is not None:
         if estimator not in EXACT:
             raise InputError(
-                f"fisher: the estimator {estimator!r} supports neither means nor alpha; "
-                f"use {' or '.join(EXACT)}"
+                f"fisher: the estimator {estimator!r} has no means, alpha_weight, weights or "
+                f"chosen; use {' or '.join(EXACT)}"
             )
         options = {"means": means, "alpha_weight": alpha_weight}
+        options["weights"] = _weights(weights, camera, alpha_weight)
+        options["chosen"] = rows = _rows(chosen, len(gaussians))
+        n = n if rows is None else len(rows)
     if n == 0:
         return np.zeros((0, size, size) if estimator == "block" else (0, size), np.float32)
     if estimator == "block":
         if n * (size * size + 3) >= 1 << 31:  # rows are written in packets of four numbers
             raise InputError(
                 f"fisher: blocks of {n:,} Gaussians of SH degree {gaussians.sh_degree} would take "
-                f"{n * size * size / 2**28:.1f} GiB, and 8 are the most; take fewer Gaussians, "
-                "a lower degree, or the estimator `exact`"
+                f"{n * size * size / 2**28:.1f} GiB, and 8 are the most; give fewer as `chosen`, "
+                "or take a lower degree, or the estimator `exact`"
             )
         check_room(
             n * BLOCK_BYTES * (size / 11) ** 2,
             f"fisher: blocks of {n:,} Gaussians",
-            "take fewer Gaussians, or the estimator `exact`",
+            "give fewer as `chosen`, or take the estimator `exact`",
         )
     return compute(as_drjit(gaussians), camera, background, cache, **options)
+
+
+def _weights(weights: Any, camera: Camera, alpha_weight: float) -> np.ndarray | None:
+    """Weights of pixels and channels, [H,W,4]; those of alpha are 1 if not given. Raises InputError
+    as `fisher`."""
+    if weights is None:
+        return None
+    shape, values = (camera.height, camera.width), np.asarray(weights)
+    channels = 4 if alpha_weight and values.shape[-1:] == (4,) else 3
+    full = np.ones((*shape, 4), np.float32)
+    try:
+        full[..., :channels] = values[..., None] if values.shape == shape else values
+        usable = bool(((full >= 0) & (full <= WEIGHT_MAX)).all())
+    except (TypeError, ValueError):
+        usable = False
+    if not usable:
+        raise InputError(
+            f"fisher: weights of shape {values.shape} must be numbers from 0 to {WEIGHT_MAX:.0e}, "
+            f"of pixels {shape} or of pixels and channels {(*shape, 3)}"
+        )
+    return full
+
+
+def _rows(chosen: Any, n: int) -> np.ndarray | None:
+    """Indices of chosen Gaussians [M]. Raises InputError if they are none of n."""
+    try:
+        return None if chosen is None else np.atleast_1d(np.arange(n)[chosen])
+    except (IndexError, TypeError) as error:
+        raise InputError(f"fisher: chosen names no Gaussians of {n:,} ({error})") from None
 
 
 def _sums(
@@ -140,17 +193,22 @@ def _sums(
     background: Any,
     cache: ListCache | None,
     block: bool,
-    means: str,
-    alpha_weight: float,
-) -> tuple[Moments, Any, Any, list[ByMean]]:
-    """Sums of `kernels.fisher`, the camera and splats for `geometry`, and derivatives by the means.
-    means, alpha_weight: as in `fisher`."""
+    means: str = "frozen",
+    alpha_weight: float = 0.0,
+    weights: np.ndarray | None = None,
+    chosen: np.ndarray | None = None,
+) -> tuple[Moments, Any, Gaussians, Any, list[ByMean]]:
+    """Sums of `kernels.fisher`, camera, chosen Gaussians and their splats for `geometry`, and
+    derivatives by the means.
+
+    means, alpha_weight: as in `fisher`. weights: [H,W,4]. chosen: indices [M].
+    """
     device = camera_array(camera.seen_from(gaussians.origin))
     splats, lists, packed = splats_and_lists(gaussians, camera, cache)
     # The derivative by a mean has a part by colour above degree 0: w g_c, hence w s_c sums.
     moving = means != "frozen"
     cross = block or (moving and gaussians.sh_degree > 0)  # then colour depends on the mean
-    count = kernels.fisher_sums(cross, moving)
+    count = kernels.fisher_sums(cross, moving, weights is not None)
     room = 4 * packet_count(count)
     if len(lists.splat) * room >= MAX_SUMS:
         raise InputError(
@@ -165,9 +223,18 @@ def _sums(
         dr.eval(exact)
         packed = pack(exact, lists.place)
     weight = dr.opaque(mi.Float, alpha_weight) if alpha_weight else None
-    placed = kernels.fisher(lists, packed, dr.detach(as_colour(background)), cross, moving, weight)
+    roots = None if weights is None else by_block(lists, camera, np.sqrt(weights))
+    surround = dr.detach(as_colour(background))
+    placed = kernels.fisher(lists, packed, surround, cross, moving, weight, roots)
+    sums = sums_by_splat(lists, placed, count)
+    if chosen is not None:
+        index = mi.UInt32(padded(chosen, np.uint32))
+        sums = [dr.gather(type(x), x, index) for x in sums]
+        gaussians = gaussians.map(lambda v: mi.TensorXf(padded(np.asarray(dr.detach(v))[chosen])))
+        splats = projected(gaussians, device)
     # Sums by name: w^2; |s|^2 xi^a eta^b; for each channel w s_c xi^a eta^b.
-    w2, *sums = sums_by_splat(lists, placed, count)
+    of_colour = 1 if roots is None else 3
+    w2, sums = (sums[:of_colour] * 3)[:3], sums[of_colour:]
     squared, mixed = kernels.fisher_moments(cross, moving)
     channels = [sums[len(squared) + c * len(mixed) :] for c in range(3)] if cross else []
     moments = Moments(
@@ -175,7 +242,7 @@ def _sums(
         dict(zip(squared, sums, strict=False)),
         [dict(zip(mixed, channel, strict=False)) for channel in channels],
     )
-    return moments, device, splats, by_means(gaussians, device) if moving else []
+    return moments, device, gaussians, splats, by_means(gaussians, device) if moving else []
 
 
 def exact(
@@ -183,17 +250,16 @@ def exact(
     camera: Camera,
     background: Any,
     cache: ListCache | None,
-    means: str = "frozen",
-    alpha_weight: float = 0.0,
+    **options: Any,
 ) -> np.ndarray:
     """Exact diagonal of J^T J, in one pass over the image: ten sums per splat, no Jacobian.
 
-    With means it takes 16 sums, or 34 above SH degree 0. means, alpha_weight: as in `fisher`.
+    With means it takes 16 sums, or 34 above SH degree 0. options: of `_sums`.
     """
-    sums, device, splats, by_mean = _sums(
-        gaussians, camera, background, cache, False, means, alpha_weight
+    sums, device, model, splats, by_mean = _sums(
+        gaussians, camera, background, cache, False, **options
     )
-    parts = dr.detach((gaussians, device, splats))
+    parts = dr.detach((model, device, splats))
     size = 3 * gaussians.sh.shape[1] + 8 + len(by_mean)
     return np.asarray(_diagonal(*parts, sums, by_mean))[:, :size]
 
@@ -205,7 +271,8 @@ def _diagonal(
     """Columns of `exact` (`_interleaved`)."""
     g = geometry(gaussians, camera, splats)
     # Colour: Y_k^2 sum w^2, 0 where the channel is clamped at 0.
-    columns = [sums.w2 * basis * basis * positive for basis in g.basis for positive in g.positive]
+    channels = list(zip(sums.w2, g.positive, strict=True))
+    columns = [w2 * basis * basis * positive for basis in g.basis for w2, positive in channels]
     # Log-scales, quaternion: sum of |s|^2 (m_k + M_k^T phi)^2. Opacity: (1 - o)^2 sum |s|^2.
     columns += [dr.maximum(product_sum(m, m, sums.squared), 0) for m in g.shape]
     columns.append(g.logit * g.logit * sums.squared[0, 0])
@@ -219,13 +286,12 @@ def block(
     camera: Camera,
     background: Any,
     cache: ListCache | None,
-    means: str = "frozen",
-    alpha_weight: float = 0.0,
+    **options: Any,
 ) -> np.ndarray:
     """Exact diagonal blocks of J^T J [N,P,P], in one pass over the image: 22 sums per splat, with
-    means 34. means, alpha_weight: as in `fisher`."""
-    sums, device, splats, by_mean = _sums(
-        gaussians, camera, background, cache, True, means, alpha_weight
+    means 34. options: of `_sums`."""
+    sums, device, gaussians, splats, by_mean = _sums(
+        gaussians, camera, background, cache, True, **options
     )
     g = geometry(gaussians, device, splats)
     dr.eval(g, by_mean)  # several kernels may write the blocks
@@ -237,7 +303,7 @@ def block(
         scaled = basis_i * g.positive[c]
         for j, (basis_j, d) in enumerate(colour[: i + 1]):
             if c == d:
-                upper[j, i] = sums.w2 * scaled * basis_j
+                upper[j, i] = sums.w2[c] * scaled * basis_j
         # Colour x footprint: Y_k sum of w s_c (m_j + M_j^T phi). Colour x opacity: Y_k (1 - o) sum
         # w s_c.
         for j, m in enumerate(g.shape):
@@ -247,7 +313,7 @@ def block(
         for j, mean in enumerate(by_mean):
             total = weighted_sum(mean.log_alpha, sums.mixed[c])
             if mean.colour:
-                total += sums.w2 * mean.colour[c]
+                total += sums.w2[c] * mean.colour[c]
             upper[i, k + 8 + j] = scaled * total
     # Footprint and opacity among themselves: sums of |s|^2 times products of polynomials.
     for i, m in enumerate(g.shape):
@@ -280,16 +346,9 @@ def loss_gradient(
     (rgb - 0.5)^2. The result is not diag(J^T J): gradients of different pixels cancel before they
     are squared.
     """
-    with dr.resume_grad():
-        learned = {name: dr.copy(dr.detach(getattr(gaussians, name))) for name in LEARNED}
-        dr.enable_grad(list(learned.values()))
-        model = replace(gaussians, means=dr.detach(gaussians.means), **learned)
-        rgb = render(model, camera, background, cache).rgb
-        # J^T z with z = dL/drgb, held constant.
-        z = (dr.detach(rgb) - 0.5) * (2 / len(rgb.array))
-        dr.backward_from(dr.sum(rgb * z, axis=None))
-        gradients = [np.asarray(dr.grad(value)) for value in learned.values()]
-    return np.concatenate([g.reshape(len(gaussians), -1) for g in gradients], axis=1) ** 2
+    slope = lambda rgb: (rgb - 0.5) * (2 / len(rgb.array))  # noqa: E731  dL / drgb
+    gradient = vjp(gaussians, slope, camera, background, cache, LEARNED)
+    return np.concatenate([g.reshape(len(gaussians), -1) for g in gradient.values()], 1) ** 2
 
 
 SMALLEST = 1.2e-38

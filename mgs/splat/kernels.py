@@ -340,11 +340,11 @@ def fisher_moments(cross: bool, means: bool) -> tuple[list[tuple[int, int]], lis
     )  # type: ignore
 
 
-def fisher_sums(cross: bool, means: bool) -> int:
+def fisher_sums(cross: bool, means: bool, weighted: bool = False) -> int:
     """Number of sums per splat of `fisher`: 10 for the exact diagonal, 22 for blocks; with means
-    16, and 34 with `cross`."""
+    16, and 34 with `cross`. If weighted, w^2 has a sum for each channel: two more."""
     squared, mixed = fisher_moments(cross, means)
-    return 1 + len(squared) + 3 * len(mixed)
+    return (3 if weighted else 1) + len(squared) + 3 * len(mixed)
 
 
 def _monomial(in_xi: list[Any], power: tuple[int, int], eta: Any, eta2: Any) -> Any:
@@ -364,6 +364,7 @@ def fisher(
     cross: bool,
     means: bool = False,
     alpha_weight: Any = None,
+    roots: Any = None,
 ) -> Any:
     """Sums over pixels for `mgs.splat.information`, to be read by `sums_by_splat`.
 
@@ -374,6 +375,8 @@ def fisher(
     background: Color3f, linear RGB.
     alpha_weight: Float [1], if alpha is a fourth channel, which adds alpha_weight s_alpha^2 to
         |s|^2, with s_alpha = T_end alpha / (1 - alpha).
+    roots: square roots of the weights of r, g, b and alpha, Float [L*32*4] in the layout of
+        `forward`. Channel c and its s_c are multiplied by them, and w^2 is summed by channel.
 
     Off-diagonal entries of blocks are sums that cancel, so for blocks give splats packed in double
     (`project64`). Pixels are then computed in double; only sums within a block are single.
@@ -387,10 +390,14 @@ def fisher(
     # T_end sqrt(alpha_weight): the fourth channel, alpha, as a colour that all splats share.
     if alpha_weight is not None:
         last = [mi.Float(dr.abs(t)) * dr.sqrt(alpha_weight) for t, *_ in pixels]
-    dr.eval(behind, last)
+    factors = [
+        [] if roots is None else list(dr.gather(mi.Vector4f, roots, lane.first + pixel))
+        for pixel in range(len(T))
+    ]
+    dr.eval(behind, last, factors)
     # Second pass: per pair, the sums over the pixels of its block, row by row.
     squared, mixed = fisher_moments(cross, means)
-    count = fisher_sums(cross, means)
+    count, of_colour = fisher_sums(cross, means, roots is not None), 1 if roots is None else 3
 
     def visit(splat: Splats, rows: list[Row], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
@@ -402,7 +409,7 @@ def fisher(
             cross_m = [[mi.Float(0)] * 3 for _ in range(3)]
             for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
                 pixel = j * lane.columns + x
-                in_row = [sums[0], *m, *(c for a in cross_m for c in a)]
+                in_row = [*sums[:of_colour], *m, *(c for a in cross_m for c in a)]
                 raw = computed_after(raw, in_row if x else sums if j else [])
                 transmittance, *behind = pixels[pixel]
                 alpha, w, after, room = blend(raw, transmittance)
@@ -414,8 +421,14 @@ def fisher(
                 # s_c = alpha (c T - S / (1 - alpha)), and s_alpha if alpha is observed.
                 slopes = _slopes(splat.colour, behind, alpha, w, after, free, last[pixel])
                 w, xi = mi.Float(w), mi.Float(xi)
+                # Weighted: channel c of the pixel times the root of its weight.
+                weights = [w] * 3
+                if factors[pixel]:
+                    slopes = [s * root for s, root in zip(slopes, factors[pixel], strict=False)]
+                    weights = [w * root for root in factors[pixel][:3]]
                 # Colours: sum of w^2.
-                sums[0] = dr.fma(w, w, sums[0])
+                for c in range(of_colour):
+                    sums[c] = dr.fma(weights[c], weights[c], sums[c])
                 # Footprint and opacity: |s|^2 times 1, xi, xi^2, xi^3, xi^4.
                 square = sum(s * s for s in slopes)
                 xi2 = xi * xi
@@ -425,7 +438,7 @@ def fisher(
                 m[3], m[4] = dr.fma(power, xi, m[3]), dr.fma(power, xi2, m[4])
                 # Colour times footprint: w s_c times 1, xi, xi^2.
                 for c, s in enumerate(slopes[:3] if cross else []):
-                    ws = w * s
+                    ws = weights[c] * s
                     a = cross_m[c]
                     cross_m[c] = [a[0] + ws, dr.fma(ws, xi, a[1]), dr.fma(ws, xi2, a[2])]
             # Moments of the pair: += xi^a eta^b of the row, for each power (a, b).
@@ -433,7 +446,8 @@ def fisher(
             eta2 = eta * eta
             moments = [_monomial(m, power, eta, eta2) for power in squared]
             moments += [_monomial(a, power, eta, eta2) for a in cross_m for power in mixed]
-            sums[1:] = [a + b for a, b in zip(sums[1:], moments, strict=True)]
+            pairs = zip(sums[of_colour:], moments, strict=True)
+            sums[of_colour:] = [a + b for a, b in pairs]
         return new, alive, sums
 
     pixels = [[t, *c] for t, c in zip(T, behind, strict=True)]

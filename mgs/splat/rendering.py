@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -14,7 +14,7 @@ import numpy as np
 from mgs import runtime
 from mgs.camera import Camera
 from mgs.errors import InputError
-from mgs.gaussians import ARRAYS, SH_MAX, Gaussians
+from mgs.gaussians import SH_MAX, Gaussians
 from mgs.memory import padded
 from mgs.notebook import html, picture
 from mgs.splat import blocks, kernels
@@ -40,11 +40,12 @@ class Image:
     depth: Any
 
     def __repr__(self) -> str:
-        height, width = self.alpha.shape
-        return f"Image({width}x{height})"
+        *views, height, width = self.alpha.shape
+        return f"Image({''.join(f'{count} of ' for count in views)}{width}x{height})"
 
     def _repr_html_(self) -> str:
-        return html(repr(self), [picture(np.asarray(self.rgb))])
+        rgb = np.asarray(self.rgb)
+        return html(repr(self), [picture(one) for one in (rgb if rgb.ndim == 4 else [rgb])])
 
 
 REMEMBERED = 1 << 10
@@ -234,6 +235,16 @@ def _block_major(lists: BlockLists, width: int, height: int) -> Any:
     return block * PIXELS + (y % BLOCK_Y) * BLOCK_X + x % BLOCK_X
 
 
+def by_block(lists: BlockLists, camera: Camera, values: np.ndarray) -> Any:
+    """Four numbers per pixel [H,W,4] in the order of the kernels, Float [L*32*4]; 0 outside."""
+    out = dr.zeros(mi.Float, 4 * PIXELS * len(lists.block))
+    places = _block_major(lists, camera.width, camera.height)
+    vectors = dr.unravel(mi.Vector4f, mi.Float(padded(values).ravel()))
+    dr.scatter(out, vectors, places, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(out)
+    return out
+
+
 def splats_and_lists(
     gaussians: Gaussians, camera: Camera, cache: ListCache | None
 ) -> tuple[Splats, BlockLists, Any]:
@@ -255,7 +266,7 @@ def splats_and_lists(
 @one_at_a_time
 def render(
     gaussians: Gaussians,
-    camera: Camera,
+    camera: Camera | Sequence[Camera],
     background: Any = (0.0, 0.0, 0.0),
     cache: ListCache | None = None,
 ) -> Image:
@@ -266,7 +277,7 @@ def render(
     - cache: pass the same one to all calls, to reuse the block lists of cameras.
 
     Returns rgb [H,W,3] (linear; sRGB if `gaussians.linear` is false), alpha [H,W] and depth [H,W]
-    (expected z-depth, metres), TensorXf.
+    (expected z-depth, metres), TensorXf; of V cameras of one size [V,H,W,3] and [V,H,W].
 
     Differentiable by Dr.Jit in reverse mode (`dr.backward`) and forward mode (`dr.forward`, `jvp`),
     also by a camera that has Dr.Jit values (`Camera`, `moved`). Not differentiated: the thresholds
@@ -274,10 +285,13 @@ def render(
 
     Raises InputError inside another `dr.freeze`, since it records kernels of its own; if a
     parameter is not finite or a colour beyond SH_MAX, naming parameter and first Gaussian; if a
-    number of the background is (a Dr.Jit colour is not checked); and for a view with too many pairs
-    (`mgs.splat.blocks.MAX_PAIRS`).
+    number of the background is (a Dr.Jit colour is not checked); for a view with too many pairs
+    (`mgs.splat.blocks.MAX_PAIRS`); and for no cameras, or cameras of different sizes.
     """
     runtime.start()
+    if not isinstance(camera, Camera):
+        model, cache = as_drjit(gaussians), cache or ListCache()
+        return _stacked([render(model, one, background, cache) for one in camera])
     if dr.flag(dr.JitFlag.FreezingScope):
         raise InputError("render: records kernels of its own; call it outside of `dr.freeze`")
     colour = as_colour(background)
@@ -288,60 +302,17 @@ def render(
     return composite(splats, packed, lists, camera.width, camera.height, colour)
 
 
-@one_at_a_time
-def jvp(
-    gaussians: Gaussians,
-    tangents: Mapping[str, Any],
-    camera: Camera,
-    background: Any = (0.0, 0.0, 0.0),
-    cache: ListCache | None = None,
-) -> Image:
-    """Derivative of the image along `tangents` of the Gaussians: J v in one pass (forward mode),
-    with J the Jacobian of `render`.
+def _stacked(images: Sequence[Image]) -> Image:
+    """One image of several of one size, which come first in its shapes. Raises InputError as
+    `render`."""
+    if len({tuple(image.alpha.shape) for image in images}) != 1:
+        raise InputError("render: takes one or more cameras of one image size; draw others apart")
 
-    - gaussians, camera, background, cache: as in `render`; their gradients are ignored. For the
-      derivative by a pose see `moved`.
-    - tangents: d parameter / dt for some t, by name ("means", "log_scales", "quats",
-      "logit_opacities", "sh"), NumPy or Dr.Jit of the parameter's shape. Others are constant.
+    def stacked(name: str) -> Any:
+        parts = [getattr(image, name) for image in images]
+        return mi.TensorXf(dr.concat([p.array for p in parts]), (len(parts), *parts[0].shape))
 
-    Returns the derivatives by t of rgb [H,W,3], alpha [H,W] and depth [H,W], TensorXf. Raises
-    InputError as `render`, and for a tangent of an unknown name, of a wrong shape or not finite.
-    """
-    model = as_drjit(gaussians)
-    given = {name: _checked_tangent(model, name, tangent) for name, tangent in tangents.items()}
-    with dr.resume_grad():
-        copy = model.map(lambda v: dr.copy(dr.detach(v)))
-        for name, tangent in given.items():
-            dr.enable_grad(getattr(copy, name))
-            dr.set_grad(getattr(copy, name), tangent)
-        image = render(copy, replace(camera), dr.detach(as_colour(background)), cache)
-        # AllowNoGrad: there may be no tangents.
-        dr.forward_to(image, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
-        return dr.grad(image)
-
-
-def _checked_tangent(gaussians: Gaussians, name: str, tangent: Any) -> Any:
-    """A tangent as detached TensorXf. Raises InputError as `jvp`."""
-    if name not in ARRAYS:
-        raise InputError(f"tangents: {name!r} is no parameter; choose from {', '.join(ARRAYS)}")
-    shape = tuple(getattr(gaussians, name).shape)
-    try:
-        with np.errstate(over="ignore"):
-            values = np.asarray(dr.detach(tangent), np.float32)
-    except (TypeError, ValueError):
-        raise InputError(
-            f"tangents: {name} must be numbers of the parameter's shape, {shape}"
-        ) from None
-    if values.shape != shape:
-        raise InputError(
-            f"tangents: {name} has shape {values.shape}, expected {shape}, that of the parameter"
-        )
-    if not np.isfinite(values).all():
-        first = np.argwhere(~np.isfinite(values))[0][0]
-        raise InputError(
-            f"tangents: {name} is NaN or infinite, first at Gaussian {first}; remove or repair it"
-        )
-    return mi.TensorXf(padded(values))
+    return Image(stacked("rgb"), stacked("alpha"), stacked("depth"))
 
 
 def _empty(camera: Camera, background: Any) -> Image:

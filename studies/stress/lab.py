@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, load_dataset, target_of
 from mgs.data.frames import Frame
-from mgs.fit.fitting import Fit, fit
+from mgs.fit.fitting import Fit, fit_gaussians
 from mgs.fit.settings import MEAN_RATE, PASSES, RATES, TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.policy.criteria import MEAN_STD, PRIOR_STD, Score, d_optimal, lam_by_kind, regularisation
@@ -181,7 +181,7 @@ class Lab:
         settings = TrainSettings(passes=passes, tolerance=0.0, means=means, rates=rates)  # type: ignore[arg-type]
         lam = lam_by_kind(self.lam(means), groups(0, means)) if with_prior else None
         frames = [self.frames[i] for i in taken]
-        return fit(
+        return fit_gaussians(
             start if model is None else model,
             [frame.camera for frame in frames],
             [target_of(frame) for frame in frames],

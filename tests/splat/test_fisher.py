@@ -210,7 +210,10 @@ def test_unseen_means_and_clamped_alphas_carry_no_information():
         ({"estimator": "magic"}, r"estimator 'magic': unknown; choose one of .*exact"),
         ({"means": "fixed"}, "means 'fixed': unknown; choose one of frozen, free"),
         ({"alpha_weight": -0.1}, r"fisher: alpha_weight -0\.1 must be from 0 to 1e[+]12"),
-        ({"estimator": "loss-gradient", "means": "free"}, "'loss-gradient' supports neither means"),
+        ({"weights": np.ones((3, 4))}, r"weights of shape \(3, 4\) must be numbers from 0"),
+        ({"weights": -np.ones(3)}, r"weights of shape \(3,\) must be numbers from 0"),
+        ({"chosen": [7]}, "chosen names no Gaussians of 5"),
+        ({"estimator": "loss-gradient", "means": "free"}, "'loss-gradient' has no means"),
     ],
 )
 def test_unusable_options_are_one_line(options, message):
@@ -225,3 +228,40 @@ def test_too_many_sums_are_refused(monkeypatch):
     fisher(g, camera, "block")
     with pytest.raises(InputError, match=r"view: 1,024 pairs .* which takes fewer than 682; take"):
         fisher(g, camera, "block", means="free")
+
+
+@pytest.mark.parametrize(("degree", "means"), [(0, "frozen"), (1, "free")])
+def test_weights_and_chosen_gaussians_against_brute_force(degree, means):
+    camera = make_camera()
+    g = calm(lambda seed: make_clamped(seed, degree), camera, 30 + degree)
+    J = reference.jacobian(g, camera, BACKGROUND, means, 0.3)
+    weights = np.random.default_rng(0).uniform(0, 2, (camera.height, camera.width, 4))
+    weights[:, :9] = 0
+    for some, full in (
+        (weights, weights),
+        (weights[..., 0], weights[..., :1] * [1, 1, 1, 0] + [0, 0, 0, 1]),
+        ([1, 0, 0], np.ones_like(weights) * [1, 0, 0, 1]),
+    ):
+        rows = (J * np.sqrt(full).reshape(-1, 4)[:, :, None, None]).reshape(-1, *J.shape[2:])
+        expected = np.matmul(rows.transpose(1, 2, 0), rows.transpose(1, 0, 2))
+        options = {"means": means, "alpha_weight": 0.3, "weights": some}
+        block = fisher(g, camera, "block", BACKGROUND, **options)
+        size = scale_of(expected)
+        assert np.abs(block - expected)[size > 0].max() <= 1e-5 * size.max()
+        exact = fisher(g, camera, "exact", BACKGROUND, **options)
+        assert_close(
+            exact[:, : 3 * (degree + 1) ** 2], diagonal(expected)[:, : 3 * (degree + 1) ** 2]
+        )
+        # Alone, Gaussian 5 would be hidden by nothing.
+        for name, whole in (("exact", exact), ("block", block)):
+            found = fisher(g, camera, name, BACKGROUND, chosen=[5, 2], **options)
+            np.testing.assert_allclose(found, whole[[5, 2]], rtol=1e-5, atol=1e-5 * whole.max())
+
+
+def test_several_cameras_are_each_alone():
+    g, cameras = make_gaussians(16, 5), [make_camera(), make_camera(eye=(0.3, -2, 1))]
+    for name in ("exact", "block"):
+        alone = [fisher(g, camera, name, chosen=[3]) for camera in cameras]
+        np.testing.assert_array_equal(fisher(g, cameras, name, chosen=[3]), alone)
+    with pytest.raises(InputError, match="weights must be 2 arrays"):
+        fisher(g, cameras, weights=[1])

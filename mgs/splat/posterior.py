@@ -1,0 +1,233 @@
+"""Fisher information of many views as an operator, without its matrix: products, solutions,
+log-determinant and samples of the posterior.
+
+With all P N parameters in one vector, H = sum over the views of J^T W J is the information of the
+images, and H + lam the precision of the posterior times sigma_e^2 (docs/notation.md). H has a row
+for each parameter and couples all Gaussians that share a pixel. `fisher` gives its diagonal blocks
+alone. A product H v takes one forward and one reverse pass over each view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mgs.camera import Camera
+from mgs.errors import InputError
+from mgs.gaussians import Gaussians, learned
+from mgs.memory import padded
+from mgs.splat.information import fisher, groups
+from mgs.splat.jacobian import jvp, vjp
+from mgs.splat.rendering import ListCache, as_drjit
+
+Floats = NDArray[np.float64]
+
+STEPS = 30
+"""Most steps of the Lanczos iteration of a probe. A chosen constant."""
+
+TOLERANCE = 1e-3
+"""Norm of a solution's residual over that of the right-hand side, after whitening by the blocks.
+Products in float32 allow about 1e-5."""
+
+MOST_STEPS = 1000
+"""Most steps of the conjugate gradients."""
+
+
+class Estimate(NamedTuple):
+    """A random estimate and its standard error."""
+
+    value: float
+    error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """Fisher information H of the images of some cameras by the parameters of the Gaussians.
+
+    - gaussians: N of them, of any fields that `render` takes. cameras: V of them.
+    - background, means: as in `fisher`; P columns for each Gaussian, in its order.
+    - weights: W of each camera, as in `fisher`, by default 1.
+    - cache: pass the same one to all calls, to reuse the block lists of cameras.
+
+    Raises InputError as `fisher`. Sources: Ubaru, Chen and Saad 2017 (stochastic Lanczos
+    quadrature); Papandreou and Yuille 2010 (samples by perturbation).
+    """
+
+    gaussians: Gaussians
+    cameras: Sequence[Camera]
+    background: Any = (0.0, 0.0, 0.0)
+    means: str = "frozen"
+    weights: Sequence[ArrayLike] | None = None
+    cache: ListCache = field(default_factory=ListCache)
+
+    def __post_init__(self) -> None:
+        if self.weights is not None and len(self.weights) != len(self.cameras):
+            raise InputError(
+                f"information: weights must be {len(self.cameras)} arrays, one a camera"
+            )
+
+    @cached_property
+    def blocks(self) -> Floats:
+        """Diagonal blocks of H [N,P,P]."""
+        each = [None] * len(self.cameras) if self.weights is None else self.weights
+        how = {"background": self.background, "cache": self.cache, "means": self.means}
+        total: Any = 0.0
+        for camera, weight in zip(self.cameras, each, strict=True):
+            total = total + fisher(self._model, camera, "block", weights=weight, **how)
+        return np.asarray(total, np.float64)
+
+    @cached_property
+    def _model(self) -> Gaussians:
+        return as_drjit(self.gaussians)
+
+    @cached_property
+    def _roots(self) -> list[Any]:
+        """Square root of the weights of each view, None or what broadcasts to [H,W,3]."""
+        if self.weights is None:
+            return [None] * len(self.cameras)
+        roots = [np.sqrt(np.asarray(weight, np.float32)) for weight in self.weights]
+        sizes = [(camera.height, camera.width) for camera in self.cameras]
+        pairs = zip(roots, sizes, strict=True)
+        return [root[..., None] if root.shape == size else root for root, size in pairs]
+
+    def product(self, vector: ArrayLike) -> Floats:
+        """H v [N,P] of v [N,P]."""
+        total = np.zeros(np.shape(vector))
+        tangents = self._by_name(np.asarray(vector))
+        for camera, root in zip(self.cameras, self._roots, strict=True):
+            image = np.asarray(jvp(self._model, tangents, camera, self.background, self.cache).rgb)
+            total += self._transposed(image if root is None else image * root * root, camera)
+        return total
+
+    def solve(self, vector: ArrayLike, lam: ArrayLike, tolerance: float = TOLERANCE) -> Floats:
+        """(H + lam)^-1 v [N,P] of v [N,P], by conjugate gradients.
+
+        lam: positive, [P], or what broadcasts to [N,P] (`regularisation`). tolerance: of the
+        residual's norm, relative, whitened by the blocks. Raises InputError if MOST_STEPS do not
+        reach it.
+        """
+        whiten, lam = self._whitening(lam)
+        b = whiten(np.asarray(vector, np.float64), True)
+        x, r, p = np.zeros_like(b), b, b
+        square, enough = float((r * r).sum()), tolerance**2 * float((b * b).sum())
+        for _ in range(MOST_STEPS):
+            if square <= enough:
+                return whiten(x, False)
+            # x moves along p to the minimum of the quadratic; the next p is conjugate to it.
+            image = self._whitened(p, whiten, lam)
+            step = square / float((p * image).sum())
+            x, r = x + step * p, r - step * image
+            square, before = float((r * r).sum()), square
+            p = r + square / before * p
+        raise InputError(
+            f"information: {MOST_STEPS} steps do not reach a residual of {tolerance:g}; "
+            "raise the tolerance, or lam"
+        )
+
+    def log_det(
+        self, lam: ArrayLike, probes: int = 8, steps: int = STEPS, seed: int = 0
+    ) -> Estimate:
+        """log det(H + lam), nats, by stochastic Lanczos quadrature, and its standard error.
+
+        lam: as in `solve`. With L L^T the blocks of H + lam, it is sum log diag(L)^2, exactly, plus
+        trace log A with A = L^-1 (H + lam) L^-T. That trace is the mean of z^T log(A) z over
+        `probes` random vectors z of +1 and -1, each by `steps` of the Lanczos iteration: the error
+        is that of the mean. Raises InputError for fewer than two probes or steps.
+        """
+        if probes < 2 or steps < 2:
+            raise InputError(
+                f"information: probes {probes}, steps {steps}: give at least 2 of each"
+            )
+        whiten, lam = self._whitening(lam)
+        rng, traces = np.random.default_rng(seed), []
+        for _ in range(probes):
+            z = rng.choice([-1.0, 1.0], self.blocks.shape[:2])
+            traces.append(z.size * self._log_quadratic(z / np.sqrt(z.size), steps, whiten, lam))
+        blocks = np.linalg.slogdet(self.blocks + _diagonal(lam))[1].sum()
+        error = np.std(traces, ddof=1) / np.sqrt(probes)
+        return Estimate(float(blocks + np.mean(traces)), float(error))
+
+    def _log_quadratic(self, q: Floats, steps: int, whiten: Any, lam: Floats) -> float:
+        """q^T log(A) q of a unit vector, by the Gauss quadrature of its Lanczos matrix."""
+        basis, a, b = [q], list[float](), list[float]()
+        for _ in range(min(steps, q.size)):
+            w = self._whitened(basis[-1], whiten, lam)
+            a.append(float((w * basis[-1]).sum()))
+            for old in basis:  # orthogonal to all, as rounding would lose it
+                w = w - (w * old).sum() * old
+            b.append(float(np.linalg.norm(w)))
+            if b[-1] < 1e-5 * abs(a[0]):
+                break
+            basis.append(w / b[-1])
+        off = b[: len(a) - 1]
+        values, vectors = np.linalg.eigh(np.diag(a) + np.diag(off, 1) + np.diag(off, -1))
+        # No eigenvalue of A is below lam over the largest of the blocks; float32 may say so.
+        return float((vectors[0] ** 2 * np.log(np.maximum(values, 1e-9))).sum())
+
+    def samples(
+        self,
+        lam: ArrayLike,
+        count: int = 8,
+        pixel_noise: float = 0.02,
+        seed: int = 0,
+        tolerance: float = TOLERANCE,
+    ) -> list[Gaussians]:
+        """Draws from the posterior N(theta, sigma_e^2 (H + lam)^-1) of the parameters.
+
+        lam, tolerance: as in `solve`. pixel_noise: sigma_e, that of lam. Each draw adds
+        (H + lam)^-1 (J^T W^1/2 e + lam^1/2 n) sigma_e with unit normal e and n, which has this
+        covariance, at the cost of one `solve`.
+        """
+        rng, (n, size) = np.random.default_rng(seed), self.blocks.shape[:2]
+        drawn = []
+        for _ in range(count):
+            b = rng.standard_normal((n, size)) * np.sqrt(lam)
+            for camera, root in zip(self.cameras, self._roots, strict=True):
+                noise = rng.standard_normal((camera.height, camera.width, 3))
+                b += self._transposed(noise if root is None else noise * root, camera)
+            moves = self._by_name(pixel_noise * self.solve(b, lam, tolerance))
+            old = {name: np.asarray(getattr(self.gaussians, name)) for name in moves}
+            drawn.append(replace(self.gaussians, **{k: old[k] + moves[k] for k in old}))
+        return drawn
+
+    def _by_name(self, vector: np.ndarray) -> dict[str, np.ndarray]:
+        """Parts of a vector [N,P] by parameter, float32 of its shape."""
+        columns = groups(self.gaussians.sh_degree, self.means)
+        shapes = {name: getattr(self.gaussians, name).shape for name in learned(self.means)}
+        parts = zip(shapes.items(), columns.values(), strict=True)
+        return {name: np.float32(vector[:, of]).reshape(shape) for (name, shape), of in parts}
+
+    def _transposed(self, image: np.ndarray, camera: Camera) -> Floats:
+        """J^T z [N,P] of an image z [H,W,3]."""
+        names, z = list(learned(self.means)), mi.TensorXf(padded(image))
+        parts = vjp(self._model, z, camera, self.background, self.cache, names).values()
+        return np.concatenate([np.float64(part).reshape(len(part), -1) for part in parts], 1)
+
+    def _whitening(self, lam: ArrayLike) -> tuple[Any, Floats]:
+        """Return whiten(v, transposed) -> L^-T v or, transposed, L^-1 v of v [N,P], with L L^T the
+        blocks of H + lam; and lam."""
+        lam = np.asarray(lam, np.float64)
+        if not (lam > 0).all():
+            raise InputError("information: lam must be positive, else the precision has no inverse")
+        inverse = np.linalg.inv(np.linalg.cholesky(self.blocks + _diagonal(lam)))
+
+        def whiten(v: Floats, transposed: bool) -> Floats:
+            return np.einsum("nij,nj->ni" if transposed else "nji,nj->ni", inverse, v)
+
+        return whiten, lam
+
+    def _whitened(self, v: Floats, whiten: Any, lam: Floats) -> Floats:
+        """A v, with A = L^-1 (H + lam) L^-T."""
+        inner = whiten(v, False)
+        return np.asarray(whiten(self.product(inner) + lam * inner, True))
+
+
+def _diagonal(lam: Floats) -> Floats:
+    """lam [P] or [N,P] as diagonal matrices."""
+    return lam[..., None] * np.eye(lam.shape[-1])
