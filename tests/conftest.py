@@ -70,10 +70,10 @@ def short_fits(monkeypatch):
     """Fits of runs have at most two passes: for tests that do not look at their quality."""
     from mgs import scene
 
-    fit = scene.fit
+    fit = scene.fit_gaussians
 
     def short(gaussians, cameras, targets, train, *rest):
         few = train.model_copy(update={"passes": min(train.passes, 2)})
         return fit(gaussians, cameras, targets, few, *rest)
 
-    monkeypatch.setattr(scene, "fit", short)
+    monkeypatch.setattr(scene, "fit_gaussians", short)

@@ -30,7 +30,7 @@ import os, signal
 from mgs import scene
 from mgs.cli.app import main
 
-fit, fits = scene.fit, []
+fit, fits = scene.fit_gaussians, []
 
 def interrupted(gaussians, cameras, targets, settings, on_pass, *rest):
     fits.append(len(cameras))
@@ -42,7 +42,7 @@ def interrupted(gaussians, cameras, targets, settings, on_pass, *rest):
 
     return fit(gaussians, cameras, targets, settings, interrupt, *rest)
 
-scene.fit = interrupted
+scene.fit_gaussians = interrupted
 # A shell lets its background processes ignore this signal.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 main()
