@@ -131,6 +131,7 @@ def changes(built: Footprints, splats: Splats) -> Any:
     must be rebuilt. REORDERED: the depth changed, so the order must be, too.
     """
     now = footprints(splats)
+    # Any number of a drawn footprint differs, bit for bit.
     other = (built.mean_x != now.mean_x) | (built.mean_y != now.mean_y) | (built.shear != now.shear)
     other |= (built.white_x != now.white_x) | (built.white_y != now.white_y)
     other |= built.level != now.level
@@ -159,6 +160,7 @@ def build(splats: Splats, camera: Camera, older: BlockLists | None = None) -> Bl
     is front to back, too. A splat touches a block if its ellipse does, not its bounding box. Raises
     InputError for more than MAX_PAIRS pairs, or too many for the memory, before taking memory.
     """
+    # First block (column, row) on the film, and number of blocks that the window touches.
     left, top = camera.corner
     right, bottom = left + camera.width, top + camera.height
     column, row = left // BLOCK_X, top // BLOCK_Y
@@ -201,6 +203,7 @@ def _tile_number(block: Any, blocks_x: int) -> Any:
 
     Tiles at the edge of the image count as whole, so some numbers belong to no block.
     """
+    # Block (bx, by) is number (by mod TILE) TILE + bx mod TILE of its tile.
     bx, by = block % blocks_x, block // blocks_x
     tile = (by // TILE) * -(-blocks_x // TILE) + bx // TILE
     return (tile * TILE + by % TILE) * TILE + bx % TILE
@@ -253,6 +256,7 @@ def _orders(
         number = dr.clip(pixel / size - mi.Float(first), 0, count - 1)
         return mi.UInt32(dr.select(splats.visible, number, 0))
 
+    # Block of each centre, clipped to the image; then by tile, in it front to back.
     column = block(splats.mean_x, BLOCK_X, first[0], blocks_x)
     row = block(splats.mean_y, BLOCK_Y, first[1], blocks_y)
     number = _tile_number(row * blocks_x + column, blocks_x)
@@ -271,6 +275,7 @@ def _lanes_by_tile(length: Any, number: Any, numbers: int) -> Any:
 
     length: of each block's list. number: `_tile_number` of each block. numbers: `_tile_numbers`.
     """
+    # Longest first, then stably by tile.
     longest = _sorted(dr.arange(mi.UInt32, len(length)), 4095 - dr.minimum(length, 4095), 4096)
     tile = dr.gather(mi.UInt32, number, longest) // (TILE * TILE)
     return _sorted(longest, tile, numbers // (TILE * TILE))
@@ -306,6 +311,7 @@ def _pairs(
     low = dr.clip(dr.ceil((v - half + 0.5) / BLOCK_Y) - 1 - row, 0, blocks_y)
     high = dr.clip(dr.floor((v + half - 0.5) / BLOCK_Y) + 1 - row, 0, blocks_y)
     rows = mi.UInt32(dr.select(q > 0, dr.maximum(high - low, 0), 0))
+    # Ellipses front to back, in two packets each (`_blocks_of_row`).
     shapes = dr.empty(mi.Float, 8 * n)
     for i, part in enumerate((mi.Vector4f(u, v, k, p), mi.Vector4f(e, q, low, 0))):
         dr.scatter(shapes, part, 2 * dr.arange(mi.UInt32, n) + i, mode=dr.ReduceMode.NoConflicts)
@@ -313,6 +319,7 @@ def _pairs(
     dr.eval(shapes, rows, nearest)
 
     # One entry for each (splat, row of blocks): its splat, and its offset from the first row.
+    # first_row: entry of a splat's first row; rank: splat of each entry, counted from the front.
     first_row = dr.prefix_sum(rows)
     rank = _run_numbers(first_row, rows, _total(rows, blocks_y, "rows of blocks"))
     owner, block, columns = mi.UInt32(), mi.UInt32(), mi.UInt32()
@@ -402,6 +409,8 @@ def _blocks_of_row(
 
     column = mi.Float(first_block[0])
     # Blocks with a pixel centre between the left and the right rim.
+    # Column i ends with the pixel centre BLOCK_X (i + 1) - 0.5, which is right of the left rim x
+    # for i >= (x + 0.5) / BLOCK_X - 1, and begins with BLOCK_X i + 0.5.
     first = dr.clip(dr.ceil((rim(-1) + 0.5) / BLOCK_X) - 1 - column, 0, blocks_x)
     last = dr.clip(dr.floor((rim(1) - 0.5) / BLOCK_X) + 1 - column, 0, blocks_x)
     columns = mi.UInt32(dr.select(low <= high, dr.maximum(last - first, 0), 0))
@@ -420,6 +429,7 @@ def _by_block(owner: Any, number: Any, numbers: int) -> tuple[Any, Any, Any, Any
     start, end = dr.zeros(mi.UInt32, numbers), dr.zeros(mi.UInt32, numbers)
     if count == 0:  # Dr.Jit has no operations on arrays of length 0
         return dr.zeros(mi.UInt32, _room(count)), pair, start, end
+    # slot: of each sorted pair. at: its number. Beyond `count` there is only padding.
     slot, at = _permutation(number, numbers), dr.arange(mi.UInt32, _room(count))
     used, last = at < dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, count - 1)
     slot = dr.gather(mi.UInt32, slot, at, used)

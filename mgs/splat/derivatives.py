@@ -101,6 +101,7 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
     _, unit, _ = axes2d(mean, quats, camera)
     scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
     # b_i = W t_i: images of the unit axes in whitened pixels per metre.
+    # W = [p, -p k; 0, e]: whitened coordinates of a pixel offset.
     k, p, e, share = whitening([a * s for a, s in zip(unit, scales, strict=True)])
     b = [mi.Vector2d(p * (t.x - k * t.y), e * t.y) for t in unit]
     axes = list(zip(b, scales, strict=True))
@@ -136,6 +137,7 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
     ]
     # d ln o / d logit = 1 - o.
     transparency = 1 / (1 + dr.exp(mi.Float64(gaussians.logit_opacities.array)))
+    # Y_k in the direction of the Gaussian; a channel clamped at 0 has no derivative.
     basis = sh_basis(mean, camera, gaussians.sh.shape[1])
     positive = [dr.select(c > 0, mi.Float(1), 0) for c in (splats.red, splats.green, splats.blue)]
     powers = POWERS[0], *POWERS[3:]
@@ -162,6 +164,7 @@ def by_means(gaussians: Gaussians, camera: Any) -> list[ByMean]:
             # AllowNoGrad: without antialiasing, the opacity does not depend on the means.
             dr.forward_to(splats, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
             tangents, splats = dr.grad(splats), dr.detach(splats)
+        # q: derivative of ln alpha by this coordinate. g_c: that of the colour, 0 for degree 0.
         polynomial = log_alpha_tangent(tangents, splats)
         columns.append(ByMean(polynomial, tangents.colour if gaussians.sh_degree else []))
     return columns
@@ -188,6 +191,7 @@ def product_sum(p: Polynomial, q: Polynomial, moments: Polynomial) -> Any:
 def mean_product(mean: ByMean, q: Polynomial, sums: Moments) -> Any:
     """Sum over pixels and channels of the derivative by a mean times s_c q, with q that of a
     parameter of the footprint."""
+    # sum over pixels and c of (s_c q_mean + w g_c) s_c q.
     total = product_sum(mean.log_alpha, q, sums.squared)
     for g, mixed in zip(mean.colour, sums.mixed, strict=False):
         total += g * weighted_sum(q, mixed)

@@ -209,6 +209,7 @@ def _sums(
     moving = means != "frozen"
     cross = block or (moving and gaussians.sh_degree > 0)  # then colour depends on the mean
     count = kernels.fisher_sums(cross, moving, weights is not None)
+    # Numbers that a pair stores: sums in packets of four.
     room = 4 * packet_count(count)
     if len(lists.splat) * room >= MAX_SUMS:
         raise InputError(
@@ -228,11 +229,13 @@ def _sums(
     placed = kernels.fisher(lists, packed, surround, cross, moving, weight, roots)
     sums = sums_by_splat(lists, placed, count)
     if chosen is not None:
+        # Rows of the chosen ones: sums were taken with all Gaussians in place.
         index = mi.UInt32(padded(chosen, np.uint32))
         sums = [dr.gather(type(x), x, index) for x in sums]
         gaussians = gaussians.map(lambda v: mi.TensorXf(padded(np.asarray(dr.detach(v))[chosen])))
         splats = projected(gaussians, device)
     # Sums by name: w^2; |s|^2 xi^a eta^b; for each channel w s_c xi^a eta^b.
+    # w^2 is the same sum for r, g and b unless channels have weights.
     of_colour = 1 if roots is None else 3
     w2, sums = (sums[:of_colour] * 3)[:3], sums[of_colour:]
     squared, mixed = kernels.fisher_moments(cross, moving)
@@ -300,6 +303,7 @@ def block(
     upper: dict[tuple[int, int], Any] = {}
     # Colour x colour: Y_k Y_l sum w^2 of one channel; channels do not mix.
     for i, (basis_i, c) in enumerate(colour):
+        # Derivative of the pixel by this coefficient: w Y_k.
         scaled = basis_i * g.positive[c]
         for j, (basis_j, d) in enumerate(colour[: i + 1]):
             if c == d:
@@ -320,6 +324,7 @@ def block(
         for j in range(i, 7):
             upper[k + i, k + j] = product_sum(m, g.shape[j], sums.squared)
         upper[k + i, k + 7] = g.logit * weighted_sum(m, sums.squared)
+    # Opacity x opacity: (1 - o)^2 sum |s|^2.
     upper[k + 7, k + 7] = g.logit * g.logit * sums.squared[0, 0]
     # Means with footprint and opacity, then among themselves.
     for j, mean in enumerate(by_mean):
@@ -346,6 +351,7 @@ def loss_gradient(
     (rgb - 0.5)^2. The result is not diag(J^T J): gradients of different pixels cancel before they
     are squared.
     """
+    # L = mean (rgb - 0.5)^2, so dL/drgb = 2 (rgb - 0.5) / count.
     slope = lambda rgb: (rgb - 0.5) * (2 / len(rgb.array))  # noqa: E731  dL / drgb
     gradient = vjp(gaussians, slope, camera, background, cache, LEARNED)
     return np.concatenate([g.reshape(len(gaussians), -1) for g in gradient.values()], 1) ** 2

@@ -124,6 +124,7 @@ def pack_tangents(tangents: Splats, splats: Splats, place: Any) -> Any:
     tangents: derivatives of the splats' fields (`_rest` fields are not read). Packed are the
     coefficients of `log_alpha_tangent` and the tangents of depth and colour.
     """
+    # Six coefficients of the tangent of ln alpha, then those of depth and colour.
     one, xi, eta, xi_xi, xi_eta, eta_eta = log_alpha_tangent(tangents, splats).values()
     return pack_parts(
         [[one, xi, eta, xi_xi], [xi_eta, eta_eta, tangents.depth, 0], [*tangents.colour, 0]], place
@@ -248,6 +249,7 @@ def adjoint(
     dL, pixels = [], []
     for pixel in range(len(T)):
         places = lane.first + pixel
+        # <dL, C> of the finished pixel, over all channels that the loss depends on.
         rgba, d_rgba = (list(dr.gather(mi.Vector4f, a[0], places)) for a in (out, d_out))
         values, slopes = rgba[:channels], d_rgba[:channels]
         if channels == 5:
@@ -301,6 +303,7 @@ def splat_gradient(sums: list[Any], splats: Splats) -> Splats:
     """
     # Transpose of `log_alpha_tangent`: each field's gradient is its coefficient there times the
     # sum.
+    # dL/dp = sum s d(ln alpha)/dp = -(2 ln 2 / p) sum s xi^2, and so on.
     red, green, blue, depth, one, xi_xi, xi_eta, eta_eta, *first = sums
     k, p, e = splats.shear, splats.white_x, splats.white_y
     mean_x = mean_y = None

@@ -34,6 +34,7 @@ def camera_from_sensor(sensor: Any) -> Camera:
     names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
     fov, ppo_x, ppo_y = (params[name] for name in names)
     traced = dr.grad_enabled(params["to_world"].matrix, fov, ppo_x, ppo_y)
+    # f = (width / 2) / tan(x_fov / 2); c = (0.5 - offset) times the side of the film.
     focal = 0.5 * width / np.tan(0.5 * np.radians(_number(params["x_fov"])))
     cx = (0.5 - _number(params["principal_point_offset_x"])) * width
     cy = (0.5 - _number(params["principal_point_offset_y"])) * height
@@ -61,6 +62,7 @@ def _traced(to_world: Any, fov: Any, ppo_x: Any, ppo_y: Any, width: int, height:
     """K [3,3] and world_to_camera [4,4] of a sensor as TensorXf64, with gradients."""
     matrix, flip = to_world.matrix, np.diag(_MITSUBA_FROM_OPENCV).tolist()
     rows = [mi.Float64(flip[j] * matrix[i, j]) for i in range(4) for j in range(4)]
+    # world_to_camera = (to_world diag(-1, -1, 1, 1))^-1.
     inverse = dr.rcp(mi.Matrix4d(*rows))
     focal = 0.5 * width / dr.tan(dr.deg2rad(0.5 * mi.Float64(fov)))
     cx, cy = (0.5 - mi.Float64(ppo_x)) * width, (0.5 - mi.Float64(ppo_y)) * height

@@ -101,6 +101,7 @@ class Information:
         total = np.zeros(np.shape(vector))
         tangents = self._by_name(np.asarray(vector))
         for camera, root in zip(self.cameras, self._roots, strict=True):
+            # J^T W J v, view by view.
             image = np.asarray(jvp(self._model, tangents, camera, self.background, self.cache).rgb)
             total += self._transposed(image if root is None else image * root * root, camera)
         return total
@@ -113,6 +114,8 @@ class Information:
         reach it.
         """
         whiten, lam = self._whitening(lam)
+        # Solve A y = b with A = L^-1 (H + lam) L^-T and b = L^-1 v; the solution is L^-T y.
+        # x: y so far; r = b - A y, its residual; p: direction of the next step.
         b = whiten(np.asarray(vector, np.float64), True)
         x, r, p = np.zeros_like(b), b, b
         square, enough = float((r * r).sum()), tolerance**2 * float((b * b).sum())
@@ -149,12 +152,16 @@ class Information:
         for _ in range(probes):
             z = rng.choice([-1.0, 1.0], self.blocks.shape[:2])
             traces.append(z.size * self._log_quadratic(z / np.sqrt(z.size), steps, whiten, lam))
+        # log det(H + lam) = log det(L L^T) + trace log A.
         blocks = np.linalg.slogdet(self.blocks + _diagonal(lam))[1].sum()
         error = np.std(traces, ddof=1) / np.sqrt(probes)
         return Estimate(float(blocks + np.mean(traces)), float(error))
 
     def _log_quadratic(self, q: Floats, steps: int, whiten: Any, lam: Floats) -> float:
         """q^T log(A) q of a unit vector, by the Gauss quadrature of its Lanczos matrix."""
+        # A Q = Q T with orthonormal Q and tridiagonal T: a its diagonal, b beside it.
+        # Then q^T log(A) q is about e1^T log(T) e1 = sum over i of u_1i^2 log theta_i, with
+        # theta_i the eigenvalues of T and u_1i the first entries of its eigenvectors.
         basis, a, b = [q], list[float](), list[float]()
         for _ in range(min(steps, q.size)):
             w = self._whitened(basis[-1], whiten, lam)
@@ -187,6 +194,7 @@ class Information:
         rng, (n, size) = np.random.default_rng(seed), self.blocks.shape[:2]
         drawn = []
         for _ in range(count):
+            # b = lam^1/2 n + J^T W^1/2 e has the covariance H + lam, so (H + lam)^-1 b its inverse.
             b = rng.standard_normal((n, size)) * np.sqrt(lam)
             for camera, root in zip(self.cameras, self._roots, strict=True):
                 noise = rng.standard_normal((camera.height, camera.width, 3))
@@ -215,6 +223,7 @@ class Information:
         lam = np.asarray(lam, np.float64)
         if not (lam > 0).all():
             raise InputError("information: lam must be positive, else the precision has no inverse")
+        # L^-1 of each block.
         inverse = np.linalg.inv(np.linalg.cholesky(self.blocks + _diagonal(lam)))
 
         def whiten(v: Floats, transposed: bool) -> Floats:

@@ -93,6 +93,7 @@ def camera_array(camera: Camera) -> Any:
         K, pose = (_entries(tensor) for tensor in camera.traced)
         # The centre is -R^T t.
         centre = [-sum(pose[row, i] * pose[row, 3] for row in range(3)) for i in range(3)]
+    # Bounds of x/z: the film, from -cx/fx to (width - cx)/fx, and a margin on each side.
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x = FRUSTUM_MARGIN * 0.5 * camera.width / fx
     margin_y = FRUSTUM_MARGIN * 0.5 * camera.height / fy
@@ -141,11 +142,13 @@ def moved(camera: Camera, motion: Any, zoom: Any = 0.0) -> Camera:
     cross = mi.Matrix3d(0, -w.z, w.y, w.z, 0, -w.x, -w.y, w.x, 0)
     # The inverse of the camera's motion moves the points: R^T (x - shift).
     turn = mi.Matrix3d(1) - sine * cross + cosine * (cross @ cross)
+    # Points: x -> R^T (x - shift), so t -> R^T (t - shift) and R_old -> R^T R_old.
     old = camera.world_to_camera
     t = turn @ (mi.Vector3d(old[:3, 3].tolist()) - shift)
     R = turn @ mi.Matrix3d(old[:3, :3].tolist())
     rows = [x for i in range(3) for x in (R[i, 0], R[i, 1], R[i, 2], t[i])]
     pose = dr.concat([mi.Float64(x) for x in (*rows, 0.0, 0.0, 0.0, 1.0)])
+    # Focal lengths times e^zoom; entries 0 and 4 of K are fx and fy.
     factor = dr.exp(mi.Float64(zoom))
     K = [factor * x if i in (0, 4) else mi.Float64(x) for i, x in enumerate(camera.K.ravel())]
     size = camera.width, camera.height
@@ -269,6 +272,7 @@ def project64(gaussians: Gaussians, camera: Any) -> Splats:
     (x, y, depth), unit, visible = axes2d(mean, quats, camera)
     # Semi-axes in the image, pixels: s_i times the image of axis i.
     scales = dr.exp(dr.clip(log_scales, *LOG_SCALE_RANGE))
+    # Sigma = sum over i of (s_i t_i) (s_i t_i)^T + EPS2D I.
     axes = [a * s for a, s in zip(unit, scales, strict=True)]
     shear, white_x, white_y, share = whitening(axes)
     # log2 of 1 / (1 + e^-l), as min(l, 0) - ln(1 + e^-|l|), which neither overflows nor cancels.

@@ -59,6 +59,7 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
         c = 0.4886025119029199
         basis += [-c * y, c * z, -c * x]
     if degree > 1:
+        # Degree 2, then degree 3.
         basis += [
             1.0925484305920792 * x * y,
             -1.0925484305920792 * y * z,
@@ -107,12 +108,14 @@ def project(gaussians: Gaussians, camera: Camera) -> Projected:
     directions = means - camera.position
     directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
     sh = np.asarray(gaussians.sh, np.float64)
+    # rgb = max(0, 0.5 + sum over k of Y_k sh_k).
     raw = 0.5 + np.einsum("nk,nkc->nc", sh_basis(directions, gaussians.sh_degree), sh)
     opacities = expit(np.asarray(gaussians.logit_opacities, np.float64))
     compensations = np.ones(len(means))
     if gaussians.antialiased:  # |x cross y|^2 of the rows x, y of A is det(A A^T)
         own = (np.cross(A[:, 0], A[:, 1]) ** 2).sum(1)
         compensations = np.maximum(np.sqrt(own / np.linalg.det(cov2d)), COMPENSATION_MIN)
+    # Centre: (fx x / z + cx, fy y / z + cy).
     means2d = np.stack([fx * x / z + cx, fy * y / z + cy], 1)
     opacities = opacities * compensations
     return Projected(means2d, cov2d, z, opacities, compensations, np.maximum(raw, 0), visible)
@@ -147,9 +150,11 @@ def composite(
     T = np.ones(len(pixels))
     live = np.ones(len(pixels), bool)
     for i, j in enumerate(order):
+        # alpha = o exp(-d^T Sigma^-1 d / 2), 0 below ALPHA_MIN, at most ALPHA_MAX.
         power = -_half_square(pixels - projected.means2d[j], projected.cov2d[j])
         raw = projected.opacities[j] * np.exp(power)
         a = np.where(raw >= ALPHA_MIN, np.minimum(raw, ALPHA_MAX), 0.0)
+        # A pixel is finished before the splat that would leave TRANSMITTANCE_MIN or less.
         live &= (a == 0) | (T * (1 - a) > TRANSMITTANCE_MIN)
         a = np.where(live, a, 0.0)
         alpha[:, i], transmittance[:, i], clipped[:, i] = a, T, raw > ALPHA_MAX
@@ -191,10 +196,12 @@ def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     least = np.full(len(pixels), np.inf)
     T, amplification, live = np.ones(len(pixels)), np.zeros(len(pixels)), np.ones(len(pixels), bool)
     for i, j in enumerate(order):
+        # Relative distance of alpha from ALPHA_MIN and from ALPHA_MAX.
         log_raw = np.log(p.opacities[j]) - _half_square(pixels - p.means2d[j], p.cov2d[j])
         near = np.minimum(np.abs(log_raw - np.log(ALPHA_MIN)), np.abs(log_raw - np.log(ALPHA_MAX)))
         least = np.where(live, np.minimum(least, near), least)
         a = np.where(log_raw >= np.log(ALPHA_MIN), np.minimum(np.exp(log_raw), ALPHA_MAX), 0)
+        # d ln T = -sum alpha / (1 - alpha) d ln alpha.
         amplification = amplification + a / (1 - a)
         after = np.log(T * (1 - a) / TRANSMITTANCE_MIN)
         near = np.abs(after) / np.maximum(amplification, 1)
@@ -305,6 +312,7 @@ def fisher_block(
 ) -> np.ndarray:
     """Diagonal blocks of J^T J [N,P,P]. options: of `jacobian`."""
     J = jacobian(gaussians, camera, background, **options)
+    # Sum over pixels and channels of J_a J_b, for each Gaussian.
     rows = J.reshape(J.shape[0] * J.shape[1], *J.shape[2:])
     return np.matmul(rows.transpose(1, 2, 0), rows.transpose(1, 0, 2))
 

@@ -85,6 +85,7 @@ class ListCache:
         Raises InputError if a parameter is not finite, a colour beyond SH_MAX, or the view has too
         many pairs.
         """
+        # Old lists may fit no longer: footprints or depth order may have changed.
         key = camera.key
         lists = self._lists.get(key)
         dr.eval(splats)
@@ -126,6 +127,7 @@ class ListCache:
         self._lists[key] = lists
         clock, used = self._clock, self._used
         while len(self._lists) > 1 and self.nbytes > self.budget:
+            # The oldest leaves if the new one was used less than half as long ago.
             oldest = next(other for other in self._lists if other != key)
             if key in used and 2 * (clock - used[key]) < clock - used[oldest]:
                 del self._lists[oldest]
@@ -230,6 +232,7 @@ def _block_major(lists: BlockLists, width: int, height: int) -> Any:
     """Index of each pixel (row by row) in the output of the kernels (block by block), UInt32
     [H*W]."""
     index = dr.arange(mi.UInt32, width * height)
+    # Column and row of the pixel, counted from the first block of the film that it touches.
     x, y = lists.left % BLOCK_X + index % width, lists.top % BLOCK_Y + index // width
     block = (y // BLOCK_Y) * lists.blocks_x + x // BLOCK_X
     return block * PIXELS + (y % BLOCK_Y) * BLOCK_X + x % BLOCK_X
@@ -332,7 +335,9 @@ def composite(
     packed: from `walking.pack`. lists: block lists. width, height: pixels.
     """
     r, g, b, alpha, weighted = _rasterised(splats, packed, lists, width, height, 5)
+    # C = sum w c + T_end background, with T_end = 1 - alpha.
     rgb = mi.Color3f(r, g, b) + (1 - alpha) * background
+    # Expected depth: sum w z / sum w.
     expected = dr.select(alpha > 0, weighted / dr.select(alpha > 0, alpha, 1), 0)
     alpha = alpha + 0  # a leaf: forward-mode AD clears the gradients of inner variables
     shape = (height, width)

@@ -133,6 +133,7 @@ def lanes(lists: BlockLists) -> tuple[Lane, list[Any]]:
         across = lane % per_block % BLOCK_X
         down = lane % per_block // BLOCK_X
         first = block * PIXELS + lane % per_block
+    # Film coordinates of the lane's first pixel: its block, and its place in that.
     x = (lists.left // BLOCK_X + block % lists.blocks_x) * BLOCK_X + across
     y = (lists.top // BLOCK_Y + block // lists.blocks_x) * BLOCK_Y + down
 
@@ -280,6 +281,7 @@ def computed_after(x: Any, before: list[Any]) -> Any:
     """
     if not before:
         return x
+    # (bits & 1) >> 1 is 0: x | 0 = x, but computed after `before`.
     bits = mi.UInt32(0)
     for value in before:
         bits |= dr.reinterpret_array(mi.UInt32, value)
@@ -413,6 +415,7 @@ def _walk_until_done(
     """
 
     def body(i: Any, pixels: Any, alive: Any) -> Any:
+        # A lane ends with its list, or with its last unfinished pixel.
         drawn = [pair_at(lists, packed, lane, i, k) for k in range(together)]
         pixels, alive = visit(i, drawn, pixels)
         return i + together, pixels, (i + together < lane.end) & alive
@@ -457,6 +460,7 @@ def sums_by_place(lists: BlockLists, stored: Any, count: int, real: Any) -> Any:
     summed = dr.empty(real, len(lists.place) * 4 * packets)
     vector = mi.Vector4f if real is mi.Float else mi.Vector4d
     for i, total in enumerate(totals):
+        # Sums in double, rounded once.
         kept = vector(*(without_denormals(x) for x in total))
         dr.scatter(summed, kept, place * packets + i, mode=dr.ReduceMode.NoConflicts)
     return summed
