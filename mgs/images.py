@@ -158,6 +158,10 @@ def exif_exposure(path: str | Path) -> float | None:
         return None
 
 
+NO_RETURN = 1e6
+"""Metres beyond which a depth stands for none: renderers write 1e10 where nothing is hit."""
+
+
 def read_values(path: str | Path) -> np.ndarray:
     """Numbers of an image of one channel, such as depth, unchanged: [H,W] uint8 or uint16, of a
     TIFF also int32 or float32.
@@ -176,20 +180,30 @@ def read_values(path: str | Path) -> np.ndarray:
 
 def read_depth(path: str | Path, unit: float = 1e-3, float_unit: float = 1.0) -> np.ndarray:
     """Depth in metres, float32 [H,W], from EXR, or an image in steps of `unit` metres; of a TIFF of
-    floating-point numbers in steps of `float_unit`.
+    floating-point numbers in steps of `float_unit`. Negative numbers and those beyond NO_RETURN
+    become 0.
 
-    Raises InputError as `read_exr` and `read_values`, for 8 bits, and where it is not plain which
-    channel of an EXR is the depth: it is named Z or depth, in a layer or not, is the only one, or
-    all of R, G and B are equal.
+    Raises InputError as `read_exr` and `read_values`, for 8 bits, if most numbers are negative, and
+    where it is not plain which channel of an EXR is the depth: it is named Z or depth, in a layer
+    or not, is the only one, or all of R, G and B are equal.
     """
     path = Path(path)
-    if path.suffix.lower() != ".exr":
+    if path.suffix.lower() == ".exr":
+        depth = _depth_channel(path)
+    else:
         values = read_values(path)
         if values.dtype == np.uint8:
             raise InputError(
                 f"{path}: a picture of 8 bits is no depth; give 16 bits, TIFF of float32, or EXR"
             )
-        return values.astype(np.float32) * (unit if values.dtype.kind in "ui" else float_unit)
+        depth = values.astype(np.float32) * (unit if values.dtype.kind in "ui" else float_unit)
+    if (depth < 0).sum() > (depth > 0).sum():
+        raise InputError(f"{path}: its depths are negative; give distances in front of the camera")
+    return np.where((depth < 0) | (depth > NO_RETURN), np.float32(0), depth)
+
+
+def _depth_channel(path: Path) -> np.ndarray:
+    """Channel of an EXR that is its depth, float32 [H,W]. Raises InputError as `read_depth`."""
     channels = read_exr(path)
     named = [name for name in channels if name.rpartition(".")[2].lower() in ("z", "depth")]
     if len(named) == 1 or len(channels) == 1:
@@ -248,10 +262,20 @@ def read_png(path: str | Path) -> np.ndarray:
 
 
 def read_mask(path: str | Path) -> np.ndarray:
-    """Read a mask image as bool [H,W], True where it is at least half white; ignores alpha. Raises
-    InputError as `read_rgba`."""
+    """Read a mask image as bool [H,W], True where it is at least half white.
+
+    Of a picture of one colour the alpha counts. Of one with two values, the lower 0 and the other
+    under half white (labels 0 and 1, a palette), the other is True. Raises InputError as
+    `read_rgba`.
+    """
     rgba = read_rgba(path)
-    return rgba[..., :3] @ LUMA >= 0.5 * np.iinfo(rgba.dtype).max
+    layer = rgba[..., :3] @ LUMA
+    if np.ptp(layer) == 0 < np.ptp(rgba[..., 3]):
+        layer = rgba[..., 3].astype(layer.dtype)
+    half, highest = 0.5 * np.iinfo(rgba.dtype).max, layer.max()
+    if 0 < highest < half and ((layer == 0) | (layer == highest)).all():
+        return layer > 0
+    return layer >= half
 
 
 def write_exr(

@@ -12,7 +12,7 @@ from mgs.camera import Camera, look_at
 from mgs.data.agreement import BODY, FLIP, agreement, observed
 from mgs.data.dataset import write_transforms
 from mgs.data.frames import Frame
-from mgs.images import write_png
+from mgs.images import write_exr, write_png
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +87,13 @@ def test_without_matches_depth_or_directions_tell(tmp_path, depth, name):
     assert right is None or (right.error < 1 and not right.problem)
     assert depth == (right is not None)
     assert name in found.problem
+
+
+def test_depth_in_another_unit_is_named(tmp_path):
+    frames = synthetic.write_dataset(tmp_path).frames
+    for frame in frames:
+        write_exr(frame.depth_path, {"Z": 5 * frame.depth()})
+    assert "fit lengths 5 times as long" in agreement(frames).problem
 
 
 def test_points_that_pictures_show_tell(frames):

@@ -19,7 +19,7 @@ from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.lens import Lens
 from mgs.data.sources import read_source
 from mgs.errors import InputError
-from mgs.images import read_depth
+from mgs.images import read_depth, read_mask
 
 COLOUR = "/camera/color/image_raw"
 
@@ -292,6 +292,40 @@ def test_masks_in_folders_are_those_of_their_images(data, tmp_path, capsys):
     assert "2 images have this name" in refused(capsys, [*asked, tmp_path / "no"], tmp_path)
 
 
+MASKS = {
+    "labels 0 and 1": lambda mask: Image.fromarray(mask),
+    "a palette": lambda mask: labelled(mask, [0, 0, 0, 128, 0, 0]),
+    "alpha of one colour": lambda mask: Image.fromarray(
+        np.dstack([np.full((*mask.shape, 3), 255, np.uint8), 255 * mask])
+    ),
+    "a soft edge": lambda mask: Image.fromarray(np.where(mask, 200, 90).astype(np.uint8)),
+}
+
+
+def labelled(mask, colours):
+    image = Image.fromarray(mask).convert("P")
+    image.putpalette(colours + [0] * (768 - len(colours)))
+    return image
+
+
+@pytest.mark.parametrize("kind", MASKS)
+def test_masks_of_other_programs(tmp_path, kind):
+    mask = np.eye(5, dtype=np.uint8)
+    MASKS[kind](mask).save(tmp_path / "a.png")
+    assert np.array_equal(read_mask(tmp_path / "a.png"), mask > 0)
+
+
+def test_masks_and_test_views_without_effect_are_noticed(data, tmp_path, capsys):
+    for frame in data.frames:
+        frame.mask_path.unlink()
+        Image.new("L", (32, 24)).save(frame.mask_path)
+    synthetic.edit(data.root, lambda json: json.update(test_filenames=["images/none.png"]))
+    command("import", data.root, "--out", tmp_path / "out")
+    errors = said(capsys)[1]
+    assert "the masks are empty" in errors
+    assert "1 test views are no frame, as none" in errors
+
+
 def write_channels(path, channels):
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, channels) as file:
@@ -323,6 +357,11 @@ def test_depth_is_right_or_refused(tmp_path):
         write_channels(exr, channels)
         with pytest.raises(InputError, match="is not plain"):
             read_depth(exr)
+    write_channels(exr, {"Z": np.where(depth > 2, 1e10, depth).astype(np.float32)})
+    assert np.array_equal(read_depth(exr), np.where(depth > 2, 0, depth))
+    write_channels(exr, {"Z": -depth})
+    with pytest.raises(InputError, match="its depths are negative"):
+        read_depth(exr)
     Image.fromarray(depth).save(tiff)
     assert np.array_equal(read_depth(tiff), depth)
     cv2.imwrite(str(png), np.round(1000 * depth).astype(np.uint16))

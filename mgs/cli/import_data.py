@@ -131,6 +131,12 @@ def _advice(found: Source, result: Dataset) -> Iterator[str]:
             f"{_numbers(found.origin)} is the origin now, from which all positions count; exports "
             "add it again, and `mgs suggest --origin` is its latitude and longitude"
         )
+    some = result.frames[:: max(1, len(result) // 10)]
+    masks = [frame.mask() for frame in some if frame.mask_path]
+    if masks and not any(mask.any() for mask in masks):
+        yield "the masks are empty: the object must be white in them"
+    if masks and all(mask.all() for mask in masks):
+        yield "the masks cover their pictures whole: only the object must be white in them"
     stops = [value for shot in found.shots if (value := exif_exposure(shot.image)) is not None]
     if stops and max(stops) - min(stops) > EXPOSURE_DIFFERS:
         yield (

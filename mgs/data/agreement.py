@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -35,13 +36,14 @@ SOUND = 0.25
 MENDED = 0.25
 """Error under another convention over that under ours, below which that convention is named."""
 
-ZOOMS = np.exp(np.linspace(np.log(0.4), np.log(2.5), 61))
-"""Factors on the focal length that are tried."""
+ZOOM, SCALE = 2.5, 1200.0
+"""Largest factors, either way, on the focal length, and on the poses' lengths against the depth,
+that are tried."""
 
 HIDDEN = 1.05
 """Depth of a point over that of the picture, beyond which the point is taken as hidden."""
 
-LEAST_SEEN = 0.05
+LEAST_SEEN = 0.1
 """Least share of the points of a depth image that a neighbour must see for their comparison."""
 
 PARALLEL = 0.02
@@ -99,7 +101,7 @@ def agreement(frames: Sequence[Frame]) -> Agreement | None:
         for one, other in pairs
         if (points := _matches(one, other)) is not None
     ]
-    width = frames[0].camera.width
+    width, found = frames[0].camera.width, []
     if len(matched) >= LEAST_PAIRS:
         count = sum(len(points) for _, _, points, _ in matched)
 
@@ -107,7 +109,9 @@ def agreement(frames: Sequence[Frame]) -> Agreement | None:
             each = [np.median(_epipolar_error(*pair, convention, zoom)) for pair in matched]
             return float(np.quantile(each, SOUND, method="higher"))
 
-        return _judged(by_matches, f"{count:,} points matched in neighbouring pictures", width)
+        found.append(
+            _judged(by_matches, f"{count:,} points matched in neighbouring pictures", width)
+        )
     if all(frame.depth_path for pair in pairs for frame in pair) and pairs:
         measured = [(one, one.depth(), other, other.depth()) for one, other in pairs]
 
@@ -115,12 +119,11 @@ def agreement(frames: Sequence[Frame]) -> Agreement | None:
             each = [_depth_error(*pair, convention, zoom) for pair in measured]
             return float(np.quantile(each, 0.5, method="lower"))
 
-        found = _judged(
-            by_depth, f"the depth of {len(pairs)} pairs of neighbouring pictures", width
-        )
-        if found:
-            return found
-    return _directions([frame.camera for frame in frames])
+        what = f"the depth of {len(pairs)} pairs of neighbouring pictures"
+        found.append(_judged(by_depth, what, width, lengths=True))
+    compared = [one for one in found if one]
+    wrong = [one for one in compared if one.problem]
+    return [*wrong, *compared, _directions([frame.camera for frame in frames])][0]
 
 
 def observed(seen: Sequence[tuple[Camera, np.ndarray, np.ndarray]]) -> Agreement | None:
@@ -140,27 +143,41 @@ def observed(seen: Sequence[tuple[Camera, np.ndarray, np.ndarray]]) -> Agreement
     return _judged(error, f"{count:,} places where pictures show its points", seen[0][0].width)
 
 
-def _judged(error: Error, evidence: str, width: int) -> Agreement | None:
+def _judged(error: Error, evidence: str, width: int, lengths: bool = False) -> Agreement | None:
     """Agreement by an error; what mends it, a convention or a focal length, is named. None if
     the error is infinite and nothing mends it."""
     ours = error(_same, 1.0)
     if ours < 1:
         return Agreement(ours, evidence)
-    least, name = min((error(convention, 1.0), name) for name, convention in CONVENTIONS)
-    if least < MENDED * ours:
-        return Agreement(ours if np.isfinite(ours) else None, evidence, name)
-    if not np.isfinite(ours):
+    mended = [(error(convention, 1.0), name) for name, convention in CONVENTIONS]
+    mended = [min(mended, key=lambda pair: pair[0])]
+    each, zoom = _searched(lambda zoom: error(_same, zoom), ZOOM)
+    mended.append((each, f"fit a focal length {zoom:.2f} times as long: correct it"))
+    if lengths:
+        each, factor = _searched(lambda factor: error(partial(_scaled, factor=factor), 1.0), SCALE)
+        unit = f"fit lengths {factor:.3g} times as long: give poses and depth in one unit"
+        mended.append((each, unit))
+    measured = ours if np.isfinite(ours) else None
+    for each, name in mended:
+        if each < MENDED * ours and each <= 2 * min(mended)[0]:
+            return Agreement(measured, evidence, name)
+    if measured is None:
         return None
-    zooms = [error(_same, zoom) for zoom in ZOOMS]
-    zoom = float(ZOOMS[int(np.argmin(zooms))])
-    if min(zooms) < MENDED * ours:
-        return Agreement(
-            ours, evidence, f"fit a focal length {zoom:.2f} times as long: correct the focal length"
-        )
-    problem = ""
-    if ours > WRONG * width:
-        problem = "do not belong to these pictures: check their order, their names and the lens"
-    return Agreement(ours, evidence, problem)
+    wrong = "do not belong to these pictures: check their order, their names and the lens"
+    return Agreement(ours, evidence, wrong if ours > WRONG * width else "")
+
+
+def _searched(error: Callable[[float], float], most: float) -> tuple[float, float]:
+    """Least error, and the factor between 1 / most and most that has it."""
+    coarse = np.exp(np.arange(-np.log(most), np.log(most), 0.1))
+    best = min(coarse, key=error)
+    return min(
+        (error(factor), float(factor)) for factor in best * np.exp(np.linspace(-0.1, 0.1, 21))
+    )
+
+
+def _scaled(world_to_camera: np.ndarray, factor: float) -> np.ndarray:
+    return world_to_camera * np.array([[1, 1, 1, factor]] * 3 + [[1, 1, 1, 1]])
 
 
 def _same(world_to_camera: np.ndarray) -> np.ndarray:
@@ -229,7 +246,8 @@ def _depth_error(
     usable = (depth > 0) & (z < HIDDEN * depth)
     if usable.sum() < max(LEAST_SEEN * len(points), 1):
         return np.inf
-    return float(np.median(zoom * other.camera.K[0, 0] * np.abs(1 - depth[usable] / z[usable])))
+    pixels = zoom * other.camera.K[0, 0] * np.abs(1 - depth[usable] / z[usable])
+    return float(np.median(pixels))
 
 
 def _matches(one: Frame, other: Frame) -> tuple[np.ndarray, np.ndarray] | None:

@@ -58,13 +58,13 @@ class Lens:
         known = {"fx": K[0, 0], "fy": K[1, 1], "f": K[0, 0], "cx": K[0, 2], "cy": K[1, 2]}
         if "f" in names and not np.isclose(K[0, 0], K[1, 1]):
             raise InputError(f"{where} has two focal lengths, and {model} has one; correct them")
-        if lacking := [name for name in values if name not in names]:
-            raise InputError(
-                f"{where} has {lacking[0]}, which the model {model} lacks; undistort the images"
-            )
         if not names or "w" in names:
             raise InputError(
                 f"{where}: camera model {model} is not supported; undistort the images first"
+            )
+        if lacking := [name for name in values if name not in names]:
+            raise InputError(
+                f"{where} has {lacking[0]}, which the model {model} lacks; undistort the images"
             )
         if model == "PINHOLE":
             return None

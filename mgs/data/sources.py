@@ -178,14 +178,21 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
         time, name = timestamp_of(where, index, record), frame_name(record["file_path"])
         files = image, depth, scale, mask, rock
         shots.append(Shot(name, camera, lens, time, *files, float_unit=of_floats))
-    note = f"{rounded} rotations were rounded when they were written; they are made orthonormal"
+    notes = []
+    if rounded:
+        notes.append(
+            f"{rounded} rotations were rounded when they were written; they are made orthonormal"
+        )
+    listed = {frame_name(record["file_path"]) for record in records}
+    if unknown := {frame_name(name) for name in tests} - listed:
+        notes.append(f"{len(unknown)} test views are no frame, as {min(unknown)}")
     cloud = path.parent / str(data["ply_file_path"]) if data.get("ply_file_path") else None
     no_cloud = cloud if cloud is not None and not cloud.is_file() else None
     return Source(
         "NeRF-synthetic" if "camera_angle_x" in data and "fl_x" not in data else "nerfstudio",
         shots,
         left_out,
-        (note,) if rounded else (),
+        tuple(notes),
         sparse=read_cloud(cloud) if cloud is not None and no_cloud is None else None,
         up=unit_up(data["up"]) if data.get("up") else None,
         unit=unit_of(path, data) or ("m" if any(shot.depth for shot in shots) else None),
@@ -207,8 +214,9 @@ def _splits(
         listed.append(set(names))
     train, val, test = listed
     tests = (test | val) - train
+    named = {frame_name(name) for name in train | tests}
     every = {record["file_path"] for record in records}
-    return tests, every - train - tests if train else set()
+    return tests, {name for name in every if frame_name(name) not in named} if train else set()
 
 
 def record_camera(
