@@ -129,6 +129,11 @@ def test_names_with_numbers_are_in_their_order(tmp_path, data):
     (tmp_path / "o/color/11.png").unlink()
     with pytest.raises(InputError, match="12 poses for 11 images in color"):
         read_source(tmp_path / "o")
+    (tmp_path / "o/color/10.png").rename(tmp_path / "o/color/11.png")
+    (tmp_path / "o/color/0.png").rename(tmp_path / "o/color/first.png")
+    shutil.copy(tmp_path / "o/color/11.png", tmp_path / "o/color/10.png")
+    with pytest.raises(InputError, match=r"first\.png: its name has no number"):
+        read_source(tmp_path / "o")
     folder = write_rtabmap(tmp_path / "r", data)
     with open(folder / "rtabmap_camera_poses.txt", "a") as file:
         file.write("\n0 1 2 3 0 0 0 1 -7\n")
@@ -322,7 +327,7 @@ def test_masks_and_test_views_without_effect_are_noticed(data, tmp_path, capsys)
     synthetic.edit(data.root, lambda json: json.update(test_filenames=["images/none.png"]))
     command("import", data.root, "--out", tmp_path / "out")
     errors = said(capsys)[1]
-    assert "the masks are empty" in errors
+    assert "12 of 12 masks looked at are empty" in errors
     assert "1 test views are no frame, as none" in errors
 
 

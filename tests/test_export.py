@@ -270,6 +270,13 @@ def test_short_quaternions_are_rotations(tmp_path):
     np.testing.assert_allclose(covariances(read), covariances(model), atol=1e-6)
 
 
+def test_float32_too_far_from_the_origin_is_noticed(tmp_path):
+    model = gaussians(0)
+    write_ply(tmp_path / "x.ply", replace(model, means=model.means + np.float32(5e6)))
+    with pytest.warns(Notice, match=r"steps of 0\.5 so far from the origin"):
+        load_gaussians(tmp_path / "x.ply")
+
+
 def test_an_spz_of_version_1_has_positions_of_float16(tmp_path):
     """Its encoder: the streams in their order, after the published description."""
     pytest.importorskip("gsply_cpp")

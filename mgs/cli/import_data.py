@@ -28,6 +28,9 @@ MANY_PIXELS = 2_000_000
 EXPOSURE_DIFFERS = 0.1
 """Difference of exposure by EXIF, stops, beyond which --exposure is recommended."""
 
+MOSTLY = 0.3
+"""Share of empty masks beyond which a line says so."""
+
 FILES = ("import.json", "transforms.json", "images", "depth", "masks", "rock", "sparse.ply", "test")
 """Names in a folder of this command."""
 
@@ -133,8 +136,12 @@ def _advice(found: Source, result: Dataset) -> Iterator[str]:
         )
     some = result.frames[:: max(1, len(result) // 10)]
     masks = [frame.mask() for frame in some if frame.mask_path]
-    if masks and not any(mask.any() for mask in masks):
-        yield "the masks are empty: the object must be white in them"
+    empty = sum(not mask.any() for mask in masks)
+    if empty > MOSTLY * len(masks):
+        yield (
+            f"{empty} of {len(masks)} masks looked at are empty: the object must be white "
+            "in them, and a mesh in the cameras' axes"
+        )
     if masks and all(mask.all() for mask in masks):
         yield "the masks cover their pictures whole: only the object must be white in them"
     stops = [value for shot in found.shots if (value := exif_exposure(shot.image)) is not None]

@@ -43,7 +43,7 @@ that are tried."""
 HIDDEN = 1.05
 """Depth of a point over that of the picture, beyond which the point is taken as hidden."""
 
-LEAST_SEEN = 0.1
+LEAST_SEEN = 0.25
 """Least share of the points of a depth image that a neighbour must see for their comparison."""
 
 PARALLEL = 0.02

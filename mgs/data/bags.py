@@ -138,10 +138,11 @@ class Tree:
         sources: dict[str, dict[str, Samples]] = defaultdict(lambda: defaultdict(dict))
         chosen = "" if topic is None else topic
         for name, message in messages(reader, "TFMessage", "tfMessage", "Odometry", topic=topic):
-            for each in getattr(message, "transforms", None) or [message]:
+            several = hasattr(message, "transforms")
+            for each in message.transforms if several else [message]:
                 child = str(getattr(each, "child_frame_id", "")).lstrip("/")
                 pose = message_of(each.transform if hasattr(each, "transform") else each.pose)
-                kind = "tf" if hasattr(each, "transform") else name
+                kind = "tf" if several else name
                 time = 0.0 if "static" in name else seconds(each)
                 if frame_of(each) != child:
                     steps = sources[child][kind].setdefault(frame_of(each), [])
@@ -191,7 +192,7 @@ class Tree:
 
 def _pose_topics(reader: Any) -> str:
     """Topics of poses that could be given as pose."""
-    kinds = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry")
+    kinds = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
     found = [one.topic for one in reader.connections if one.msgtype.rpartition("/")[2] in kinds]
     return ", ".join(sorted(set(found))) or "none"
 

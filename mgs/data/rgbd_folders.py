@@ -5,6 +5,7 @@ Each reader returns keyframes, in metres.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -150,6 +151,10 @@ def read_open3d(folder: Path, spacing: Spacing) -> Source:
                 f"{path}: has {len(matrices)} poses for {len(listed)} images in {name}; "
                 "make them equal"
             )
+    if unnumbered := [path for path in images if not re.search(r"\d", path.name)]:
+        raise InputError(
+            f"{unnumbered[0]}: its name has no number, which gives its pose; rename it"
+        )
     times = OPEN3D_INTERVAL * np.arange(len(images))
     K, lens = calibration(folder)
     shots: list[Shot] = []
