@@ -477,7 +477,7 @@ def test_a_world_in_which_nothing_would_be_drawn_is_one_line(tmp_path, capsys):
 def test_poses_alone_are_fitted_from_random_points(tmp_path, capsys):
     bare(tmp_path / "d")
     command("prior", tmp_path / "d", "--gaussians", "300")
-    assert "300 random points" in capsys.readouterr().out
+    assert "300, in and around a ball" in capsys.readouterr().out
     fitted = ["fit", tmp_path / "d", "--passes", "2", "--out", tmp_path / "run"]
     assert "let means be free" in refused(capsys, [*fitted, "--means", "frozen"], tmp_path / "run")
     command(*fitted)
