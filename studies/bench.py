@@ -1,7 +1,8 @@
 """Time the splatting kernels and Mitsuba's own splatting integrator, `volprim_rf_basic`.
 
-Kernels are compiled and memory is allocated before anything is timed. Times are medians. Ratios of
-times are about the same on other machines; times are not.
+The scene is a rock of surface Gaussians in an image of 640x480 pixels. Kernels are compiled and
+memory is allocated before anything is timed: let nothing else run meanwhile. Times are medians.
+Ratios of times are about the same on other machines; times are not.
 """
 
 from __future__ import annotations
@@ -10,18 +11,22 @@ import resource
 import time
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mgs.camera import Camera, look_at
-from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
+from mgs import Camera, Gaussians, ListCache, as_drjit, fisher, look_at, render, runtime
+from mgs.files import check_new_file, write_json
+from mgs.gaussians import LEARNED, sh_from_rgb
 from mgs.memory import padded
+from mgs.provenance import versions
+from mgs.reports.tables import markdown
 from mgs.rotation import quat_from_normals
 from mgs.seeds import derive_seed, generator
-from mgs.splat import ListCache, as_drjit, fisher, render
+from studies.frame.program import Study, Work, at_least, study_of
 
 WARM_UP = 2
 """Untimed calls before the timed ones: they compile kernels and allocate memory."""
@@ -173,22 +178,17 @@ def time_volprim(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str
     return {"volprim_forward": primal, "volprim_gradient": median_seconds(backward, repeats)}
 
 
-def bench_splat(
-    n: int, width: int, height: int, repeats: int, report: Callable[[str], None]
-) -> dict[str, Any]:
+def bench_splat(n: int, width: int, height: int, repeats: int) -> dict[str, Any]:
     """Measure what the program prints: n Gaussians in an image of width x height pixels.
 
-    report(what) is called before each measurement. Returns "scene"; "seconds" of each operation;
-    "ratios", time of Mitsuba's integrator over ours (..._speedup) and of the Fisher information
-    over that of image and gradient; and "peak_memory_megabytes" of the process before Mitsuba's
-    integrator is loaded.
+    Returns "scene"; "seconds" of each operation; "ratios", time of Mitsuba's integrator over ours
+    (..._speedup) and of the Fisher information over that of image and gradient; and
+    "peak_memory_megabytes" of the process before Mitsuba's integrator is loaded.
     """
     gaussians = surface_gaussians(n)
     camera = surface_camera(gaussians, width, height)
-    report("splatting")
     own = time_core(gaussians, camera, repeats)
     memory = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 1e3
-    report("Mitsuba's volprim_rf_basic")
     peer = time_volprim(gaussians, camera, max(repeats // 3, 3))
     ratios = {
         "forward_warm_speedup": peer["volprim_forward"] / own["forward_warm"],
@@ -205,7 +205,39 @@ def bench_splat(
     }
 
 
-if __name__ == "__main__":
-    from studies.commands import start
+def write(work: Work) -> list[Path]:
+    """Print the measurements; with --json, write them with the command, machine and versions."""
+    options = work.options
+    if options.json is not None:
+        check_new_file(options.json)  # before minutes of measuring
+    runtime.start()
+    result = bench_splat(options.gaussians, 640, 480, options.repeats)
+    seconds = [(key.replace("_", " "), f"{1e3 * s:.1f}") for key, s in result["seconds"].items()]
+    ratios = [(key.replace("_", " "), f"{ratio:.3g}") for key, ratio in result["ratios"].items()]
+    print(markdown(("operation", "milliseconds"), seconds))
+    print(markdown(("ratio", "measured"), ratios))
+    print(f"peak memory {result['peak_memory_megabytes']:.0f} MB")
+    if options.json is None:
+        return []
+    made = {"command": work.command, "machine": runtime.processor(), "versions": versions()}
+    write_json(options.json, result | made)
+    return [options.json]
 
-    start("bench")
+
+STUDY = Study(
+    "bench",
+    __doc__,
+    write,
+    options={
+        "--json": {"type": Path, "help": "Write all measurements to this file."},
+        "--gaussians": {"type": at_least(1000), "default": 100_000, "help": "Default: 100,000."},
+        "--repeats": {
+            "type": at_least(3),
+            "default": 9,
+            "help": "Calls of each operation; the median counts. Default: 9.",
+        },
+    },
+)
+
+if __name__ == "__main__":
+    study_of("bench")()

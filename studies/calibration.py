@@ -1,19 +1,27 @@
-"""Accuracy of predicted errors: functions of errors and of their predicted standard deviations,
-both [n].
+"""Predict the errors of unseen views of runs and compare them with the true ones.
+
+Writes RUN/diagnostics/uncertainty.json and uncertainty.png, and NAME.errors.exr with the true error
+and the predicted standard deviation of some views (`studies.predicted_error`). This module measures
+the predictions: its functions are of errors and of predicted standard deviations, both [n].
 
 AUSE and the calibration follow the usual definitions for uncertainty maps (sparsification curves;
-probability integral transform; continuous ranked probability score of a normal distribution).
+probability integral transform).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
+
+from mgs import runtime
+from mgs.files import folder_locked
+from studies.frame.program import Study, Work, study_of
 
 Array = NDArray[np.floating]
 
@@ -111,7 +119,6 @@ def judged(
     - spearman: rank correlation of sigma with the absolute error.
     - held: share of the errors inside the interval of each of LEVELS, over all pixels and over
       thirds of them by sigma.
-    - crps, crps_constant: mean, of sigma and of one sigma for all.
     - pit: shares of the probability integral transform in BINS bins.
     """
     from scipy.stats import spearmanr  # here, because it takes 0.2 s
@@ -124,27 +131,30 @@ def judged(
         str(level): [float((np.abs(z[part]) <= width).mean()) for part in parts]
         for level, width in widths.items()
     }
-    rms = float(np.sqrt(np.square(errors).mean()))
     return {
         "count": len(errors),
-        "rms": rms,
+        "rms": float(np.sqrt(np.square(errors).mean())),
         "ause": area | {"perfect": ause(drawn, sigma)},
         "spearman": float(spearmanr(sigma, size).statistic) if np.ptp(sigma) > 0 else 0.0,
         "held": held,
-        "crps": crps(errors, sigma),
-        "crps_constant": crps(errors, np.full(len(errors), max(rms, 1e-30))),
         "pit": (np.histogram(ndtr(z), BINS, (0, 1))[0] / len(z)).tolist(),
     }
 
 
-def crps(errors: Array, sigma: Array) -> float:
-    """Mean continuous ranked probability score of normal distributions around 0."""
-    z = errors / sigma
-    density = np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi)
-    return float((sigma * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi))).mean())
+def write(work: Work) -> list[Path]:
+    """Calibrate each run."""
+    from studies.predicted_error import calibrate_run  # which imports this module
 
+    runtime.start()
+    paths = []
+    for run in work.options.run:
+        with folder_locked(run / "diagnostics"):
+            paths += calibrate_run(run)
+    return paths
+
+
+RUNS = {"run": {"nargs": "+", "type": Path, "help": "Folders that `mgs nbv` wrote."}}
+STUDY = Study("calibration", __doc__, write, options=RUNS)
 
 if __name__ == "__main__":
-    from studies.commands import start
-
-    start("calibration")
+    study_of("calibration")()

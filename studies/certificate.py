@@ -6,25 +6,43 @@ After the seeds, plans of several sizes and other sets are compared with the bou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import spearmanr
 
-from mgs.learning import fit_views, learn
+import mgs
+from mgs.files import write_csv
+from mgs.learning import fit_views
 from mgs.policy import certificate, poses
 from mgs.policy.relaxation import Relaxation
 from mgs.run.directional import DIRECTIONAL_D, Directional
-from mgs.scene import Scene, State
-from studies.case import Rock
-from studies.output import Content, Panel, draw_panels, table
-from studies.setups import SETUPS, Found, SetupSize, before_any_fit, case_of, shared_scene
-from studies.statistics import interval
-from studies.sweep import Cell
-from studies.verdict import Row
+from studies.frame.case import ROCKS, Rock
+from studies.frame.claim import Row
+from studies.frame.output import (
+    Content,
+    Panel,
+    draw_panels,
+    grouped,
+    over_scenes,
+    scene_mean,
+    table,
+    write_table,
+)
+from studies.frame.program import WORKERS, Study, Work, study_of
+from studies.frame.sweep import Cell
+from studies.setups import (
+    SETUPS,
+    Results,
+    SetupSize,
+    before_any_fit,
+    case_of,
+    shared_scene,
+    sized,
+)
 
 SETUP = SETUPS["hemisphere"]
 
@@ -33,57 +51,80 @@ POLICIES = {policy.name: policy for policy in (Directional(), DIRECTIONAL_D)}
 TRAINING = tuple(Rock(scene) for scene in ("boulder", "contact-binary", "low-sun", "pebbles"))
 """Rocks that chose the default of `enough`."""
 
-COUNTS = (4, 8)
-"""Sizes of plans."""
+NODES = 40
+"""Nodes of branch and bound."""
 
-SHARES = (0.8, 0.85, 0.9, 0.95, 0.98)
-"""Shares of the gain of all candidates at which greedy sets end."""
 
-NODES, DRAWS, SIZE = 40, 20, 8
-"""Nodes of branch and bound; random sets by the criterion; views of a random set that is fitted."""
+@dataclass(frozen=True)
+class CertificateSize(SetupSize):
+    """Size of the study.
 
-BATCHES, BATCH, GAUSSIANS = 4, 50, 6000
-"""Cells of random sets that are fitted, sets in each, and Gaussians of the priors of fits."""
+    counts: views of plans. shares: of the gain of all candidates at which greedy sets end. sets:
+    random sets by the criterion. batches, batch: cells of random sets that are fitted, and sets in
+    each, of so many `views`. fitted: Gaussians of the priors of fits. training: rocks that chose
+    the default of `enough`.
+    """
+
+    counts: tuple[int, ...] = (4, 8)
+    shares: tuple[float, ...] = (0.8, 0.85, 0.9, 0.95, 0.98)
+    sets: int = 20
+    batches: int = 4
+    batch: int = 50
+    views: int = 8
+    fitted: int = 6000
+    training: tuple[Rock, ...] = TRAINING
+
+
+SIZES = {"quick": CertificateSize(), "paper": CertificateSize(320, 240, 24, 16)}
 
 KINDS = ("bound", "plan", "even", "random")
 """Keys of `mgs.policy.certificate.curve`."""
 
 
-def cells_of(size: SetupSize, rocks: Iterable[Rock]) -> list[Cell]:
+def cells_of(size: CertificateSize) -> list[Cell]:
     """Cells of each rock: its dataset, prior, plans and fits. "part" of the last: plans, training,
     growing or random."""
-    cells, rocks = [], list(rocks)
     parts: list[tuple[str, str, dict[str, Any], Sequence[Rock]]]
-    parts = [("training", "growing", {}, TRAINING), ("growing", "growing", {}, rocks)]
-    parts.append(("plans", "planned", {}, rocks))
-    parts += [("random", "randomised", {"batch": k}, rocks) for k in range(BATCHES)]
-    for part, task, arguments, some in parts:
-        for rock in some:
-            name = "/".join(["certificate", rock.name, part, *map(str, arguments.values())])
-            one = size if part == "plans" else replace(size, gaussians=GAUSSIANS // size.fewer)
-            case = case_of(rock, SETUP, one)
-            *data, last = case.with_task(name, f"{__name__}:{task}", seed=rock.index, **arguments)
-            about = {"rock": rock.name, "scene": rock.scene, "part": part}
+    shares = {"shares": list(size.shares)}
+    parts = [
+        ("training", "growing", shares, size.training),
+        ("growing", "growing", shares, size.rocks),
+    ]
+    of_plans = {"counts": list(size.counts), "sets": size.sets}
+    parts.append(("plans", "planned", of_plans, size.rocks))
+    for k in range(size.batches):
+        of_sets = {"batch": [k, size.batch], "views": size.views}
+        parts.append((f"random/{k}", "randomised", of_sets, size.rocks))
+    cells = []
+    for part, task, arguments, rocks in parts:
+        one = size if part == "plans" else replace(size, gaussians=size.fitted)
+        for rock in rocks:
+            name = f"certificate/{rock.name}/{part}"
+            how = {"seed": rock.index, **arguments}
+            *data, last = case_of(rock, SETUP, one).with_task(name, f"{__name__}:{task}", **how)
+            about = {"rock": rock.name, "scene": rock.scene, "part": part.partition("/")[0]}
             cells += [*data, replace(last, about=about)]
     return cells
 
 
 def _of_rock(
-    root: Path, dataset: str, prior: str, start: Callable[[Scene], State]
-) -> tuple[Scene, State, list[int], dict[str, Relaxation], Any]:
+    root: Path, dataset: str, prior: str, start: Callable[[mgs.Scene], mgs.State]
+) -> tuple[mgs.Scene, mgs.State, list[int], dict[str, Relaxation], Any]:
     """Scene, state after the seeds, candidates, relaxations by policy, and PSNR of a model."""
-    scene, tests, _, _ = shared_scene(root / dataset, root / prior, root / dataset, None)
+    scene, tests, _ = shared_scene(root / dataset, root / prior, None)
     state = start(scene)
     free = [i for i in range(len(scene.frames)) if i not in state.taken]
     made = {name: policy.relaxation(scene, state, free) for name, policy in POLICIES.items()}
     return scene, state, free, made, tests
 
 
-def planned(root: Path, out: Path, dataset: str, prior: str, seed: int) -> dict[str, Any]:
+def planned(
+    root: Path, out: Path, dataset: str, prior: str, seed: int, counts: Sequence[int], sets: int
+) -> dict[str, Any]:
     """Task: "plans", a row for each policy and size; "curve", that of the first policy."""
     rng = np.random.default_rng(seed)
 
-    def start(scene: Scene) -> State:
+    def start(scene: mgs.Scene) -> mgs.State:
         return before_any_fit(scene, SETUP.seeds)
 
     scene, state, free, made, _ = _of_rock(root, dataset, prior, start)
@@ -95,11 +136,11 @@ def planned(root: Path, out: Path, dataset: str, prior: str, seed: int) -> dict[
     even = poses.spread(positions[free], positions[seeds], scene.centre)
     plans = []
     for name, one in made.items():
-        for k in COUNTS:
-            others = even[:k], draws(rng, len(free), k, DRAWS)
+        for k in counts:
+            others = even[:k], draws(rng, len(free), k, sets)
             plans.append({"policy": name} | compared(one, plan(name, k), *others))
     name, one = next(iter(made.items()))
-    curve = certificate.curve(one, plan(name, max(COUNTS)), even)
+    curve = certificate.curve(one, plan(name, max(counts)), even)
     return {"gaussians": len(scene.prior.points), "plans": plans, "curve": curve}
 
 
@@ -109,8 +150,8 @@ def _psnr_of(
     """PSNR on test views of fits to sets, which start at the model of the seeds as in a run; and
     the sets' gains by policy."""
 
-    def start(scene: Scene) -> State:
-        return learn(scene, scene.seeds(SETUP.seeds))
+    def start(scene: mgs.Scene) -> mgs.State:
+        return mgs.learn(scene, scene.seeds(SETUP.seeds))
 
     scene, state, free, made, tests = _of_rock(root, dataset, prior, start)
     rows = []
@@ -123,14 +164,16 @@ def _psnr_of(
     return {"sets": rows}
 
 
-def growing(root: Path, out: Path, dataset: str, prior: str, seed: int) -> dict[str, Any]:
-    """Task: "sets", the greedy sets of each policy that end at SHARES, and all candidates."""
+def growing(
+    root: Path, out: Path, dataset: str, prior: str, seed: int, shares: Sequence[float]
+) -> dict[str, Any]:
+    """Task: "sets", the greedy sets of each policy that end at these shares, and all candidates."""
 
     def sets_of(made: dict[str, Relaxation], count: int) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = [
             {"policy": name, "share": share, "set": certificate.greedy(one, share)}
             for name, one in made.items()
-            for share in SHARES
+            for share in shares
         ]
         return [*rows, {"policy": "", "share": 1.0, "set": list(range(count))}]
 
@@ -138,13 +181,13 @@ def growing(root: Path, out: Path, dataset: str, prior: str, seed: int) -> dict[
 
 
 def randomised(
-    root: Path, out: Path, dataset: str, prior: str, seed: int, batch: int
+    root: Path, out: Path, dataset: str, prior: str, seed: int, batch: Sequence[int], views: int
 ) -> dict[str, Any]:
-    """Task: "sets", BATCH random sets of SIZE."""
-    rng = np.random.default_rng([seed, batch])
+    """Task: "sets", random sets of so many views. batch: its number, and the number of sets."""
+    rng = np.random.default_rng([seed, batch[0]])
 
     def sets_of(_: dict[str, Relaxation], count: int) -> list[dict[str, Any]]:
-        return [{"set": some} for some in draws(rng, count, SIZE, BATCH)]
+        return [{"set": some} for some in draws(rng, count, views, batch[1])]
 
     return _psnr_of(root, dataset, prior, sets_of)
 
@@ -176,7 +219,7 @@ def compared(
     }
 
 
-def rows_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
+def rows_of(results: Results, cells: Sequence[Cell]) -> list[Row]:
     """A row for each rock, policy and size of a plan: gains as shares of the bound, and
     "correlation" of the criterion and PSNR over the rock's random sets."""
     rows: list[Row] = []
@@ -199,7 +242,7 @@ def rows_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
     return rows
 
 
-def losses_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
+def losses_of(results: Results, cells: Sequence[Cell]) -> list[Row]:
     """Rows with "part" (training or growing), rock, scene, policy, share, views, and "loss" against
     all candidates, dB."""
     rows: list[Row] = []
@@ -215,59 +258,34 @@ def _of_part(part: str, cells: Sequence[Cell]) -> list[Cell]:
     return [cell for cell in cells if cell.about.get("part") == part]
 
 
-def _mean(rows: Sequence[Row], key: str, form: str) -> str:
-    """Mean over scenes with its 95 % interval."""
-    scenes: dict[str, list[float]] = {}
-    for row in rows:
-        scenes.setdefault(row["scene"], []).append(row[key])
-    values = [float(np.mean(of)) for of in scenes.values()]
-    ends, middle = interval(values), format(float(np.mean(values)), form)
-    return middle if ends is None else f"{middle} [{ends[0]:{form}}, {ends[1]:{form}}]"
-
-
-def text_of(rows: Sequence[Row], losses: Sequence[Row]) -> str:
+def text_of(rows: Sequence[Row], losses: Sequence[Row], size: CertificateSize) -> str:
     """Tables of plans, bounds, correlation and losses: means over scenes, 95 % intervals."""
-    lines: dict[tuple[Any, ...], list[Row]] = {}
-    for row in rows:
-        lines.setdefault((row["policy"], row["views"]), []).append(row)
-    shares: dict[tuple[Any, ...], list[Row]] = {}
-    for row in losses:
-        shares.setdefault((row["policy"], row["share"]), []).append(row)
-
-    def of(key: str, form: str, part: str = "") -> Callable[[Row], str]:
-        return lambda line: _mean(
-            [row for row in line["of"] if not part or row["part"] == part], key, form
-        )
-
-    names = ("plan", "greedy", "farthest", "random, mean", f"random, best of {DRAWS}")
+    names = ("plan", "greedy", "farthest", "random, mean", f"random, best of {size.sets}")
     keys = ("plan", "greedy", "farthest", "random", "random_best")
     of_sets: dict[str, Content] = {"policy": "policy", "views": "views:d"}
-    of_sets |= {name: of(key, ".3f") for name, key in zip(names, keys, strict=True)}
+    of_sets |= {name: scene_mean(key, ".3f") for name, key in zip(names, keys, strict=True)}
     of_plans: dict[str, Content] = {
         "policy": "policy",
         "views": "views:d",
-        "plan / relaxation": of("relaxed", ".3f"),
-        "one view less / plan": of("fewer", ".3f"),
+        "plan / relaxation": scene_mean("relaxed", ".3f"),
+        "one view less / plan": scene_mean("fewer", ".3f"),
     }
-    of_ranks: dict[str, Content] = {
-        "policy": "policy",
-        f"rank correlation, {BATCHES * BATCH} sets of {SIZE}": of("correlation", ".2f"),
-    }
+    fits = f"rank correlation, {size.batches * size.batch} sets of {size.views}"
+    of_ranks: dict[str, Content] = {"policy": "policy", fits: scene_mean("correlation", ".2f")}
     of_losses: dict[str, Content] = {
         "policy": "policy",
         "share of all": "share:.2f",
-        "views": of("views", ".1f", "growing"),
-        "dB lost, training rocks": of("loss", ".2f", "training"),
-        "dB lost, others": of("loss", ".2f", "growing"),
+        "views": scene_mean("views", ".1f", part="growing"),
+        "dB lost, training rocks": scene_mean("loss", ".2f", part="training"),
+        "dB lost, others": scene_mean("loss", ".2f", part="growing"),
     }
-    every = [{"policy": name, "views": k, "of": some} for (name, k), some in lines.items()]
-    last = [line for line in every if line["views"] == max(COUNTS)]
-    ends = [{"policy": name, "share": k, "of": some} for (name, k), some in shares.items()]
+    every, ends = grouped(rows, "policy", "views"), grouped(losses, "policy", "share")
+    last = [line for line in every if line["views"] == max(size.counts)]
     made = ((of_sets, every), (of_plans, every), (of_ranks, last), (of_losses, ends))
     return "\n".join(table(*one) for one in made)
 
 
-def curve_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
+def curve_of(results: Results, cells: Sequence[Cell]) -> list[Row]:
     """Rows of the curve: rock, scene, views, kind (of KINDS), percent of the gain of all."""
     return [
         dict(cell.about) | {"views": row["views"], "kind": kind, "percent": 100 * row[kind]}
@@ -279,19 +297,38 @@ def curve_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
 
 def draw(path: Path, curve: Sequence[Row]) -> None:
     """Draw gains against the number of views: bound, plan, farthest poses, random."""
-    by_scene: dict[tuple[Any, ...], list[float]] = {}
-    for row in curve:
-        by_scene.setdefault((row["scene"], row["views"], row["kind"]), []).append(row["percent"])
     rows = [
-        {"scene": scene, "views": views, "kind": kind, "percent": float(np.mean(of))}
-        for (scene, views, kind), of in by_scene.items()
+        group | {"percent": percent}
+        for group in grouped(curve, "views", "kind")
+        for percent in over_scenes(group["of"], "percent").values()
     ]
     label = "gain of all candidates (%)"
     title = "directional-i, after four seeds"
     draw_panels(path, [Panel("views", "percent", "views chosen", label, "kind", title=title)], rows)
 
 
-if __name__ == "__main__":
-    from studies.commands import start
+def write(work: Work) -> list[Path]:
+    """Write certificate.csv, .json, .md and .png, certificate-curve.csv and -losses.csv."""
+    rows, losses, curve = (
+        make(work.results, work.cells) for make in (rows_of, losses_of, curve_of)
+    )
+    draw(work.out / "certificate.png", curve)
+    text = text_of(rows, losses, work.size)
+    paths = write_table(work, "certificate", rows, text, rocks=len(work.size.rocks))
+    for name, of in (("curve", curve), ("losses", losses)):
+        paths.append(write_csv(work.out / f"certificate-{name}.csv", of))
+    return [*paths, work.out / "certificate.png"]
 
-    start("certificate")
+
+STUDY = Study(
+    "certificate",
+    __doc__,
+    write,
+    SIZES,
+    lambda work: cells_of(work.size),
+    ROCKS | WORKERS,
+    sized,
+)
+
+if __name__ == "__main__":
+    study_of("certificate")()

@@ -3,31 +3,32 @@
 A point is one `mgs nbv`: its time, and its quality on the test views. A *fit* takes all its images
 at once, evenly spaced in azimuth; a *run* starts from the seeds and chooses the other images one by
 one. Factors are varied one at a time around the default; those that matter most are crossed.
+
+Points are timed one by one: let nothing else run meanwhile.
 """
 
 from __future__ import annotations
 
 import shlex
 import shutil
+from argparse import Namespace
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mgs.data.dataset import load_dataset
+import mgs
 from mgs.fit.settings import COLOURS_ALONE, PASSES, WARM_PASSES
 from mgs.plotting import drawing
-from mgs.run.folder import Checkpoint
-from mgs.run.nbv import run_nbv
-from studies.case import Case, Rock, Size, judge, test_views_of
-from studies.output import Content, group_styles, logarithmic, table, write_table
-from studies.statistics import pareto_front
-from studies.sweep import Cell, Report, Results, run_cells
-from studies.timing import span, timed, with_seconds
-from studies.verdict import Claim, Row, judged, verdict_table
+from studies.frame.case import Case, Rock, Size, judge, test_views_of
+from studies.frame.claim import Claim, Row, judged, pareto_front, verdict_table
+from studies.frame.output import Content, group_styles, logarithmic, table, write_table
+from studies.frame.program import Study, Work, at_least, names_of, study_of
+from studies.frame.sweep import Cell, Results
+from studies.frame.timing import REFERENCE, span, timed, with_seconds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,9 +62,12 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class ChartSize:
-    """Size of the charts. images: of the dataset. count: images fitted, of which `seeds` are evenly
-    spaced. repeats: default number of timings. run_passes: of the first fit of runs. The other
-    fields are values of factors."""
+    """Size of the charts.
+
+    images: of the dataset. count: images fitted, of which `seeds` are evenly spaced. repeats:
+    timings of each point. run_passes: of the first fit of runs. reference: of `timed`. kinds: of
+    KINDS. given: a dataset in place of the rendered one. The other fields are values of factors.
+    """
 
     images: Size
     count: int
@@ -73,7 +77,17 @@ class ChartSize:
     run_passes: tuple[int, ...]
     image_counts: tuple[int, ...]
     policies: tuple[str, ...]
+    estimators: tuple[str, ...] = ("loss-gradient",)
+    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: PRESETS)
     seeds: int = 4
+    reference: tuple[int, int, int] = REFERENCE
+    kinds: tuple[str, ...] = KINDS
+    given: Path | None = None
+
+    def case(self, density: float) -> Case:
+        """Case with a prior of this density."""
+        label = self.given.name if self.given else ""
+        return Case(Rock(SCENE), self.images, {"density": density}, self.given, label=label)
 
 
 SIZES = {
@@ -159,7 +173,7 @@ def factors(size: ChartSize) -> dict[str, list[Point]]:
             replace(fit, density=d, passes=p) for d in size.densities for p in size.passes
         ],
         "policy": [replace(run, policy=name) for name in ("d-optimal", *size.policies)],
-        "estimator": [replace(run, estimator="loss-gradient")],
+        "estimator": [replace(run, estimator=name) for name in size.estimators],
         "number and passes": [
             replace(run, density=d, passes=p, warm_passes=LATER_PASSES[p])
             for d in size.densities[-3:]
@@ -172,7 +186,7 @@ def factors(size: ChartSize) -> dict[str, list[Point]]:
 def preset_points(size: ChartSize) -> dict[str, Point]:
     """Runs with PRESETS."""
     run = Point(size.count, policy="d-optimal")
-    return {name: replace(run, **row) for name, row in PRESETS.items()}
+    return {name: replace(run, **row) for name, row in size.presets.items()}
 
 
 def points_of(size: ChartSize, kind: str) -> list[Point]:
@@ -181,67 +195,62 @@ def points_of(size: ChartSize, kind: str) -> list[Point]:
     return list(dict.fromkeys(points))
 
 
-@dataclass(frozen=True)
-class Data:
-    """Points of a size, to be measured on the rendered scene or on a given dataset."""
+def cells_of(size: ChartSize) -> list[Cell]:
+    """Cells of all points, and those they need."""
+    cells: list[Cell] = []
+    for point in (point for kind in size.kinds for point in points_of(size, kind)):
+        how = {"repeats": size.repeats, "settings": point.settings(size.seeds)}
+        how["reference"] = list(size.reference)
+        task = f"{__name__}:measure"
+        cells += size.case(point.density).with_task(point.name, task, alone=True, **how)
+    return cells
 
-    size: ChartSize
-    given: Path | None = None
 
-    def case(self, density: float) -> Case:
-        """Case with a prior of this density."""
-        label = self.given.name if self.given else ""
-        settings = {"density": density}
-        return Case(Rock(SCENE), self.size.images, settings, self.given, label=label)
-
-    def cells(self, kind: str, repeats: int) -> list[Cell]:
-        """Cells of all points of a kind, and those they need."""
-        cells: list[Cell] = []
-        for point in points_of(self.size, kind):
-            given = {"repeats": repeats, "settings": point.settings(self.size.seeds)}
-            case = self.case(point.density)
-            cells += case.with_task(point.name, f"{__name__}:measure", alone=True, **given)
-        return cells
-
-    def rows(self, kind: str, root: Path, found: Results, unit: float) -> list[Row]:
-        """A row for each point of a kind: factors, settings, results, command, and whether it is on
-        the front of seconds against PSNR and SSIM among points of as many images. unit: seconds of
-        the reference."""
-        by_factor, rows = factors(self.size), list[Row]()
-        presets = {point: name for name, point in preset_points(self.size).items()}
-        for point in points_of(self.size, kind):
-            case = self.case(point.density)
-            names = [name for name in by_factor if point in by_factor[name]]
-            row: Row = {"factors": "; ".join(names), "preset": presets.get(point, "")}
-            row |= asdict(point) | found[point.name]
-            row |= {"gaussians": found[case.prior_name]["gaussians"]}
-            where = root / case.dataset, root / case.prior
-            rows.append(row | {"command": point.command(*where, self.size.seeds)})
-        rows = with_seconds(rows, unit)
-        for count in {row["images"] for row in rows}:
-            alike = [row for row in rows if row["images"] == count]
-            seconds = [row["seconds"] for row in alike]
-            for column, metric in (("front", "psnr"), ("front_ssim", "ssim")):
-                front = pareto_front(seconds, [row[metric] for row in alike])
-                for row, on in zip(alike, front, strict=True):
-                    row[column] = bool(on)
-        return rows
+def rows_of(size: ChartSize, kind: str, root: Path, results: Results, unit: float) -> list[Row]:
+    """A row for each point of a kind: factors, settings, results, command, and whether it is on the
+    front of seconds against PSNR and SSIM among points of as many images. unit: seconds of the
+    reference."""
+    by_factor, rows = factors(size), list[Row]()
+    presets = {point: name for name, point in preset_points(size).items()}
+    for point in points_of(size, kind):
+        case = size.case(point.density)
+        names = [name for name in by_factor if point in by_factor[name]]
+        row: Row = {"factors": "; ".join(names), "preset": presets.get(point, "")}
+        row |= asdict(point) | results[point.name]
+        row |= {"gaussians": results[case.prior_name]["gaussians"]}
+        where = root / case.dataset, root / case.prior
+        rows.append(row | {"command": point.command(*where, size.seeds)})
+    rows = with_seconds(rows, unit)
+    for count in {row["images"] for row in rows}:
+        alike = [row for row in rows if row["images"] == count]
+        seconds = [row["seconds"] for row in alike]
+        for column, metric in (("front", "psnr"), ("front_ssim", "ssim")):
+            front = pareto_front(seconds, [row[metric] for row in alike])
+            for row, on in zip(alike, front, strict=True):
+                row[column] = bool(on)
+    return rows
 
 
 def measure(
-    root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any], repeats: int
+    root: Path,
+    out: Path,
+    dataset: str,
+    prior: str,
+    settings: dict[str, Any],
+    repeats: int,
+    reference: Sequence[int] = REFERENCE,
 ) -> dict[str, Any]:
     """Task: time a run, files included, and judge its model. Returns times (`timed`), qualities and
     passes of all fits together."""
     given = settings | {"train": settings["train"] | COLOURS_ALONE}
 
-    def run() -> Checkpoint:
+    def run() -> mgs.Checkpoint:
         shutil.rmtree(out / "run", ignore_errors=True)
-        return run_nbv(root / dataset, out / "run", prior=root / prior, **given).state
+        return mgs.run_nbv(root / dataset, out / "run", prior=root / prior, **given).state
 
-    state, times = timed(run, repeats)
+    state, times = timed(run, repeats, tuple(reference))
     shutil.rmtree(out / "run")
-    metrics = judge(state.gaussians, load_dataset(root / dataset))
+    metrics = judge(state.gaussians, mgs.load_dataset(root / dataset))
     return {
         **times,
         **{name: metrics[name] for name in QUALITIES},
@@ -288,42 +297,32 @@ COLUMNS: dict[str, Content] = {
 
 def check_dataset(dataset: Path) -> None:
     """Raises InputError for a dataset that cannot be read or has no test views."""
-    test_views_of(load_dataset(dataset))
+    test_views_of(mgs.load_dataset(dataset))
 
 
-def run_chart(
-    out: Path,
-    preset: str,
-    kinds: Sequence[str],
-    repeats: int | None,
-    dataset: Path | None,
-    report: Report,
-) -> dict[str, tuple[list[Row], list[Row]]]:
-    """Measure fits, runs or both, and write KIND.csv, .json, .md and .png; returns rows and judged
-    claims by kind.
+def sized(size: ChartSize, options: Namespace) -> ChartSize:
+    """Size with the options."""
+    given: Path | None = options.dataset and options.dataset.resolve()
+    if given:
+        check_dataset(given)
+    kinds = tuple(names_of(options.only, KINDS))
+    return replace(size, given=given, kinds=kinds, repeats=options.repeats or size.repeats)
 
-    preset: of SIZES. repeats: by default those of the size. dataset: in place of the rendered one
-    (`check_dataset`).
-    """
-    size = SIZES[preset]
-    repeats = repeats or size.repeats
-    data, measured = Data(size, dataset.resolve() if dataset else None), {}
-    cells = [cell for kind in kinds for cell in data.cells(kind, repeats)]
-    found = run_cells(out, cells, report)
-    unit = float(np.median([one["reference"] for one in found.values() if "reference" in one]))
-    for kind in kinds:
-        words = ["python", "-m", "studies.chart", str(out), "--only", kind, "--scale", preset]
-        words += ["--repeats", str(repeats), *(["--dataset", str(dataset)] if dataset else [])]
-        rows = data.rows(kind, out, found, unit)
+
+def write(work: Work) -> list[Path]:
+    """Write KIND.csv, .json, .md and .png for each kind."""
+    size, results, paths = work.size, work.results, list[Path]()
+    unit = float(np.median([one["reference"] for one in results.values() if "reference" in one]))
+    for kind in size.kinds:
+        rows = rows_of(size, kind, work.out, results, unit)
         claims = [judged(PRESET_CLAIM, rows)] if kind == "run" else []
         shown = [row for row in rows if row["front"] or row["preset"]]
         text = table(COLUMNS, sorted(shown, key=lambda row: (row["images"], row["seconds"])))
         text += f"\n{verdict_table(claims)}" if claims else ""
-        more = {"preset": preset, "repeats": repeats, "reference_seconds": unit, "claims": claims}
-        write_table(out, kind, rows, text, shlex.join(words), **more)
-        draw(out / f"{kind}.png", {kind: rows})
-        measured[kind] = rows, claims
-    return measured
+        more = {"repeats": size.repeats, "reference_seconds": unit, "claims": claims}
+        paths += [*write_table(work, kind, rows, text, **more), work.out / f"{kind}.png"]
+        draw(paths[-1], {kind: rows})
+    return paths
 
 
 TITLES = {"fit": "What a second buys: single fits", "run": "What a second buys: whole runs"}
@@ -372,7 +371,25 @@ def _draw_kind(axes: Axes, rows: Sequence[Row], looks: Mapping[str, dict[str, An
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, fontsize=9)
 
 
-if __name__ == "__main__":
-    from studies.commands import start
+STUDY = Study(
+    "chart",
+    __doc__,
+    write,
+    SIZES,
+    lambda work: cells_of(work.size),
+    {
+        "--dataset": {
+            "type": Path,
+            "help": "A dataset with test views, in place of the rendered one.",
+        },
+        "--only": {"help": "fit or run. Default: both."},
+        "--repeats": {
+            "type": at_least(1),
+            "help": "Timings of each point; the median counts. Default: quick 2, full 3.",
+        },
+    },
+    sized,
+)
 
-    start("chart")
+if __name__ == "__main__":
+    study_of("chart")()

@@ -7,29 +7,52 @@ there are the metres with which even spacing has the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import mgs
 from mgs.learning import fit_views
 from mgs.policy import tour
 from mgs.policy.poses import travel_cost
 from mgs.run.choosing import planned_flight, rated
 from mgs.run.directional import DIRECTIONAL_D
 from mgs.run.flight import flight_of, reachable
-from mgs.run.settings import FlightLimits, Mission
-from mgs.scene import Scene, State
-from studies.case import Rock
-from studies.output import Content, Panel, draw_panels, table
+from mgs.run.settings import FlightLimits
+from studies.frame.case import ROCKS
+from studies.frame.claim import Row
+from studies.frame.output import (
+    Content,
+    Panel,
+    draw_panels,
+    grouped,
+    over_scenes,
+    scene_mean,
+    table,
+    write_table,
+)
+from studies.frame.program import WORKERS, Study, Work, study_of
+from studies.frame.sweep import Cell
 from studies.policies import angle
-from studies.setups import SETUPS, Found, SetupSize, before_any_fit, case_of, shared_scene
-from studies.statistics import interval
-from studies.sweep import Cell
-from studies.verdict import Row
+from studies.setups import (
+    SETUPS,
+    Results,
+    SetupSize,
+    before_any_fit,
+    case_of,
+    shared_scene,
+    sized,
+)
+
+SIZES = {
+    "quick": SetupSize(gaussians=6000, passes=10),
+    "paper": SetupSize(320, 240, 24, 16, passes=10),
+}
 
 POOLS = {"dome": SETUPS["one seed"], "mixed distances": SETUPS["mixed distances"]}
 """Candidates; the flight starts with one seed in both."""
@@ -41,11 +64,11 @@ EVEN, EVEN_IMAGES = "even spacing", (2, 3, 4, 5, 6, 8, 11, 15, 20, 27, 36)
 """Baseline, and its numbers of images."""
 
 OURS = "planned tour"
-Flier = Callable[[Scene, State, Mission], list[int]]
+Flier = Callable[[mgs.Scene, mgs.State, mgs.Mission], list[int]]
 """(scene, state after the seed, mission with a limit) -> the views of a flight in flying order."""
 
 
-def one_by_one(scene: Scene, state: State, mission: Mission) -> list[int]:
+def one_by_one(scene: mgs.Scene, state: mgs.State, mission: mgs.Mission) -> list[int]:
     """Views of the largest score / travel cost in reach, one after another."""
     while views := reachable(scene, state, mission):
         cost = None
@@ -57,7 +80,7 @@ def one_by_one(scene: Scene, state: State, mission: Mission) -> list[int]:
     return list(state.taken)
 
 
-def cut(scene: Scene, state: State, mission: Mission) -> list[int]:
+def cut(scene: mgs.Scene, state: mgs.State, mission: mgs.Mission) -> list[int]:
     """Views in the order of a choice without a limit, as many as a short tour can take."""
     flight = flight_of(scene, state, mission)
     order = one_by_one(scene, state, mission.model_copy(update={"flight": FlightLimits()}))
@@ -65,7 +88,7 @@ def cut(scene: Scene, state: State, mission: Mission) -> list[int]:
     return max((way for way in flown if flight.share(flight.metres(way), len(way)) <= 1), key=len)
 
 
-def planned(scene: Scene, state: State, mission: Mission) -> list[int]:
+def planned(scene: mgs.Scene, state: mgs.State, mission: mgs.Mission) -> list[int]:
     """Views of the tour that the policy plans."""
     return [*state.taken, *planned_flight(scene, state, DIRECTIONAL_D, mission)]
 
@@ -76,7 +99,7 @@ def short_tour(legs: np.ndarray, views: Sequence[int]) -> list[int]:
     return [home, *tour.flying_order(legs, home, stops, home)]
 
 
-def evenly_spaced(scene: Scene, state: State, count: int) -> list[int]:
+def evenly_spaced(scene: mgs.Scene, state: mgs.State, count: int) -> list[int]:
     """`count` views, each the farthest in direction from those before."""
     chosen, positions = list(state.taken), scene.positions(state.frames)
     while len(chosen) < count:
@@ -95,38 +118,42 @@ FLIERS: Mapping[str, tuple[Flier, dict[str, Any]]] = {
 """Fliers by name, all with `directional-d`, and fields of their `Mission`."""
 
 
-def cells_of(size: SetupSize, rocks: Iterable[Rock]) -> list[Cell]:
+def cells_of(size: SetupSize) -> list[Cell]:
     """A cell for each rock and pool, with its dataset and prior."""
     cells: dict[str, Cell] = {}
-    for rock in rocks:
-        for name, setup in POOLS.items():
-            case = case_of(rock, setup, size)
-            count = "" if size.gaussians is None else f"-{size.gaussians}"
-            folder = f"{name.replace(' ', '-')}-{size.width}x{size.height}{count}"
-            frames = setup.frames // size.fewer
-            *data, last = case.with_task(
-                f"flights/{rock.name}/{folder}", f"{__name__}:fly_and_judge", frames=frames
-            )
-            about = {"rock": rock.name, "scene": rock.scene, "pool": name}
-            cells |= {cell.name: cell for cell in (*data, replace(last, about=about))}
+    for rock, (name, setup) in product(size.rocks, POOLS.items()):
+        count = "" if size.gaussians is None else f"-{size.gaussians}"
+        folder = f"{name.replace(' ', '-')}-{size.width}x{size.height}{count}"
+        *data, last = case_of(rock, setup, size).with_task(
+            f"flights/{rock.name}/{folder}",
+            f"{__name__}:fly_and_judge",
+            frames=setup.frames // size.fewer,
+            passes=size.passes,
+        )
+        about = {"rock": rock.name, "scene": rock.scene, "pool": name}
+        cells |= {cell.name: cell for cell in (*data, replace(last, about=about))}
     return list(cells.values())
 
 
-def fly_and_judge(root: Path, out: Path, dataset: str, prior: str, frames: int) -> dict[str, Any]:
+def fly_and_judge(
+    root: Path, out: Path, dataset: str, prior: str, frames: int, passes: int
+) -> dict[str, Any]:
     """Task: fly every policy with every length, and judge a fit to each flight's images.
 
-    Returns "flights": "policy", "length" (None for even spacing), "images", "metres", "psnr" and
+    Returns "whole", metres of a short tour through all candidates, and "flights": for each one
+    "policy", "length" over `whole` (None for even spacing), "images", "metres", "psnr" and
     "psnr_mask" over the test views, dB, and "taken".
     """
-    scene, tests, _, _ = shared_scene(root / dataset, root / prior, root / dataset, None)
-    state, mission = before_any_fit(scene, 1), Mission(seeds=1, budget=frames - 1)
+    scene, tests, _ = shared_scene(root / dataset, root / prior, None)
+    state, mission = before_any_fit(scene, 1), mgs.Mission(seeds=1, budget=frames - 1)
     anywhere = flight_of(scene, state, mission)
     everywhere = [*state.taken, *reachable(scene, state, mission)]
     whole = anywhere.metres(short_tour(anywhere.legs, everywhere))
+    train = scene.settings.train.model_copy(update={"passes": passes})
 
     @cache
     def judged(views: tuple[int, ...]) -> dict[str, float]:
-        on = tests(fit_views(scene, scene.frames, views)[0].gaussians)
+        on = tests(fit_views(scene, scene.frames, views, train=train)[0].gaussians)
         return {key: float(on[key].mean()) for key in ("psnr", "psnr_mask")}
 
     def flight(policy: str, length: float | None, taken: list[int]) -> Row:
@@ -144,7 +171,7 @@ def fly_and_judge(root: Path, out: Path, dataset: str, prior: str, frames: int) 
     return {"whole": whole, "flights": flights}
 
 
-def rows_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
+def rows_of(results: Results, cells: Sequence[Cell]) -> list[Row]:
     """A row for each flight, with "gain": dB over even spacing with the same metres, and "ratio":
     metres over those with which even spacing has the same PSNR, both interpolated. The ratio is
     None where the PSNR is below that of the shortest flight with even spacing."""
@@ -164,57 +191,32 @@ def rows_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
     return rows
 
 
-def by_scene(rows: Sequence[Row]) -> list[Row]:
-    """Means over the rocks of a scene, for each pool, policy and length; NaN for a missing one."""
-    groups: dict[tuple[Any, ...], list[Row]] = {}
-    keys = ("scene", "pool", "policy", "length")
-    for row in rows:
-        if row["length"] is not None:
-            groups.setdefault(tuple(row[key] for key in keys), []).append(row)
-    numbers = ("images", "metres", "psnr", "psnr_mask", "gain", "ratio")
-    return [
-        dict(zip(keys, group, strict=True))
-        | {key: float(np.mean(np.array([row[key] for row in found], float))) for key in numbers}
-        for group, found in groups.items()
-    ]
+COLUMNS: dict[str, Content] = {
+    "candidates": "pool",
+    "length": "length:.0%",
+    "policy": "policy",
+    "images": scene_mean("images", ".1f", ends=False),
+    "PSNR (dB)": scene_mean("psnr", ".2f", ends=False),
+    "over even spacing (dB)": scene_mean("gain", "+.2f"),
+    "metres / even spacing's": scene_mean("ratio", ".2f"),
+}
 
 
 def text_of(rows: Sequence[Row]) -> str:
     """A line for each pool, length and policy: means over scenes with 95 % intervals."""
-    groups: dict[tuple[str, float, str], list[Row]] = {}
-    for row in by_scene(rows):
-        groups.setdefault((row["pool"], row["length"], row["policy"]), []).append(row)
-
-    def mean(key: str, form: str) -> Callable[[Row], str]:
-        def cell(line: Row) -> str:
-            values = [row[key] for row in line["of"]]
-            if np.isnan(values).any():
-                return "–"
-            ends = interval(values)
-            middle = format(float(np.mean(values)), form)
-            return middle if ends is None else f"{middle} [{ends[0]:{form}}, {ends[1]:{form}}]"
-
-        return cell
-
-    columns: dict[str, Content] = {
-        "candidates": "pool",
-        "length": "length:.0%",
-        "policy": "policy",
-        "images": lambda line: f"{np.mean([row['images'] for row in line['of']]):.1f}",
-        "PSNR (dB)": lambda line: f"{np.mean([row['psnr'] for row in line['of']]):.2f}",
-        "over even spacing (dB)": mean("gain", "+.2f"),
-        "metres / even spacing's": mean("ratio", ".2f"),
-    }
-    lines = [
-        {"pool": pool, "length": length, "policy": policy, "of": groups[pool, length, policy]}
-        for pool, length, policy in sorted(groups, key=lambda one: (one[0], one[1]))
-    ]
-    return table(columns, lines)
+    limited = [row for row in rows if row["length"] is not None]
+    lines = grouped(limited, "pool", "length", "policy")
+    return table(COLUMNS, sorted(lines, key=lambda line: (line["pool"], line["length"])))
 
 
 def draw(path: Path, rows: Sequence[Row]) -> None:
     """Draw the metres over those of even spacing against the length, means over scenes."""
-    shown = [row | {"percent": 100 * row["length"]} for row in by_scene(rows)]
+    limited = [row for row in rows if row["length"] is not None]
+    shown = [
+        group | {"percent": 100 * group["length"], "ratio": ratio}
+        for group in grouped(limited, "pool", "policy", "length")
+        for ratio in over_scenes(group["of"], "ratio").values()
+    ]
     labels = "flight / whole tour (%)", "metres / even spacing's"
     panels = [
         Panel("percent", "ratio", *labels, "policy", only=(("pool", pool),), title=pool)
@@ -223,7 +225,23 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     draw_panels(path, panels, shown, "Metres of a flight over even spacing's with the same PSNR")
 
 
-if __name__ == "__main__":
-    from studies.commands import start
+def write(work: Work) -> list[Path]:
+    """Write flights.csv, .json, .md and .png."""
+    rows = rows_of(work.results, work.cells)
+    draw(work.out / "flights.png", rows)
+    paths = write_table(work, "flights", rows, text_of(rows), rocks=len(work.size.rocks))
+    return [*paths, work.out / "flights.png"]
 
-    start("flights")
+
+STUDY = Study(
+    "flights",
+    __doc__,
+    write,
+    SIZES,
+    lambda work: cells_of(work.size),
+    ROCKS | WORKERS,
+    sized,
+)
+
+if __name__ == "__main__":
+    study_of("flights")()

@@ -4,59 +4,47 @@ may exist."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from argparse import Namespace
+from dataclasses import replace
 
 import numpy as np
 
-from mgs.data.dataset import Dataset
+import mgs
 from mgs.evaluation import psnr_measure
 from mgs.learning import fit_views
-from mgs.run.policies import Policy
-from mgs.scene import Scene, State
-from mgs.splat import ListCache
+from studies import setups
+from studies.frame.program import study_of
 
 
 class Oracle:
-    """Policy that fits to every candidate; its score is the mean PSNR over the test views, dB.
-
-    It reads the images of the candidates. policies: compared with it at each choice; `tried` has a
-    row for each choice (`foretold`).
-    """
+    """Policy that fits to every candidate; its score is the mean PSNR over the test views, dB."""
 
     name, needs_fit = "oracle", True
 
-    def __init__(self, tests: Dataset, policies: Sequence[Policy] = ()) -> None:
-        self.measure, self.policies = psnr_measure(tests, ListCache()), policies
-        self.tried: list[dict[str, dict[str, float]]] = []
+    def __init__(self, tests: mgs.Dataset) -> None:
+        self.measure = psnr_measure(tests, mgs.ListCache())
 
-    def __call__(self, scene: Scene, state: State, views: list[int]) -> np.ndarray:
+    def __call__(self, scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
         fits = (fit_views(scene, state.frames, (*state.taken, view), state)[0] for view in views)
-        scores = np.array([self.measure(fit.gaussians, [])["psnr"] for fit in fits])
-        self.tried.append(foretold(self.policies, scene, state, views, scores))
-        return scores
+        return np.array([self.measure(fit.gaussians, [])["psnr"] for fit in fits])
 
 
-def foretold(
-    policies: Sequence[Policy], scene: Scene, state: State, views: list[int], psnr: np.ndarray
-) -> dict[str, dict[str, float]]:
-    """Compare the scores of policies with the PSNR after the fit to each candidate.
+def sized(size: setups.SetupSize, options: Namespace) -> setups.SetupSize:
+    """As in the set-ups, with two rocks by default."""
+    return setups.sized(replace(size, count=2), options)
 
-    psnr: mean PSNR of the candidates over the test views [C], dB. Returns for each policy
-    "spearman", the rank correlation (0 if all scores are equal), and "regret", dB: the PSNR of the
-    best candidate less that of the candidate with the best score.
-    """
-    from scipy.stats import spearmanr
 
-    rows = {}
-    for policy in policies:
-        scores = np.asarray(policy(scene, state, views))
-        rank = spearmanr(scores, psnr).statistic if np.ptp(scores) > 0 else 0
-        regret = psnr.max() - psnr[int(np.argmax(scores))]
-        rows[policy.name] = {"spearman": float(rank), "regret": float(regret)}
-    return rows
-
+STUDY = replace(
+    setups.STUDY,
+    name="oracle",
+    about="Compare policies as `setups` does, with an oracle that chooses the view which raises "
+    "the PSNR of the test views most: an upper bound for policies, which cannot see test views.",
+    cells=lambda work: [
+        *setups.cells_of(work.size),
+        *setups.cells_of(work.size, (setups.ORACLE,)),
+    ],
+    sized=sized,
+)
 
 if __name__ == "__main__":
-    from studies.commands import start
-
-    start("oracle")
+    study_of("oracle")()

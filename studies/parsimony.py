@@ -16,21 +16,19 @@ from typing import Any
 
 import numpy as np
 
-from mgs.data.dataset import load_dataset
+import mgs
 from mgs.fit.evidence import lean_fit
 from mgs.fit.pruning import prune
-from mgs.fit.settings import RATES, ModelSettings, TrainSettings
-from mgs.gaussians import Gaussians
+from mgs.fit.settings import RATES
 from mgs.learning import fit_views, images_of
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.policy.poses import seed_views
-from mgs.prior.build import load_prior
-from mgs.scene import Scene, State
 from mgs.splat import groups
-from studies.case import Case, Rock, Size, judge
-from studies.output import Content, Panel, draw_panels, table, write_table
-from studies.sweep import Cell, Report, run_cells
-from studies.verdict import Claim, Row, judged, single, verdict_table
+from studies.frame.case import Case, Rock, Size, judge
+from studies.frame.claim import Claim, Row, judged, single, verdict_table
+from studies.frame.output import Content, Panel, draw_panels, table, write_table
+from studies.frame.program import Study, Work, study_of
+from studies.frame.sweep import Cell
 
 AUTO = "auto"
 """Automatic number of Gaussians."""
@@ -44,8 +42,6 @@ LEARNED = {
 """Kinds of parameters that are learned, by what each set adds to the one before."""
 
 ALL = "+ rotation"
-
-DEGREES = (0, 1, 2)
 
 NUMBER, KINDS, DEGREE = "number of Gaussians", "kinds learned", "SH degree"
 AUTOMATIC, PRUNED = "automatic", "pruned"
@@ -72,13 +68,14 @@ CLOSE = 0.1
 @dataclass(frozen=True)
 class ParsimonySize:
     """Size of the study. counts: fixed numbers of Gaussians. views: images that are fitted, the
-    first `seeds` at once."""
+    first `seeds` at once. degrees: of the SH."""
 
     scenes: tuple[str, ...]
     counts: tuple[int, ...]
     images: Size
     views: int
     seeds: int = 4
+    degrees: tuple[int, ...] = (0, 1, 2)
 
     def case(self, scene: str, gaussians: int | str) -> Case:
         """Case of a scene with a prior of so many Gaussians."""
@@ -102,7 +99,7 @@ def fixed_choices(size: ParsimonySize) -> list[Fixed]:
     """Fixed choices of number, kinds and degree, one factor at a time."""
     choices: list[Fixed] = [(NUMBER, n, ALL, 0) for n in size.counts]
     choices += [(KINDS, AUTO, learned, 0) for learned in LEARNED]
-    return choices + [(DEGREE, AUTO, ALL, degree) for degree in DEGREES]
+    return choices + [(DEGREE, AUTO, ALL, degree) for degree in size.degrees]
 
 
 def _fit_name(scene: str, gaussians: int | str, learned: str, degree: int) -> str:
@@ -147,9 +144,9 @@ def fit_and_judge(
     """Task: fit views one after the other; returns quality and cost, and the same of the model
     pruned at each of `noises`."""
     rates = {kind: rate if kind in LEARNED[learned] else 0.0 for kind, rate in RATES.items()}
-    train = TrainSettings(rates=rates)
-    settings = ModelSettings(sh=degree, train=train)
-    scene = Scene(load_dataset(root / dataset), load_prior(root / prior), settings)
+    train = mgs.TrainSettings(rates=rates)
+    settings = mgs.ModelSettings(sh=degree, train=train)
+    scene = mgs.Scene(mgs.load_dataset(root / dataset), mgs.load_prior(root / prior), settings)
     spent = list[float]()
     order = views_in_order(scene.positions(scene.frames), scene.centre, views, seeds)
     for i in order:
@@ -161,7 +158,7 @@ def fit_and_judge(
         spent.append(time.perf_counter() - began)
         passes, model = passes + fit.passes, fit.gaussians
         nothing = np.zeros((0, 0))  # no view is chosen by information
-        before = State(scene.frames, tuple(order[:count]), seeds, model, nothing, nothing)
+        before = mgs.State(scene.frames, tuple(order[:count]), seeds, model, nothing, nothing)
     cameras = [scene.frames[i].camera for i in order]
     kinds = groups(degree)
     each = sum(kinds[kind].stop - kinds[kind].start for kind in LEARNED[learned])
@@ -184,8 +181,8 @@ def fit_lean_and_judge(
     root: Path, out: Path, dataset: str, prior: str, views: int, seeds: int
 ) -> dict[str, Any]:
     """Task: `mgs.fit.evidence.lean_fit` to as many views."""
-    settings = ModelSettings(train=TrainSettings())
-    scene = Scene(load_dataset(root / dataset), load_prior(root / prior), settings)
+    settings = mgs.ModelSettings(train=mgs.TrainSettings())
+    scene = mgs.Scene(mgs.load_dataset(root / dataset), mgs.load_prior(root / prior), settings)
     order = views_in_order(scene.positions(scene.frames), scene.centre, views, seeds)
     frames = [scene.frames[i] for i in order]
     images, began = images_of(scene, frames), time.perf_counter()
@@ -200,9 +197,9 @@ def fit_lean_and_judge(
     }
 
 
-def _quality(model: Gaussians, dataset: Path) -> dict[str, float]:
+def _quality(model: mgs.Gaussians, dataset: Path) -> dict[str, float]:
     """PSNR on the test views, dB: of the whole frame, and of pixels that the rock covers wholly."""
-    found = judge(model, load_dataset(dataset))
+    found = judge(model, mgs.load_dataset(dataset))
     return {"psnr": found["psnr"], "psnr_inside": found["psnr_inside"]}
 
 
@@ -273,21 +270,17 @@ def _holds(row: Row) -> str:
     return "yes" if row["over_smallest"] <= 1 else "no: too many parameters"
 
 
-def run_study(
-    out: Path, size: ParsimonySize, report: Report, command: str, preset: str
-) -> tuple[list[Row], list[Row]]:
-    """Do all cells that are not done, and write parsimony.json, .csv, .md and .png. Returns the
-    rows of the automatic choices, and the judged claims."""
-    found = run_cells(out, cells_of(size), report)
-    rows = [row for scene in size.scenes for row in rows_of(size, found, scene)]
-    priors = {scene: found[size.case(scene, AUTO).prior_name] for scene in size.scenes}
+def write(work: Work) -> list[Path]:
+    """Write parsimony.csv, .json, .md and .png."""
+    size, results = work.size, work.results
+    rows = [row for scene in size.scenes for row in rows_of(size, results, scene)]
+    priors = {scene: results[size.case(scene, AUTO).prior_name] for scene in size.scenes}
     claims = [judged(claim, rows) for claim in CLAIMS]
     choices = [row for row in rows if row["choice"] == AUTOMATIC]
     text = f"{table(COLUMNS, choices)}\n{verdict_table(claims)}"
-    more = {"preset": preset, "priors": priors, "claims": claims}
-    write_table(out, "parsimony", rows, text, command, **more)
-    draw(out / "parsimony.png", rows)
-    return choices, claims
+    draw(work.out / "parsimony.png", rows)
+    paths = write_table(work, "parsimony", rows, text, priors=priors, claims=claims)
+    return [*paths, work.out / "parsimony.png"]
 
 
 def draw(path: Path, rows: Sequence[Row]) -> None:
@@ -301,7 +294,13 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     draw_panels(path, panels, rows, title)
 
 
-if __name__ == "__main__":
-    from studies.commands import start
+STUDY = Study(
+    "parsimony",
+    __doc__,
+    write,
+    SIZES,
+    lambda work: cells_of(work.size),
+)
 
-    start("parsimony")
+if __name__ == "__main__":
+    study_of("parsimony")()

@@ -1,4 +1,7 @@
-"""PSNR against CPU seconds of `mgs fit` on datasets of photographs, beside other programs."""
+"""PSNR against CPU seconds of `mgs fit` on datasets of photographs, beside other programs.
+
+Fits are timed one by one: let nothing else run meanwhile.
+"""
 
 from __future__ import annotations
 
@@ -7,23 +10,24 @@ import math
 import shlex
 import shutil
 import time
-from collections.abc import Sequence
+from argparse import ArgumentTypeError, Namespace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
-from mgs.data.dataset import load_dataset
-from mgs.errors import InputError
+import mgs
 from mgs.files import reading
-from mgs.run.nbv import resume_nbv, start_fit
-from studies.case import judge
-from studies.output import Content, Panel, draw_panels, table, write_table
-from studies.sweep import Cell, Report, run_cells
-from studies.verdict import Row
+from mgs.run.nbv import start_fit
+from studies.chart import check_dataset
+from studies.frame.case import judge
+from studies.frame.claim import Row
+from studies.frame.output import Content, Panel, draw_panels, table, write_table
+from studies.frame.program import Study, Work, study_of
+from studies.frame.sweep import Cell
 
 NAME = "photographs"
-
-PASSES = {"quick": (5, 15, 30), "full": (5, 15, 30, 60)}
-"""Passes of the fits, by scale."""
 
 NUMBERS = ("cpu_seconds", "psnr", "seconds", "ssim")
 """Columns that are read from the CSV of another program."""
@@ -44,21 +48,19 @@ def measure(root: Path, out: Path, dataset: str, gaussians: Any, passes: int) ->
     """Task: time a fit from the images to the model, once, and judge it on the test views."""
     wall, cpu = time.perf_counter(), time.process_time()
     run = start_fit(dataset, out / "run", gaussians=gaussians, train={"passes": passes}, force=True)
-    model = resume_nbv(run).state.gaussians
+    model = mgs.resume_nbv(run).state.gaussians
     seconds = {"seconds": time.perf_counter() - wall, "cpu_seconds": time.process_time() - cpu}
-    metrics = judge(model, load_dataset(dataset))
+    metrics = judge(model, mgs.load_dataset(dataset))
     shutil.rmtree(out / "run")
     found = {key: metrics[key] for key in ("psnr", "ssim", "psnr_mask") if key in metrics}
     return seconds | found | {"gaussians": len(model)}
 
 
-def parse_count(text: str) -> int | str:
-    """Number of Gaussians of an option, or auto. Raises InputError for anything else."""
-    if text == "auto":
-        return text
-    if not text.isdecimal() or int(text) < 1:
-        raise InputError(f"--gaussians {text!r}: expected a positive whole number, or auto")
-    return int(text)
+def count_of(text: str) -> int | str:
+    """Number of Gaussians of an option, or auto. Raises ArgumentTypeError for anything else."""
+    if text != "auto" and (not text.isdecimal() or int(text) < 1):
+        raise ArgumentTypeError(f"{text!r} is no positive whole number, nor auto")
+    return text if text == "auto" else int(text)
 
 
 def read_peer(file: Path, datasets: Sequence[str]) -> list[Row]:
@@ -79,77 +81,107 @@ def read_peer(file: Path, datasets: Sequence[str]) -> list[Row]:
             raise ValueError
     except (KeyError, TypeError, ValueError):
         columns = "a column `cpu_seconds` and one `psnr`, positive numbers"
-        raise InputError(f"{file}: needs {columns}, one row or more; correct it") from None
+        raise mgs.InputError(f"{file}: needs {columns}, one row or more; correct it") from None
     about = [
         {"dataset": line.get("dataset") or datasets[0], "program": file.stem} for line in lines
     ]
     if unknown := [row["dataset"] for row in about if row["dataset"] not in datasets]:
         known = ", ".join(datasets)
-        raise InputError(f"{file}: dataset {unknown[0]} is not charted; choose of {known}")
+        raise mgs.InputError(f"{file}: dataset {unknown[0]} is not charted; choose of {known}")
     return [names | row for names, row in zip(about, numbers, strict=True)]
 
 
-def chart_photographs(
-    out: Path,
-    preset: str,
-    datasets: Sequence[Path],
-    gaussians: Sequence[int | str],
-    peers: Sequence[Path],
-    report: Report,
-) -> list[Row]:
-    """Time fits of PASSES of each dataset with each number of Gaussians, and write photographs.csv,
-    .json, .md and .png. Returns the rows.
+@dataclass(frozen=True)
+class Fits:
+    """Fits of every number of passes, to every dataset, with every number of Gaussians. peers: rows
+    of other programs."""
 
-    datasets: of different names. peers: files of other programs (`read_peer`).
-    """
-    names = [dataset.absolute().name for dataset in datasets]
-    asked = [
-        (dataset, count, passes)
-        for dataset in datasets
-        for count in gaussians
-        for passes in PASSES[preset]
-    ]
-    cells = [
-        Cell(
-            f"{NAME}/{dataset.absolute().name}/{count}-{passes}",
-            f"{__name__}:measure",
-            {"dataset": str(dataset.resolve()), "gaussians": count, "passes": passes},
-            alone=True,
-        )
-        for dataset, count, passes in asked
-    ]
-    found = run_cells(out, cells, report)
+    passes: tuple[int, ...]
+    datasets: tuple[Path, ...] = ()
+    gaussians: tuple[int | str, ...] = ()
+    peers: tuple[Path, ...] = ()
+
+    def each(self) -> Iterator[tuple[Path, int | str, int, Cell]]:
+        """Dataset, Gaussians, passes and cell of each fit."""
+        for dataset, count, passes in product(self.datasets, self.gaussians, self.passes):
+            name = f"{NAME}/{dataset.absolute().name}/{count}-{passes}"
+            how = {"dataset": str(dataset.resolve()), "gaussians": count, "passes": passes}
+            yield dataset, count, passes, Cell(name, f"{__name__}:measure", how, alone=True)
+
+    def peer_rows(self) -> list[Row]:
+        """Rows of other programs (`read_peer`)."""
+        names = [dataset.absolute().name for dataset in self.datasets]
+        return [row for file in self.peers for row in read_peer(file, names)]
+
+
+SIZES = {"quick": Fits((5, 15, 30)), "full": Fits((5, 15, 30, 60))}
+
+
+def sized(size: Fits, options: Namespace) -> Fits:
+    """Fits of the datasets of the options. Raises InputError for those that cannot be charted."""
+    for folder in options.dataset:
+        check_dataset(folder)
+    names = [folder.absolute().name for folder in options.dataset]
+    if len(set(names)) < len(names):
+        raise mgs.InputError("--dataset: two folders have one name; rename one")
+    fits = replace(
+        size,
+        datasets=tuple(options.dataset),
+        gaussians=tuple(options.gaussians or ["auto"]),
+        peers=tuple(options.peer),
+    )
+    fits.peer_rows()  # before hours of fits
+    return fits
+
+
+def write(work: Work) -> list[Path]:
+    """Write photographs.csv, .json, .md and .png."""
     rows: list[Row] = []
-    for (dataset, count, passes), cell in zip(asked, cells, strict=True):
-        result = found[cell.name]
+    for dataset, count, passes, cell in work.size.each():
+        result = work.results[cell.name]
         words = ["mgs", "fit", str(dataset), "--gaussians", str(count), "--passes", str(passes)]
         program = f"mgs, {result['gaussians']:,} Gaussians"
         about = {"dataset": dataset.absolute().name, "program": program, "passes": passes}
         rows.append(about | result | {"command": shlex.join([*words, "--out", "RUN"])})
-    rows += [row for file in peers for row in read_peer(file, names)]
-    words = ["python", "-m", "studies.photographs", str(out), "--scale", preset]
-    words += [word for dataset in datasets for word in ("--dataset", str(dataset))]
-    words += [word for count in gaussians for word in ("--gaussians", str(count))]
-    words += [word for file in peers for word in ("--peer", str(file))]
-    write_table(out, NAME, rows, table(COLUMNS, rows), shlex.join(words), preset=preset)
+    rows += work.size.peer_rows()
+    labels = "cpu_seconds", "psnr", "CPU seconds", "PSNR on the test views (dB)", "program", True
     panels = [
-        Panel(
-            "cpu_seconds",
-            "psnr",
-            "CPU seconds",
-            "PSNR on the test views (dB)",
-            by="program",
-            log=True,
-            only=(("dataset", name),),
-            title=name,
-        )
-        for name in names
+        Panel(*labels, only=(("dataset", name),), title=name)
+        for name in dict.fromkeys(row["dataset"] for row in rows)
     ]
-    draw_panels(out / f"{NAME}.png", panels, rows)
-    return rows
+    draw_panels(work.out / f"{NAME}.png", panels, rows)
+    return [*write_table(work, NAME, rows, table(COLUMNS, rows)), work.out / f"{NAME}.png"]
 
+
+STUDY = Study(
+    NAME,
+    __doc__,
+    write,
+    SIZES,
+    lambda work: [cell for *_, cell in work.size.each()],
+    {
+        "--dataset": {
+            "action": "append",
+            "required": True,
+            "type": Path,
+            "help": "A dataset with test views; repeat for more.",
+        },
+        "--gaussians": {
+            "action": "append",
+            "type": count_of,
+            "metavar": "N|auto",
+            "help": "Number of Gaussians; repeat for more.",
+        },
+        "--peer": {
+            "action": "append",
+            "default": [],
+            "type": Path,
+            "help": "CSV of another program: `cpu_seconds`, `psnr` and, if not of the first "
+            "dataset, `dataset`; repeat for more.",
+        },
+    },
+    sized,
+)
 
 if __name__ == "__main__":
-    from studies.commands import start
-
-    start("photographs")
+    study_of(NAME)()

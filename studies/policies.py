@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mgs import Scene, State
+import mgs
 from mgs.policy.criteria import Array, observed
 from mgs.policy.poses import angles
 from mgs.run.policies import each
@@ -23,7 +23,7 @@ def e_optimal(F: Array, H: Array, lam: Array) -> float:
     return float((H + F + lam).min() - (H + lam).min())
 
 
-def i_optimal(scene: Scene, state: State, views: list[int]) -> np.ndarray:
+def i_optimal(scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
     """I-optimality over all poses of the dataset (`predicted_variance`) [C]."""
     H, lam, count = state.H, scene.lam, len(state.frames)
     others = [i for i in range(count) if i not in state.taken]
@@ -41,7 +41,7 @@ def predicted_variance(F: Array, H: Array, lam: Array, weight: Array) -> float:
     return float((weight * F / ((H + lam) * (H + F + lam))).mean(dtype=np.float64))
 
 
-def block_d(scene: Scene, state: State, views: list[int]) -> np.ndarray:
+def block_d(scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
     """Eq. 7 for the exact 11x11 blocks, whatever the estimator of the run [C]."""
 
     def F(view: int) -> Array:

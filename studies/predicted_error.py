@@ -21,22 +21,31 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mgs.camera import Camera
+from mgs import (
+    Camera,
+    Frame,
+    Gaussians,
+    InputError,
+    ListCache,
+    Run,
+    Scene,
+    as_drjit,
+    fisher,
+    jvp,
+    open_run,
+    render,
+)
 from mgs.colour import SH_C0
-from mgs.data.frames import Frame
-from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.fit.evidence import Images, fitted
-from mgs.gaussians import Gaussians, learned, sh_from_rgb
+from mgs.gaussians import learned, sh_from_rgb
 from mgs.images import write_exr
 from mgs.learning import images_of
 from mgs.memory import padded
 from mgs.provenance import versions
-from mgs.run.folder import Run, open_run
 from mgs.run.settings import NbvSettings
-from mgs.scene import Scene
 from mgs.seeds import generator
-from mgs.splat import ListCache, as_drjit, fisher, groups, jvp, render
+from mgs.splat import groups
 from studies.calibration import NORMAL, Calibration, fit_calibration, judged
 from studies.uncertainty_figure import uncertainty_figure
 

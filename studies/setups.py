@@ -8,36 +8,39 @@ of every test, because rocks of one scene are not independent.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from argparse import Namespace
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mgs.data.dataset import load_dataset
-from mgs.data.frames import Frame
+import mgs
 from mgs.evaluation import psnr_over
-from mgs.learning import fit_views, learn, surface_information, with_view
+from mgs.files import write_csv
+from mgs.learning import fit_views, surface_information, with_view
 from mgs.policy.poses import path_length
-from mgs.prior.build import load_prior
-from mgs.run.choosing import choose
+from mgs.run import policy_file
 from mgs.run.inputs import policy_record
-from mgs.run.loop import finished, select_views
-from mgs.run.policy_file import label, policy_of
-from mgs.run.settings import Mission
-from mgs.scene import Scene, State
-from mgs.splat import ListCache
-from studies.case import Case, Rock, Size, test_views_of
-from studies.oracle import Oracle
-from studies.output import Panel, draw_matrix, table, with_interval
-from studies.statistics import holm, interval, permutation_p
-from studies.sweep import Cell
-from studies.verdict import Row
+from mgs.run.loop import finished
+from studies.frame.case import FRESH, NAMESAKE, ROCKS, Case, Rock, Size, rocks_of, test_views_of
+from studies.frame.claim import Row, holm, interval, permutation_p
+from studies.frame.output import (
+    Panel,
+    draw_matrix,
+    grouped,
+    over_scenes,
+    table,
+    with_interval,
+    write_table,
+)
+from studies.frame.program import WORKERS, Options, Study, Work, study_of
+from studies.frame.sweep import Cell, results_so_far
 
-Found = Mapping[str, Mapping[str, Any]]
+Results = Mapping[str, Mapping[str, Any]]
 """Results of cells by name."""
 
 POLICIES = (
@@ -50,29 +53,13 @@ LEADER = "directional-i"
 
 RANDOM, ORACLE = "random", "oracle"
 
-SCORED = tuple(policy for policy in POLICIES if policy != RANDOM)
-"""Policies whose scores are compared with what each candidate gains, at the oracle's choices."""
-
-FORETOLD = {
-    "spearman": "rank correlation of the score with the gain",
-    "regret": "regret of one choice (dB)",
-}
-"""Keys of `studies.oracle.foretold`."""
-
 MEAN = "mean"
 """Name of the mean over the set-ups, beside their names."""
-
-DRAWS = 5
-"""Runs of `random`, averaged."""
-
-JUDGE_PASSES = 20
-"""Passes of the fit that is judged: twice the default."""
 
 MEASURES = {
     "test": "test views",
     "test_mask": "inside the rock",
     "pool": "views of the pool not taken",
-    "ring": "views of the ring not taken",
 }
 """Mean PSNR of each cell, dB, by what it is over."""
 
@@ -115,9 +102,13 @@ SURVEYED = {"surveyed ring": Setup(RING, 48, survey=True)}
 
 @dataclass(frozen=True)
 class SetupSize:
-    """Width, height, test views and samples per pixel of the images, and images that a run
-    takes, seeds among them. Numbers of frames are those of SETUPS, over `fewer`. gaussians: of the
-    prior; None: automatic."""
+    """Images, fits and numbers of a comparison.
+
+    width, height, tests, spp: of the images. images: that a run takes, seeds among them. fewer:
+    divisor of the numbers of frames of `setups`. gaussians: of the prior; None: automatic. passes:
+    of the fit that is judged; twice the default. draws: runs of `random`, averaged. count: default
+    number of rocks. rocks: set by the options.
+    """
 
     width: int = 128
     height: int = 96
@@ -126,6 +117,42 @@ class SetupSize:
     images: int = 12
     fewer: int = 1
     gaussians: int | None = None
+    passes: int = 20
+    draws: int = 5
+    setups: Mapping[str, Setup] = field(default_factory=lambda: SETUPS)
+    policies: tuple[str, ...] = POLICIES
+    count: int = len(FRESH)
+    rocks: tuple[Rock, ...] = ()
+
+
+SIZES = {"quick": SetupSize(), "paper": SetupSize(320, 240, 24, 16)}
+
+POLICY: Options = {
+    "--policy": {
+        "action": "append",
+        "default": [],
+        "help": "A further policy: a name or FILE.py:NAME; repeatable.",
+    },
+}
+
+
+def sized(size: SetupSize, options: Namespace) -> SetupSize:
+    """Size with the options --rocks, --mesh and --policy.
+
+    Raises InputError as `rocks_of`, and if a policy is unknown or already compared, or two have the
+    same name.
+    """
+    own = getattr(options, "policy", [])
+    labels = list(POLICIES)
+    for policy in own:
+        if policy in POLICIES:
+            raise mgs.InputError(f"--policy {policy}: is compared anyway; leave it out")
+        if policy_file.label(policy) in labels:
+            raise mgs.InputError(f"--policy {policy}: {NAMESAKE}")
+        labels.append(policy_file.label(policy))
+        policy_file.policy_of(policy)
+    policies = (*size.policies, *map(policy_file.absolute, own))
+    return replace(size, policies=policies, rocks=rocks_of(options, size.count))
 
 
 def case_of(rock: Rock, setup: Setup, size: SetupSize) -> Case:
@@ -137,37 +164,34 @@ def case_of(rock: Rock, setup: Setup, size: SetupSize) -> Case:
 
 def cells_of(
     size: SetupSize,
-    rocks: Iterable[Rock],
-    policies: Sequence[str],
-    setups: Mapping[str, Setup] = SETUPS,
+    policies: Sequence[str] | None = None,
+    setups: Mapping[str, Setup] | None = None,
 ) -> list[Cell]:
-    """Cells of every policy in every set-up on every rock, with datasets and priors."""
+    """Cells of every policy in every set-up on every rock, with datasets and priors; policies and
+    set-ups are those of the size by default."""
     cells: dict[str, Cell] = {}
-    for rock in rocks:
-        ring = case_of(rock, SETUPS["ring"], size)
-        for name, setup in setups.items():
-            case = case_of(rock, setup, size)
-            case, data = case.surveyed(rock.index) if setup.survey else (case, case.cells())
-            common = {"seeds": setup.seeds, "budget": size.images - setup.seeds, **setup.settings}
-            for policy in policies:
-                for draw in range(DRAWS if policy == RANDOM else 1):
-                    settings = common | {"policy": policy, "seed": rock.index + 1000 * draw}
-                    version = "".join(f"-{d[:8]}" for d in policy_record(policy).values())
-                    shown = label(policy)
-                    where = f"{name.replace(' ', '-')}-{size.width}x{size.height}"
-                    of = f"setup/{rock.name}/{where}/{shown}{version}-{draw}"
-                    made = case.with_task(
-                        of,
-                        f"{__name__}:choose_and_judge",
-                        ring=ring.dataset,
-                        every=setup.every,
-                        settings=settings,
-                    )
-                    needs = (ring.cells()[0].name, *(cell.name for cell in data))
-                    about = {"rock": rock.name, "scene": rock.scene, "setup": name, "policy": shown}
-                    last = replace(made[-1], needs=needs, about=about)
-                    for cell in (*ring.cells()[:1], *data, last):
-                        cells[cell.name] = cell
+    pairs = product(size.rocks, (size.setups if setups is None else setups).items())
+    for rock, (name, setup) in pairs:
+        case = case_of(rock, setup, size)
+        case, data = case.surveyed(rock.index) if setup.survey else (case, case.cells())
+        common = {"seeds": setup.seeds, "budget": size.images - setup.seeds, **setup.settings}
+        for policy in size.policies if policies is None else policies:
+            shown = policy_file.label(policy)
+            version = "".join(f"-{digest[:8]}" for digest in policy_record(policy).values())
+            where = f"{rock.name}/{name.replace(' ', '-')}-{size.width}x{size.height}"
+            about = {"rock": rock.name, "scene": rock.scene, "setup": name, "policy": shown}
+            for draw in range(size.draws if policy == RANDOM else 1):
+                settings = common | {"policy": policy, "seed": rock.index + 1000 * draw}
+                *_, last = case.with_task(
+                    f"setup/{where}/{shown}{version}-{draw}",
+                    f"{__name__}:choose_and_judge",
+                    every=setup.every,
+                    passes=size.passes,
+                    settings=settings,
+                )
+                needs = tuple(cell.name for cell in data)
+                made = (*data, replace(last, needs=needs, about=about))
+                cells |= {cell.name: cell for cell in made}
     return list(cells.values())
 
 
@@ -176,56 +200,48 @@ def choose_and_judge(
     out: Path,
     dataset: str,
     prior: str,
-    ring: str,
     every: int | None,
     settings: dict[str, Any],
+    passes: int = SetupSize.passes,
 ) -> dict[str, Any]:
     """Task: choose views by a policy, fit all of them from the prior, and judge the model.
 
     Returns MEASURES, "taken" (indices of the frames in the order taken) and "path" (metres through
-    the views taken). The oracle's has "foretold": means of `foretold` over its choices.
+    the views taken).
     """
     name, seed = settings["policy"], settings["seed"]
-    shared, tests, pool, on_ring = shared_scene(root / dataset, root / prior, root / ring, every)
+    shared, tests, pool = shared_scene(root / dataset, root / prior, every)
     scene = shared.with_seed(seed)
-    mission = Mission(**{k: v for k, v in settings.items() if k not in ("policy", "seed")})
-    policy = (
-        policy_of(name)
-        if name != ORACLE
-        else Oracle(test_views_of(shared.dataset), [policy_of(one) for one in SCORED])
-    )
+    mission = mgs.Mission(**{k: v for k, v in settings.items() if k not in ("policy", "seed")})
+    policy = policy_file.policy_of(name) if name != ORACLE else _oracle(shared)
     start = _after_seeds if policy.needs_fit else before_any_fit
     state = start(shared, mission.seeds)
     if policy.needs_fit:
-        for item in select_views(scene, policy, mission, state):
-            state = item if isinstance(item, State) else state
+        for item in mgs.select_views(scene, policy, mission, state):
+            state = item if isinstance(item, mgs.State) else state
     else:
         unused = np.zeros_like(state.H)  # information about a model that there is not
         while not finished(scene, state, mission):
-            view, _ = choose(scene, state, policy, mission)
+            view, _ = mgs.choose(scene, state, policy, mission)
             state = with_view(scene, state, view, unused)
-    train = scene.settings.train.model_copy(update={"passes": JUDGE_PASSES})
+    train = scene.settings.train.model_copy(update={"passes": passes})
     taken = list(state.taken)
     model = fit_views(scene, scene.frames, taken, train=train)[0].gaussians
     others = [i for i in range(len(scene.frames)) if i not in taken]
     on_tests, on_pool = tests(model), pool(model, others)
-    mine = dataset == ring  # the poses of the ring, of which some may be taken
     return {
         "test": float(on_tests["psnr"].mean()),
         "test_mask": float(on_tests["psnr_mask"].mean()),
         "pool": float(on_pool["psnr"].mean()),
-        "ring": float((on_pool if mine else on_ring(model))["psnr"].mean()),
         "path": path_length(scene.positions([scene.frames[i] for i in taken])),
         "taken": taken,
-    } | ({"foretold": _means(policy.tried)} if isinstance(policy, Oracle) else {})
-
-
-def _means(tried: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
-    """Means of `foretold` over choices."""
-    return {
-        policy: {key: float(np.mean([one[policy][key] for one in tried])) for key in first}
-        for policy, first in tried[0].items()
     }
+
+
+def _oracle(scene: mgs.Scene) -> Any:
+    from studies.oracle import Oracle  # which imports this module
+
+    return Oracle(test_views_of(scene.dataset))
 
 
 Measure = Callable[..., dict[str, np.ndarray]]
@@ -234,53 +250,50 @@ Measure = Callable[..., dict[str, np.ndarray]]
 
 @lru_cache(maxsize=1)
 def shared_scene(
-    dataset: Path, prior: Path, ring: Path, every: int | None
-) -> tuple[Scene, Measure, Measure, Measure]:
-    """Scene of a set-up on one rock, and PSNR over test views, candidates and the ring.
+    dataset: Path, prior: Path, every: int | None
+) -> tuple[mgs.Scene, Measure, Measure]:
+    """Scene of a set-up on one rock, and PSNR over test views and candidates.
 
     All policies share them, with the visibility of the surface."""
-    data, cache = load_dataset(dataset), ListCache()
+    data, cache = mgs.load_dataset(dataset), mgs.ListCache()
     if every is not None:
         half = len(data) // 2
         some = (f for i, f in enumerate(data.frames) if i < half or (i - half) % every == 0)
         data = replace(data, frames=tuple(some))
     _after_seeds.cache_clear()
 
-    def over(frames: Sequence[Frame]) -> Measure:
+    def over(frames: Sequence[mgs.Frame]) -> Measure:
         of = psnr_over(frames, cache)
         return lambda model, some=range(len(frames)): of(model, some)
 
-    views = test_views_of(data).frames, data.frames, load_dataset(ring).frames
-    tests, pool, on_ring = map(over, views)
-    return Scene(data, load_prior(prior)), tests, pool, on_ring
+    tests, pool = over(test_views_of(data).frames), over(data.frames)
+    return mgs.Scene(data, mgs.load_prior(prior)), tests, pool
 
 
 @lru_cache(maxsize=1)
-def _after_seeds(scene: Scene, seeds: int) -> State:
+def _after_seeds(scene: mgs.Scene, seeds: int) -> mgs.State:
     """State after the fit to the seeds, the same for every policy."""
-    return learn(scene, scene.seeds(seeds))
+    return mgs.learn(scene, scene.seeds(seeds))
 
 
-def before_any_fit(scene: Scene, seeds: int) -> State:
+def before_any_fit(scene: mgs.Scene, seeds: int) -> mgs.State:
     """State after the seeds, with the Gaussians before training and no information about them."""
     views, nothing = tuple(scene.seeds(seeds)), np.zeros(0)
     start = scene.start(tuple(scene.frames[i] for i in views))
-    state = State(scene.frames, views, len(views), start, nothing, nothing)
+    state = mgs.State(scene.frames, views, len(views), start, nothing, nothing)
     surface = surface_information(scene, state, views)
     return replace(state, H=np.zeros_like(surface), surface=surface)
 
 
-def rows_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
+def rows_of(results: Results, cells: Sequence[Cell]) -> list[Row]:
     """A row for each rock, set-up and policy, draws averaged: MEASURES, "path", and KEY_gain, the
     difference from `random`."""
-    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
-    for cell in cells:
-        if cell.about:
-            groups.setdefault(tuple(cell.about.items()), []).append(results[cell.name])
-    rows: list[Row] = [
-        dict(about) | {key: float(np.mean([one[key] for one in of])) for key in (*MEASURES, "path")}
-        for about, of in groups.items()
-    ]
+    keys = (*MEASURES, "path")
+    every = [dict(cell.about) | dict(results[cell.name]) for cell in cells if cell.about]
+    rows: list[Row] = []
+    for group in grouped(every, "rock", "scene", "setup", "policy"):
+        draws = group.pop("of")
+        rows.append(group | {key: float(np.mean([one[key] for one in draws])) for key in keys})
     base = {(row["rock"], row["setup"]): row for row in rows if row["policy"] == RANDOM}
     for row in rows:
         against = base[row["rock"], row["setup"]]
@@ -288,22 +301,10 @@ def rows_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
     return rows
 
 
-def foretold_of(results: Found, cells: Sequence[Cell]) -> list[Row]:
-    """Rows with FORETOLD for each rock and set-up of the oracle, and each of SCORED."""
-    return [
-        cell.about | {"policy": policy} | numbers
-        for cell in cells
-        for policy, numbers in results[cell.name].get("foretold", {}).items()
-    ]
-
-
 def by_scene(rows: Sequence[Row], setup: str, policy: str, key: str) -> dict[str, float]:
     """Mean of a key over the rocks of each scene; setup: a name of SETUPS, or MEAN."""
-    values: dict[str, list[float]] = {}
-    for row in rows:
-        if row["policy"] == policy and setup in (row["setup"], MEAN):
-            values.setdefault(row["scene"], []).append(row[key])
-    return {scene: float(np.mean(of)) for scene, of in values.items()}
+    of = [r for r in rows if r["policy"] == policy and setup in (r["setup"], MEAN)]
+    return over_scenes(of, key)
 
 
 def _setups(rows: Sequence[Row]) -> list[str]:
@@ -352,70 +353,69 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     draw_matrix(path, Panel("setup", "gain", "set-up", "", "policy", title=title), means)
 
 
-def text_of(rows: Sequence[Row], leads: Sequence[Row], predicted: Sequence[Row] = ()) -> str:
+def text_of(rows: Sequence[Row], leads: Sequence[Row]) -> str:
     """Tables with a line for each policy and a column for each set-up: gains over `random` by each
-    of MEASURES, share of the oracle's gain, the leader's lead, and FORETOLD of `foretold_of`."""
+    of MEASURES, the leader's lead, and share of the oracle's gain."""
     setups, policies = _setups(rows), _policies(rows)
-    matrix = partial(_matrix, setups)
+    rocks = {row["rock"] for row in rows if row["policy"] == ORACLE}
+    tried = [row for row in rows if row["rock"] in rocks]
+    known = {(lead["setup"], lead["policy"]): lead for lead in leads if lead["measure"] == "test"}
 
-    def means(of: Sequence[Row], key: str, form: str) -> Callable[[str, str], str]:
+    def matrix(title: str, cell: Callable[[str, str], str], policies: Sequence[str]) -> str:
+        columns = {title: "policy"} | {setup: setup for setup in setups}
+        lines = [{"policy": p} | {setup: cell(setup, p) for setup in setups} for p in policies]
+        return table(columns, lines)
+
+    def gain(key: str) -> Callable[[str, str], str]:
         def cell(setup: str, policy: str) -> str:
-            found = by_scene(of, setup, policy, key)
-            return format(np.mean(list(found.values())), form) if found else "–"
+            values = by_scene(rows, setup, policy, f"{key}_gain")
+            return format(np.mean(list(values.values())), "+.2f") if values else "–"
 
         return cell
 
-    tables = [
-        matrix(f"{title}, over random (dB)", means(rows, f"{key}_gain", "+.2f"), policies)
-        for key, title in MEASURES.items()
-    ]
-    known = {(lead["setup"], lead["policy"]): lead for lead in leads if lead["measure"] == "test"}
-    others = [p for p in policies if p not in (LEADER, ORACLE)]
-    tables.append(
-        matrix(
-            f"{LEADER} over it (dB)",
-            lambda s, p: (
-                with_interval(known.get((s, p), {}), "lead")
-                + (" *" if (known.get((s, p), {}).get("p_holm") or 1) < 0.05 else "")
-            ),
-            others,
-        )
-    )
-    if ORACLE in policies:
-        tables.append(_shares(rows, setups, policies, matrix))
-    if predicted:
-        tables += [matrix(t, means(predicted, k, ".2f"), SCORED) for k, t in FORETOLD.items()]
-    return "\n".join(tables)
-
-
-def _matrix(
-    setups: Sequence[str], title: str, cell: Callable[[str, str], str], policies: Sequence[str]
-) -> str:
-    """Table of cell(setup, policy), a line for each policy."""
-    columns = {title: "policy"} | {setup: setup for setup in setups}
-    lines = [{"policy": p} | {setup: cell(setup, p) for setup in setups} for p in policies]
-    return table(columns, lines)
-
-
-def _shares(
-    rows: Sequence[Row],
-    setups: Sequence[str],
-    policies: Sequence[str],
-    matrix: Callable[..., str],
-) -> str:
-    """Share of the oracle's gain over `random`, over the rocks that the oracle was tried on."""
-    rocks = {row["rock"] for row in rows if row["policy"] == ORACLE}
-    tried = [row for row in rows if row["rock"] in rocks]
+    def ahead(setup: str, policy: str) -> str:
+        lead = known.get((setup, policy), {})
+        return with_interval(lead, "lead") + (" *" if (lead.get("p_holm") or 1) < 0.05 else "")
 
     def share(setup: str, policy: str) -> str:
         of, won = (by_scene(tried, setup, p, "test_gain") for p in (policy, ORACLE))
         total = sum(won.values())
         return f"{sum(of.values()) / total:.0%}" if of and total > 0 else "–"
 
-    return matrix("share of the oracle's gain", share, [p for p in policies if p != RANDOM])
+    tables = [
+        matrix(f"{title}, over random (dB)", gain(key), policies) for key, title in MEASURES.items()
+    ]
+    others = [p for p in policies if p not in (LEADER, ORACLE)]
+    tables.append(matrix(f"{LEADER} over it (dB)", ahead, others))
+    if ORACLE in policies:
+        shown = [p for p in policies if p != RANDOM]
+        tables.append(matrix("share of the oracle's gain", share, shown))
+    return "\n".join(tables)
 
+
+def write(work: Work, name: str = "setups", cells: Sequence[Cell] | None = None) -> list[Path]:
+    """Write NAME.csv, .json, .md, .png and NAME-leads.csv. cells: by default those of set-ups and
+    oracle that are done."""
+    cells = cells or [*cells_of(work.size), *cells_of(work.size, (ORACLE,))]
+    results = results_so_far(work.out, cells)
+    done = [cell for cell in cells if cell.name in results]
+    rows = rows_of(results, done)
+    leads = [lead for key in MEASURES for lead in leads_of(rows, LEADER, key)]
+    draw(work.out / f"{name}.png", rows)
+    text = text_of(rows, leads)
+    paths = write_table(work, name, rows, text, rocks=len(work.size.rocks))
+    return [*paths, work.out / f"{name}.png", write_csv(work.out / f"{name}-leads.csv", leads)]
+
+
+STUDY = Study(
+    "setups",
+    __doc__,
+    write,
+    SIZES,
+    lambda work: cells_of(work.size),
+    ROCKS | POLICY | WORKERS,
+    sized,
+)
 
 if __name__ == "__main__":
-    from studies.commands import start
-
-    start("setups")
+    study_of("setups")()

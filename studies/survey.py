@@ -1,6 +1,17 @@
 """Policies compared with the poses, depth and prior of `mgs survey`: see `studies.setups`."""
 
-from studies.commands import start
+from dataclasses import replace
+
+from studies import setups
+from studies.frame.program import study_of
+
+STUDY = replace(
+    setups.STUDY,
+    name="survey",
+    about="Compare policies as `setups` does, with the poses, depth and prior of `mgs survey`.",
+    cells=lambda work: setups.cells_of(work.size, setups=setups.SURVEYED),
+    write=lambda work: setups.write(work, "survey", work.cells),
+)
 
 if __name__ == "__main__":
-    start("survey")
+    study_of("survey")()

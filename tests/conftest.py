@@ -77,3 +77,11 @@ def short_fits(monkeypatch):
         return fit(gaussians, cameras, targets, few, *rest)
 
     monkeypatch.setattr(scene, "fit_gaussians", short)
+
+
+@pytest.fixture
+def ellipsoids(monkeypatch):
+    """Studies render nothing: their rocks are ellipsoids."""
+    import synthetic
+
+    monkeypatch.setattr("studies.frame.case.make_dataset", synthetic.make_dataset)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from mgs.cli.app import main
 from mgs.reports.runs import compare_runs
 from mgs.reports.tables import comparison_rows
-from studies.commands import start
+from studies.frame.program import study_of
 
 
 def exit_code(*arguments) -> int:
@@ -25,10 +26,11 @@ def command(*arguments) -> None:
     assert exit_code(*arguments) == 0
 
 
-def study(name, *arguments, exit_code=0) -> None:
-    """Run `python -m studies.NAME ARGUMENTS`; fails unless it exits with this code."""
+def study(name, *arguments, exit_code=0, **changes) -> None:
+    """Run `python -m studies.NAME ARGUMENTS`; fails unless it exits with this code. changes: of the
+    fields of the `Study`."""
     with pytest.raises(SystemExit) as stop:
-        start(name, [str(argument) for argument in arguments])
+        replace(study_of(name), **changes)([str(argument) for argument in arguments])
     assert stop.value.code == exit_code
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from mgs.cli.app import main
-from studies.commands import start
+from studies.frame.program import study_of
 
 
 def listing(root: Path) -> dict[str, bytes | None]:
@@ -21,7 +21,7 @@ def refused(capsys, arguments: list, out: Path | None = None, study: str = "") -
     is 2, and `out` is unchanged; return the line."""
     before, words = listing(out) if out else None, [str(argument) for argument in arguments]
     with pytest.raises(SystemExit) as stop:
-        start(study, words) if study else main(words)
+        study_of(study)(words) if study else main(words)
     error = capsys.readouterr().err
     assert stop.value.code == 2, error
     lines = error.splitlines()

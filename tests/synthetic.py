@@ -138,3 +138,14 @@ def write_colmap(dataset: Dataset, root: Path, binary: bool) -> None:
     (root / "sparse/0").mkdir(parents=True)
     (model.write_binary if binary else model.write_text)(root / "sparse/0")
     (root / "images").symlink_to(dataset.root / "images")
+
+
+def make_dataset(root, out, scene, seed, size, changes=None, mesh=None):
+    """In place of the task of studies that renders a dataset: another ellipsoid for each seed."""
+    folder, images = out / "dataset", (size["width"], size["height"])
+    if not folder.exists():
+        rocks = [(CENTRE, AXES * (1 + 0.1 * (seed % 5)))]
+        write_dataset(folder, orbit_cameras(size["frames"], *images), rocks)
+        tests = orbit_cameras(size["tests"], *images, altitude=2.0)
+        write_dataset(folder / "test", tests, rocks)
+    return {"frames": size["frames"]}

@@ -4,7 +4,6 @@ import csv
 import json
 import shlex
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,13 +12,15 @@ import typer
 from program import study
 from refusals import refused
 
+import mgs
 from mgs.cli.app import app
 from mgs.cli.nbv import nbv
 from mgs.cli.options import parse_settings
-from mgs.run.nbv import run_nbv
 from mgs.run.settings import NbvSettings
-from studies import case, chart, photographs, timing
-from studies.commands import program
+from studies import chart, photographs
+from studies.frame import timing
+from studies.frame.case import Size
+from studies.frame.program import study_of
 
 
 def test_times_are_ratios_to_a_reference_that_is_timed_beside_each_call(monkeypatch):
@@ -58,8 +59,8 @@ def parsed(line):
     """Parameters of a command line of mgs, or of a study."""
     words = shlex.split(line)
     if words[:2] == ["python", "-m"]:
-        name = words[2].removeprefix("studies.")
-        return typer.main.get_command(program(name)).make_context(name, words[3:]).params
+        options = study_of(words[2].removeprefix("studies.")).parser().parse_args(words[3:])
+        return vars(options)
     assert words[0] == "mgs"
     return COMMANDS[words[1]].make_context(words[1], words[2:]).params
 
@@ -87,40 +88,25 @@ def test_a_preset_that_is_beaten_by_a_run_of_its_time_fails():
     assert chart.preset_losses([row | {"preset": "balanced"}, *better, fast, other]) == [0.5, 0.0]
 
 
-@pytest.fixture
-def small(dataset, monkeypatch):
-    """A size of few points on the tiny dataset, with a prior that is there already and a reference
-    that costs little."""
+SMALL = chart.ChartSize(
+    Size(32, 24, 6, 3), count=4, repeats=1, densities=(1 / 8,), passes=(1,), run_passes=(),
+    image_counts=(), policies=(), estimators=(), seeds=3, reference=(100, 32, 24),
+    presets={"fast": {"passes": 2, "warm_passes": 1, "density": 1 / 8}},
+)  # fmt: skip
+
+
+@pytest.mark.usefixtures("coarse_priors")
+def test_a_chart_is_measured_once_and_written(dataset, tmp_path, capsys, monkeypatch):
     tiny.write_dataset(dataset / "test", frames=3)
-    size = replace(chart.SIZES["quick"], densities=(1 / 8,), passes=(2,), seeds=3, count=4)
-    point = chart.Point(4, passes=2)
-    presets = list(chart.preset_points(size).values())[:1]
-    some = {"both": [point, replace(point, passes=1)], "preset": presets}
-    monkeypatch.setitem(chart.SIZES, "quick", size)
-    monkeypatch.setattr(chart, "factors", lambda size: some)
-    monkeypatch.setattr(timing, "_reference", timing._reference.__wrapped__)  # without its cache
-    monkeypatch.setattr(timing, "REFERENCE_GAUSSIANS", 100)
-    monkeypatch.setattr(timing, "REFERENCE_SIZE", (32, 24))
+    out, times, weights, run_nbv = tmp_path / "chart", [], [], mgs.run_nbv
 
-    def made(root, out, dataset, density):
-        if not (out / "prior").exists():
-            tiny.write_prior(out / "prior")
-        return {"gaussians": tiny.POINTS, "spacing": 0.5}
-
-    monkeypatch.setattr(case, "make_prior", made)
-    return dataset
-
-
-def test_a_chart_is_measured_once_and_written(small, tmp_path, capsys, monkeypatch):
-    out, times, weights = tmp_path / "chart", [], []
-
-    def run(*where, train, **given):
+    def run(*where, train, **settings):
         weights.append(train["alpha_weight"])
-        return run_nbv(*where, train=train, **given)
+        return run_nbv(*where, train=train, **settings)
 
-    monkeypatch.setattr(chart, "run_nbv", run)
+    monkeypatch.setattr(mgs, "run_nbv", run)
     for _ in range(2):
-        study("chart", out, "--dataset", small, "--repeats", 1)
+        study("chart", out, "--dataset", dataset, "--repeats", 1, sizes={"quick": SMALL})
         told = capsys.readouterr().out
         times.append({p: p.stat().st_mtime_ns for p in out.glob("cells/**/result.json")})
     assert "/prior" not in told  # the second time all was there
@@ -132,37 +118,34 @@ def test_a_chart_is_measured_once_and_written(small, tmp_path, capsys, monkeypat
         assert len(rows) == len(record["rows"])
         assert all(parsed(row["command"]) for row in rows)
         assert any(row["front"] for row in record["rows"])
-        line = f"{out} --only {kind} --scale quick --repeats 1 --dataset {small}"
-        assert record["command"] == f"python -m studies.chart {line}"
-        assert line in (out / f"{kind}.md").read_text()
+        assert parsed(record["command"])["dataset"] == dataset
         assert (out / f"{kind}.png").stat().st_size > 10_000
-    assert [row["total_passes"] for row in written["fit"]["rows"]] == [2, 1]
+    assert [row["total_passes"] for row in written["fit"]["rows"]][1] == 1
     assert written["run"]["claims"][0]["runs"] == 1
     assert "| **fast**: " in (out / "run.md").read_text()
 
 
 @pytest.mark.usefixtures("coarse_priors")
-def test_photographs_are_charted_beside_another_program(dataset, tmp_path, capsys, monkeypatch):
+def test_photographs_are_charted_beside_another_program(dataset, tmp_path, capsys):
     tiny.write_dataset(dataset / "test", frames=3)
-    monkeypatch.setitem(photographs.PASSES, "quick", (1, 2))
     peer, out = tmp_path / "other.csv", tmp_path / "chart"
     charted = [out, "--dataset", dataset, "--gaussians", "60"]
     second = Path(shutil.copytree(dataset, tmp_path / "second"))
     namesake = shutil.copytree(dataset, tmp_path / "other" / "second")
-    for text in ("psnr\n", "psnr\n1,x\n", "step\n1,5\n", "psnr\n0,9\n", "psnr\n1,inf\n"):
+    for text in (
+        "psnr\n", "psnr\n1,x\n", "step\n1,5\n", "psnr\n0,9\n", "psnr\n1,inf\n",
+        "dataset,psnr\n0.5,third,20\n",
+    ):  # fmt: skip
         peer.write_text(f"cpu_seconds,{text}")
         line = refused(capsys, [*charted, "--peer", peer], out, "photographs")
-        assert "one row or more; correct it" in line
-    peer.write_text("cpu_seconds,dataset,psnr\n0.5,third,20\n")
-    line = refused(capsys, [*charted, "--peer", peer], out, "photographs")
-    assert "third is not charted" in line
+        assert str(peer) in line
     peer.write_text("cpu_seconds,step,psnr,dataset\n0.5,9,20,\n2,50,21.5,second\n")
     several = [out, "--dataset", second, "--dataset", namesake]
     assert "have one name" in refused(capsys, several, out, "photographs")
     no_tests = [out, "--dataset", tiny.write_dataset(tmp_path / "untested")]
     assert "has no test views" in refused(capsys, no_tests, out, "photographs")
     charted += ["--dataset", second]
-    study("photographs", *charted, "--peer", peer)
+    study("photographs", *charted, "--peer", peer, sizes={"quick": photographs.Fits((1, 2))})
     record = json.loads((out / "photographs.json").read_text())
     ours, others = record["rows"][:4], record["rows"][4:]
     assert [row["dataset"] for row in ours] == [dataset.name] * 2 + ["second"] * 2

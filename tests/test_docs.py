@@ -13,6 +13,7 @@ from markdown_it import MarkdownIt
 import mgs
 from mgs.cli.app import app
 from mgs.colour import SH_C0
+from mgs.errors import InputError
 from mgs.fit.stopping import StopReason
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.rotation import QUAT_MIN
@@ -22,7 +23,7 @@ from mgs.splat import ESTIMATORS, constants
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE
 from mgs.splat_ply import write_ply
 from mgs.synth.scene_file import SceneFile
-from studies.commands import program
+from studies.frame.program import study_of
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -123,19 +124,23 @@ def command_lines(page):
 def wrong_command(words, whole):
     """Error of a command line, else None. Options may stand in brackets."""
     name, *rest = words
-    study = name.removeprefix("studies.")
-    command = COMMANDS.get(name) if study == name else typer.main.get_command(program(study))
-    if command is None:
-        return f"no command {name}"
     options = {word.strip("[]") for word in rest if word.strip("[").startswith("--")}
-    known = {name for one in command.params for name in (*one.opts, *one.secondary_opts)}
-    if not known | {"--help"} >= options:
+    if name.startswith("studies."):
+        parser = study_of(name.removeprefix("studies.")).parser()
+        known, parse = set(parser._option_string_actions), parser.parse_args
+    elif name in COMMANDS:
+        params = COMMANDS[name].params
+        known = {name for one in params for name in (*one.opts, *one.secondary_opts)} | {"--help"}
+        parse = lambda rest: COMMANDS[name].make_context(name, rest)  # noqa: E731
+    else:
+        return f"no command {name}"
+    if not known >= options:
         return f"{name} has no {options - known}"
     if whole and not any(word.startswith("[") for word in rest):
         try:
-            command.make_context(name, rest)
-        except typer.TyperException as error:
-            return error.format_message()
+            parse(rest)
+        except (typer.TyperException, InputError) as error:
+            return str(error)
     return None
 
 

@@ -52,7 +52,7 @@ from mgs.run.folder import open_run
 from mgs.splat_ply import read_ply, write_ply
 from mgs.synth.scene_file import load_scene_file
 from mgs.view.subject import read_subject
-from studies.sweep import Cell, found
+from studies.frame.sweep import Cell, result_of
 
 FLOATS = (float("nan"), float("inf"), -1.0, 0.0, 1e-300)
 NUMBERS = [struct.pack(form, n) for form in ("<I", ">I", "<Q") for n in (0, 1, 255, 2**32 - 1)]
@@ -237,7 +237,7 @@ def study(path: Path) -> None:
 
 def result(path: Path) -> None:
     """Read the record of a study's cell."""
-    found(path.parents[2], Cell(path.parent.name, "a:b", {"a": 1}))
+    result_of(path.parents[2], Cell(path.parent.name, "a:b", {"a": 1}))
 
 
 ROBOTS = (

@@ -24,7 +24,6 @@ from mgs.policy import criteria
 from mgs.prior.build import load_prior, save_prior
 from mgs.run import folder as run_folder
 from mgs.run import nbv
-from mgs.run.folder import Checkpoint
 from mgs.run.inputs import prior_digest
 from mgs.run.settings import NbvSettings
 from mgs.splat import ListCache, fisher

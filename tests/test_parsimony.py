@@ -16,9 +16,9 @@ from mgs.policy.criteria import PIXEL_NOISE
 from mgs.prior.build import _samples, build_prior, prior_from_mesh
 from mgs.prior.resolution import PIXELS_OF_PHOTOGRAPHS, PIXELS_PER_SAMPLE, resolution
 from mgs.prior.settings import PriorSettings
-from studies import case, parsimony
-from studies.case import Size
-from studies.verdict import judged
+from studies import parsimony
+from studies.frame.case import Size
+from studies.frame.claim import judged
 
 
 def square():
@@ -145,22 +145,14 @@ def test_the_automatic_choice_is_compared_with_the_smallest_that_is_as_good():
 
 
 @pytest.mark.slow
-def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, monkeypatch):
-    calls = []
-
-    def make_dataset(root, out, scene, **size):
-        calls.append(scene)
-        write_data(out / "dataset")
-        return {}
-
-    size = parsimony.ParsimonySize(("boulder",), (60, 200), Size(48, 36, 12, 3), 4, seeds=3)
-    monkeypatch.setattr(parsimony, "DEGREES", (0, 1))
-    monkeypatch.setitem(parsimony.SIZES, "quick", size)
-    monkeypatch.setattr(case, "make_dataset", make_dataset)
+def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, ellipsoids):
+    size = parsimony.ParsimonySize(
+        ("boulder",), (60, 200), Size(48, 36, 12, 3), 4, seeds=3, degrees=(0, 1)
+    )
     out = tmp_path / "out"
     for _ in range(2):
-        study("parsimony", out)
-    assert calls == ["boulder"]
+        study("parsimony", out, sizes={"quick": size})
+    assert len(list(out.glob("cells/dataset/**/result.json"))) == 1
     record = json.loads((out / "parsimony.json").read_text())
     with open(out / "parsimony.csv") as file:
         assert len(list(csv.DictReader(file))) == len(record["rows"]) == 12

@@ -7,9 +7,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from studies.output import table, with_interval
-from studies.statistics import MOST_ROCKS, holm, interval, pareto_front, permutation_p
-from studies.verdict import Claim, judged, paired, single, verdict_table
+from studies.frame.claim import (
+    MOST_ROCKS,
+    Claim,
+    holm,
+    interval,
+    judged,
+    paired,
+    pareto_front,
+    permutation_p,
+    single,
+    verdict_table,
+)
+from studies.frame.output import grouped, scene_mean, table, with_interval
 
 numbers = st.floats(-10, 10, allow_nan=False).map(lambda x: round(x, 3))
 
@@ -102,3 +112,11 @@ def test_columns_are_formats_or_functions_and_missing_values_are_dashes():
     assert with_interval({"d": 1.0, "d_low": 0.5, "d_high": 1.5}, "d") == "+1.00 [+0.50, +1.50]"
     assert with_interval({"d": 1.0, "d_low": None}, "d") == "+1.00"
     assert with_interval({}, "d") == "–"
+
+
+def test_means_are_over_scenes():
+    rows = [{"scene": s, "k": k, "x": x} for s, k, x in (("a", 1, 2), ("a", 1, 4), ("b", 1, 5))]
+    (group,) = grouped(rows, "k")
+    assert scene_mean("x", ".1f", ends=False)(group) == "4.0"  # 3 and 5
+    assert scene_mean("x", ".1f")(group).startswith("4.0 [-8.7, 16.7")
+    assert scene_mean("x", ".1f")({"of": [*rows, {"scene": "c", "x": None}]}) == "–"

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,34 +12,13 @@ from program import study
 from mgs.data.dataset import load_dataset
 from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
-from studies.output import Panel
-from studies.stress import faults, run
-from studies.stress.fits import CONVERGENCE, convergence, free_means
-from studies.stress.lab import Experiment, open_lab
-from studies.sweep import Cell
-from studies.verdict import Claim, judged
+from studies import faults, stress
+from studies.frame.claim import Claim
+from studies.frame.output import Panel
+from studies.frame.sweep import Cell
+from studies.stress import Experiment, open_lab
 
 FOLDERS = {"dataset": "dataset", "prior": "prior"}
-
-
-def fit_rows(kind, values):
-    """Rows of two runs with these qualities after 1, 2, 3 ... passes."""
-    row = {"fit": kind, "criterion": "d-optimal", "tau": 1.0, "regret": 0.0}
-    return [
-        row | {"run": r, "passes": p, "psnr_mask": v + 0.01 * r}
-        for r in (0, 1)
-        for p, v in enumerate(values, 1)
-    ]
-
-
-def test_overfitting_is_what_the_longest_fit_lost():
-    no_prior, with_prior = CONVERGENCE.claims[2:]
-    for values, verdicts in (
-        ([20, 25, 23], ("holds", "fails")),
-        ([20, 23, 25], ("fails", "holds")),
-    ):
-        assert judged(no_prior, fit_rows("no prior", values))["verdict"] == verdicts[0]
-        assert judged(with_prior, fit_rows("with the prior", values))["verdict"] == verdicts[1]
 
 
 def test_detectors_are_judged_by_false_and_missed_alarms():
@@ -47,10 +27,10 @@ def test_detectors_are_judged_by_false_and_missed_alarms():
         failed = {"run": "a", "size": 1, "fault": "exposure", "failed": True, "sign exposure": sign}
         return [clean, failed, failed | {"failed": False}]
 
-    assert (faults.caught(rows(9.0)), faults.caught(rows(0.0))) == ([1.0], [0.0])
-    assert faults.false_alarms(rows(9.0)) == [0.0]
+    assert (stress.caught(rows(9.0)), stress.caught(rows(0.0))) == ([1.0], [0.0])
+    assert stress.false_alarms(rows(9.0)) == [0.0]
     noisy = [row | {"sign exposure": 9.0} for row in rows(9.0)]
-    assert faults.false_alarms(noisy + noisy) == [1.0], "a clean run of two experiments counts once"
+    assert stress.false_alarms(noisy + noisy) == [1.0], "a clean run of two experiments counts once"
 
 
 @pytest.fixture(scope="module")
@@ -109,31 +89,26 @@ def test_even_views_turn(lab):
 
 
 def test_fits_are_measured(root):
-    rows = free_means(root, root, "rock", **FOLDERS, turns_=1, counts=[4])["rows"]
+    rows = stress.free_means(root, root, "rock", **FOLDERS, turns_=1, counts=[4])["rows"]
     by = {row["means"]: row for row in rows}
     assert by["frozen"]["drift"] == 0 < by["free"]["drift"]
     assert by["frozen"]["tau"] == by["frozen, no prior"]["tau"] == pytest.approx(1)
-    rows = convergence(root, root, "rock", **FOLDERS, turns_=1, passes=[1, 5])["rows"]
-    last = [row for row in rows if row["passes"] == 5]
-    assert all(row["tau"] == pytest.approx(1) and row["regret"] == 0 for row in last)
-    with_prior = [r["psnr"] for r in rows if r["fit"] == "with the prior" and "psnr" in r]
-    assert with_prior[0] < with_prior[1]
 
 
 def test_faults_are_measured_against_the_clean_run(root, monkeypatch):
-    monkeypatch.setattr(faults, "PRIOR_FAULTS", {"shifted prior": (faults.shifted, (0.4,), "")})
-    monkeypatch.setattr(faults, "IMAGE_FAULTS", {"image noise": (faults.image_noise, (0.3,), "")})
-    for name in ("SHORT_FITS", "FREE_VIEWS", "ONE_POSE"):
-        monkeypatch.setattr(faults, name, getattr(faults, name)[:1])
-    rows = faults.faults(root, root, "rock", **FOLDERS, kinds="prior", others=[FOLDERS], repeats=1)
+    monkeypatch.setattr(stress, "PRIOR_FAULTS", {"shifted prior": (faults.shifted, (0.4,), "")})
+    monkeypatch.setattr(stress, "IMAGE_FAULTS", {"image noise": (faults.image_noise, (0.3,), "")})
+    how = {"scene": "rock", **FOLDERS, "repeats": 1}
+    rows = stress.faults(root, root, **how, kinds="prior", others=[FOLDERS])
     clean, shifted, same = rows["rows"]
     assert (clean["fault"], clean["lost"], clean["failed"]) == ("none", 0, False)
-    assert shifted["lost"] > faults.FAILURE
+    assert shifted["lost"] > stress.FAILURE
     assert shifted["failed"]
     assert same["lost"] == 0, "the prior of the same rock"
-    rows = faults.faults(root, root, "rock", **FOLDERS, kinds="images", others=[], repeats=1)
+    rows = stress.faults(root, root, **how, kinds="images", others=[])
     kinds = [row["fault"] for row in rows["rows"]]
-    assert kinds == ["none", "image noise", "few passes", "none", "free means", "one bad pose"]
+    few, free = ["few passes"] * 3, ["none", "free means"] * 2
+    assert kinds == ["none", "image noise", *few, *free, *["one bad pose"] * 2]
 
 
 CALLS = []
@@ -146,9 +121,7 @@ def toy(root, out, scene, lift):
     return {"rows": rows}
 
 
-def test_a_run_writes_its_files_continues_and_keeps_earlier_experiments(
-    tmp_path, monkeypatch, capsys
-):
+def test_a_run_writes_its_files_continues_and_keeps_earlier_experiments(tmp_path, capsys):
     def experiment(name, lift):
         task = "test_stress:toy"
         cells = [Cell(f"{name}/{s}", task, {"scene": s, "lift": lift}) for s in "ab"]
@@ -157,19 +130,17 @@ def test_a_run_writes_its_files_continues_and_keeps_earlier_experiments(
         return Experiment("Is it so?", lambda size: cells, (claim,), panels)
 
     table = {"one": experiment("one", 2.0), "two": experiment("two", 0.0)}
-    monkeypatch.setattr(run, "EXPERIMENTS", table)
+    size = replace(stress.SIZES["quick"], experiments=table)
     CALLS.clear()
 
     def verdicts(*arguments):
-        study("stress", tmp_path / "out", *arguments)
+        study("stress", tmp_path / "out", *arguments, sizes={"quick": size})
         found = json.loads((tmp_path / "out/verdicts.json").read_text())["experiments"]
         return [(one["name"], one["claims"][0]["verdict"]) for one in found]
 
     assert verdicts("--only", "one") == [("one", "holds")]
     assert verdicts("--only", "two") == [("one", "holds"), ("two", "fails")]
-    said = capsys.readouterr().out
-    assert "  holds    It is so. 2.05 (" in said
-    assert "4 runs" in said
+    assert "| It is so. | **holds** | 2.05 (" in capsys.readouterr().out
     assert verdicts() == [("one", "holds"), ("two", "fails")]
     assert CALLS == ["a", "b", "a", "b"]
     with open(tmp_path / "out/stability.csv") as file:

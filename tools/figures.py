@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from studies import chart, parsimony, setups
-from studies.output import draw_panels
-from studies.stress.faults import LOST, label_of
+from studies.frame.output import draw_panels
+from studies.stress import LOST, label_of
 
 RESULTS = Path(__file__).parent.parent / "docs/results"
 

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mgs.files import atomic_path, write_csv, write_json
+from mgs.files import write_csv, write_json, write_text
 from mgs.plotting import NO_GRID, STYLE, drawing
 from mgs.provenance import versions
 from mgs.reports.figures import POLICY_STYLE, STYLES
 from mgs.reports.tables import markdown
 from mgs.runtime import processor
-from studies.statistics import interval
-from studies.verdict import Row
+from studies.frame.claim import Row, interval
+from studies.frame.program import Work
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,15 +52,49 @@ def with_interval(row: Row, key: str) -> str:
     return f"{row[key]:+.2f} [{row[f'{key}_low']:+.2f}, {row[f'{key}_high']:+.2f}]"
 
 
-def write_table(
-    out: Path, name: str, rows: Sequence[Row], text: str, command: str, **more: Any
-) -> list[Path]:
+def over_scenes(rows: Iterable[Row], key: str) -> dict[str, float]:
+    """Mean of a key over the rocks of each scene; NaN where a value is missing.
+
+    A scene is the unit of statistics, because rocks of one scene are not independent.
+    """
+    values: dict[str, list[Any]] = {}
+    for row in rows:
+        values.setdefault(row["scene"], []).append(row[key])
+    return {scene: float(np.mean(np.array(of, float))) for scene, of in values.items()}
+
+
+def grouped(rows: Iterable[Row], *keys: str) -> list[Row]:
+    """A row for each group of the same values of `keys`, with these and the group's rows "of"."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return [dict(zip(keys, group, strict=True)) | {"of": of} for group, of in groups.items()]
+
+
+def scene_mean(key: str, form: str, ends: bool = True, **only: Any) -> Content:
+    """Content for a row of `grouped`: mean over scenes with its 95 % interval; a dash where a value
+    is missing. only: entries that rows must have."""
+
+    def cell(group: Row) -> str:
+        rows = [row for row in group["of"] if only.items() <= row.items()]
+        values = list(over_scenes(rows, key).values())
+        if np.isnan(values).any():
+            return "–"
+        between, middle = interval(values), format(float(np.mean(values)), form)
+        if between is None or not ends:
+            return middle
+        return f"{middle} [{between[0]:{form}}, {between[1]:{form}}]"
+
+    return cell
+
+
+def write_table(work: Work, name: str, rows: Sequence[Row], text: str, **more: Any) -> list[Path]:
     """Write NAME.csv of rows, NAME.md of a text, and NAME.json with both, the command, the machine
     and more entries. Returns the paths."""
+    out, command = work.out, work.command
     record = {"command": command, "machine": processor(), "versions": versions(), **more}
     write_json(out / f"{name}.json", record | {"rows": rows, "markdown": text})
-    with atomic_path(out / f"{name}.md") as temporary:
-        temporary.write_text(f"{text}\n`{command}`\n", encoding="utf-8")
+    write_text(out / f"{name}.md", f"{text}\n`{command}`\n")
     with_command = [row if "command" in row else row | {"command": command} for row in rows]
     return [write_csv(out / f"{name}.csv", with_command), out / f"{name}.json", out / f"{name}.md"]
 

@@ -15,10 +15,13 @@ import numpy as np
 
 from mgs import runtime
 from mgs.memory import padded
-from studies.verdict import Row
+from studies.frame.claim import Row
 
-REFERENCE_GAUSSIANS, REFERENCE_SIZE, REFERENCE_CALLS = 10_000, (320, 240), 10
-"""Gaussians, image size and number of renders with gradients of the reference."""
+REFERENCE = 10_000, 320, 240
+"""Gaussians, width and height of the reference, which renders REFERENCE_CALLS times with gradients.
+"""
+
+REFERENCE_CALLS = 10
 
 LEAST_SECONDS, MOST_REPEATS = 0.8, 15
 """A call is repeated until its times add up to so many seconds, at most so often."""
@@ -27,16 +30,16 @@ Result = TypeVar("Result")
 
 
 @functools.cache
-def _reference() -> Callable[[], Any]:
-    """The reference, with its kernels compiled."""
+def reference_of(count: int, width: int, height: int) -> Callable[[], Any]:
+    """The reference of this size, with its kernels compiled."""
     runtime.start()
     import mitsuba as mi
 
     from mgs.splat import ListCache, as_drjit
     from studies.bench import gradient, surface_camera, surface_gaussians
 
-    gaussians, cache = surface_gaussians(REFERENCE_GAUSSIANS), ListCache()
-    camera, device = surface_camera(gaussians, *REFERENCE_SIZE), as_drjit(gaussians)
+    gaussians, cache = surface_gaussians(count), ListCache()
+    camera, device = surface_camera(gaussians, width, height), as_drjit(gaussians)
     weights = mi.TensorXf(padded(np.ones((camera.height, camera.width, 3))))
 
     def call() -> None:
@@ -56,15 +59,18 @@ def _clock(call: Callable[[], Result]) -> tuple[Result, float, float]:
 
 
 def timed(
-    call: Callable[[], Result], repeats: int, reference: Callable[[], Any] | None = None
+    call: Callable[[], Result],
+    repeats: int,
+    reference: Callable[[], Any] | tuple[int, ...] = REFERENCE,
 ) -> tuple[Result, dict[str, float]]:
     """Call a function once untimed, which compiles its kernels, and then `repeats` times or more.
 
     The function must return NumPy arrays or plain values, so that nothing is left to compute.
+    reference: a function, or the size of `reference_of`.
     Returns its result, and medians: wall and cpu, seconds; reference, seconds; ratio, wall over
     reference, with its extremes ratio_low and ratio_high.
     """
-    reference = reference or _reference()
+    reference = reference if callable(reference) else reference_of(*reference)
     result = call()
     walls, cpus, references = list[float](), list[float](), list[float]()
     while len(walls) < repeats or (sum(walls) < LEAST_SECONDS and len(walls) < MOST_REPEATS):

@@ -19,7 +19,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mgs.errors import InputError
+from mgs import InputError
 from mgs.files import read_json, write_json
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ PRELOAD = "pymeshlab"
 makes a Poisson surface aborts when it ends."""
 
 Report = Callable[[str, int, int], None]
-"""Called as report(name, done, total) before each cell that is not done yet."""
+"""Called as report(name, done, total) for each cell that is not done yet."""
 
 Results = dict[str, dict[str, Any]]
 """Results of cells by their names."""
@@ -48,7 +48,7 @@ class Cell:
     function(root, out, **arguments) with the study's folder and the cell's own folder, which may
     hold files of an interrupted call; returns JSON data. needs: names of cells that must be done
     before. alone: the result contains seconds, so the cell runs in this process while all workers
-    are idle. about: first columns of its rows in tables.
+    are idle; no other cell needs it. about: first columns of its rows in tables.
     """
 
     name: str
@@ -59,25 +59,12 @@ class Cell:
     about: dict[str, Any] = field(default_factory=dict)
 
 
-def names_of(only: str | None, known: Iterable[str]) -> list[str]:
-    """Names in a comma-separated option --only, in the order of the known ones; all if None.
-
-    Raises InputError for an unknown or missing name.
-    """
-    known = list(known)
-    asked = known if only is None else [name.strip() for name in only.split(",")]
-    for name in asked:
-        if name not in known:
-            raise InputError(f"--only {name!r}: unknown; choose some of {','.join(known)}")
-    return [name for name in known if name in asked]
-
-
 def cell_folder(root: Path, name: str) -> Path:
     """Folder of a cell."""
     return root / CELLS / name
 
 
-def found(root: Path, cell: Cell) -> dict[str, Any] | None:
+def result_of(root: Path, cell: Cell) -> dict[str, Any] | None:
     """Result of a cell; None if it is not done. Raises InputError if its folder holds the result of
     another task or of other arguments."""
     path = cell_folder(root, cell.name) / "result.json"
@@ -94,11 +81,17 @@ def found(root: Path, cell: Cell) -> dict[str, Any] | None:
     return result
 
 
+def results_so_far(root: Path, cells: Iterable[Cell]) -> Results:
+    """Results of the cells that are done."""
+    results = {cell.name: result_of(root, cell) for cell in cells}
+    return {name: result for name, result in results.items() if result is not None}
+
+
 def do(root: Path, cell: Cell) -> dict[str, Any]:
-    """Result of a cell, which is done first if necessary."""
-    known = found(root, cell)
-    if known is not None:
-        return known
+    """Do a cell, unless it is done; returns its result."""
+    before = result_of(root, cell)
+    if before is not None:
+        return before
     module, _, name = cell.task.partition(":")
     out = cell_folder(root, cell.name)
     out.mkdir(parents=True, exist_ok=True)
@@ -113,37 +106,38 @@ def run_cells(
     cells: Iterable[Cell],
     report: Report,
     *,
-    workers: int = 1,
+    workers: int | None = None,
     scheduler: str | None = None,
 ) -> Results:
     """Do all cells in the order of their needs, and return their results.
 
     workers: number of processes, which share the cores; one: this process. scheduler: address of a
     Dask scheduler whose workers are used instead; they must see `root` under the same path and have
-    one thread each. Raises what a cell raises; InputError if the scheduler does not answer or is
-    lost, its workers do not fit, or a cell's worker is killed repeatedly. Finished cells are kept.
+    one thread each. A cell is reported before it begins, and in a worker once it is done.
+
+    Raises what a cell raises; InputError if the scheduler does not answer or is lost, its workers
+    do not fit, or a cell's worker is killed repeatedly. Finished cells are kept.
     """
     root = root.resolve()  # workers may have another current folder
     by_name = {cell.name: cell for cell in cells}
     order = TopologicalSorter({name: cell.needs for name, cell in by_name.items()}).static_order()
     ordered = [by_name[name] for name in order]
-    known = {cell.name: found(root, cell) for cell in ordered}
-    results = {name: result for name, result in known.items() if result is not None}
-    left = [cell for cell in ordered if cell.name not in results]
-    if scheduler is None and workers == 1:
-        for cell in left:
-            report(cell.name, len(results), len(ordered))
+    results = results_so_far(root, ordered)
+
+    def tell(cell: Cell) -> None:
+        report(cell.name, len(results), len(ordered))
+
+    side_by_side = [cell for cell in ordered if cell.name not in results and not cell.alone]
+    if side_by_side and (scheduler or (workers or 1) > 1):
+        threads = None if scheduler else max(1, len(os.sched_getaffinity(0)) // (workers or 1))
+        with _client(workers or 1, scheduler) as client:
+            for cell, result in _done_in_workers(root, side_by_side, client, threads):
+                tell(cell)
+                results[cell.name] = result
+    for cell in ordered:
+        if cell.name not in results:
+            tell(cell)
             results[cell.name] = do(root, cell)
-    elif left:
-        threads = None if scheduler else max(1, len(os.sched_getaffinity(0)) // workers)
-        with _client(workers, scheduler) as client:
-            try:
-                _run_in_workers(root, left, results, report, client, threads)
-            except CancelledError:
-                raise InputError(
-                    "the connection to the Dask scheduler is lost; finished cells are kept: run "
-                    "the same command again when the scheduler is there"
-                ) from None
     return {cell.name: results[cell.name] for cell in ordered}
 
 
@@ -166,23 +160,15 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
     levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(silent)
+    options = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "preload": PRELOAD}
+    options |= {"threads_per_worker": 1, "memory_limit": 0, "silence_logs": silent}
     try:
         with dask.config.set(settings):
             if scheduler is not None:
                 with _connected(scheduler) as client:
                     yield client
                 return
-            options = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "preload": PRELOAD}
-            with (
-                LocalCluster(
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    memory_limit=0,
-                    silence_logs=silent,
-                    **options,
-                ) as cluster,
-                Client(cluster) as client,
-            ):
+            with LocalCluster(n_workers=workers, **options) as cluster, Client(cluster) as client:
                 yield client
     finally:
         for logger, level in zip(loggers, levels, strict=True):
@@ -214,46 +200,35 @@ def _connected(scheduler: str) -> Client:
     return client
 
 
-def _run_in_workers(
-    root: Path,
-    left: list[Cell],
-    results: Results,
-    report: Report,
-    client: Client,
-    threads: int | None,
-) -> None:
-    """Do the cells that are left, and add their results. Each worker has one cell at a time; cells
-    to be done alone wait until no other cell can run."""
-    from distributed import Future, KilledWorker, wait
+def _done_in_workers(
+    root: Path, cells: list[Cell], client: Client, threads: int | None
+) -> Iterator[tuple[Cell, dict[str, Any]]]:
+    """Do cells in workers, one at a time in each; yield them with their results as they end."""
+    from distributed import Future, KilledWorker, as_completed
 
-    total = len(left) + len(results)
-    running: dict[Future, Cell] = {}
-    while left or running:
-        ready = [cell for cell in left if results.keys() >= set(cell.needs)]
-        free = max(0, max(1, len(client.nthreads())) - len(running))
-        for cell in [cell for cell in ready if not cell.alone][:free]:
-            report(cell.name, len(results), total)
-            running[client.submit(_do_in_worker, root, cell, threads, pure=False)] = cell
-            left.remove(cell)
-        if not running:
-            cell = next(cell for cell in ready if cell.alone)
-            report(cell.name, len(results), total)
-            results[cell.name] = do(root, cell)
-            left.remove(cell)
-            continue
-        for future in wait(list(running), return_when="FIRST_COMPLETED").done:
-            cell = running.pop(future)
-            try:
-                results[cell.name] = future.result()
-            except KilledWorker:
-                raise InputError(
-                    f"{cell.name}: its worker was killed again and again (is there too little "
-                    "memory?); run the same command again with fewer workers"
-                ) from None
+    futures: dict[str, Future] = {}
+    for cell in cells:
+        needs = [futures[name] for name in cell.needs if name in futures]
+        futures[cell.name] = client.submit(_do_in_worker, root, cell, threads, needs, pure=False)
+    by_future = {futures[cell.name]: cell for cell in cells}
+    for future in as_completed(by_future):
+        try:
+            yield by_future[future], future.result()
+        except CancelledError:
+            raise InputError(
+                "the connection to the Dask scheduler is lost; finished cells are kept: run the "
+                "same command again when the scheduler is there"
+            ) from None
+        except KilledWorker:
+            raise InputError(
+                f"{by_future[future].name}: its worker was killed again and again (is there too "
+                "little memory?); run the same command again with fewer workers"
+            ) from None
 
 
-def _do_in_worker(root: Path, cell: Cell, threads: int | None) -> dict[str, Any]:
-    """`do` in a worker process with this many threads of Dr.Jit; None: its default."""
+def _do_in_worker(root: Path, cell: Cell, threads: int | None, needs: list[Any]) -> dict[str, Any]:
+    """`do` in a worker process with this many threads of Dr.Jit, None: its default; after the cells
+    whose results are `needs`."""
     if threads is not None:
         import drjit as dr
 

@@ -1,34 +1,25 @@
 """Cases: a rock at one size with one prior, and what studies do with it.
 
-A case names the cells that render its dataset and build its prior. The functions with the arguments
-(root, out, ...) are tasks of `studies.sweep.Cell`; `dataset` and `prior` are folders below the
-study's folder, or absolute. All tasks continue after an interruption.
+A case names the cells that render its dataset and build its prior. The functions of (root, out,
+...) are tasks of `studies.frame.sweep.Cell`; `dataset` and `prior` are folders below the study's
+folder, or absolute. All tasks continue after an interruption.
 """
 
 from __future__ import annotations
 
 import shutil
-import signal
-from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from argparse import Namespace
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from mgs.data.dataset import Dataset, load_dataset
-from mgs.errors import InputError
-from mgs.evaluation import evaluate_model
+import mgs
 from mgs.files import atomic_folder
-from mgs.fit.settings import COLOURS_ALONE
-from mgs.gaussians import Gaussians
-from mgs.prior.build import build_prior, load_prior, save_prior
-from mgs.prior.settings import PriorSettings
-from mgs.reports.evaluation import evaluate_run
-from mgs.run.folder import Run, open_run
-from mgs.run.nbv import resume_nbv, start_run
-from studies.sweep import CELLS, Cell
+from mgs.run.inputs import file_digest
+from studies.frame.claim import MOST_ROCKS
+from studies.frame.program import Options, at_least
+from studies.frame.sweep import CELLS, Cell
 
 MESH_SCENE = "boulder"
 """Scene whose ground, light and orbits a mesh gets."""
@@ -51,6 +42,63 @@ class Rock:
     def name(self) -> str:
         """Folder name."""
         return f"{self.scene}-{self.digest[:8] if self.mesh else self.seed}"
+
+
+_SEEDS = {
+    "boulder": (11, 12),
+    "contact-binary": (12, 14),
+    "low-sun": (11, 12),
+    "pebbles": (11, 12),
+    "strata": (12,),
+    "horseshoe": (11,),
+    "obsidian": (12,),
+    "half-banded": (11,),
+}
+
+FRESH = tuple(
+    Rock(scene, seed, index)
+    for index, (scene, seed) in enumerate(
+        (scene, seeds[k]) for k in range(2) for scene, seeds in _SEEDS.items() if k < len(seeds)
+    )
+)
+"""Rocks that chose no setting: of each scene the first seeds from 11 on with which the rock is
+wholly in every view, one of each scene first. Three scenes are new with them."""
+
+ROCKS: Options = {
+    "--rocks": {"type": at_least(1), "help": "Number of rocks."},
+    "--mesh": {
+        "action": "append",
+        "default": [],
+        "type": Path,
+        "help": "A rock of your own in place of the procedural ones; repeatable.",
+    },
+}
+
+
+def rocks_of(options: Namespace, count: int) -> tuple[Rock, ...]:
+    """Rocks of the options --rocks and --mesh; `count` of FRESH by default.
+
+    Raises InputError if there are fewer, two meshes have one name, or a mesh cannot be read or is
+    one too many.
+    """
+    if len(options.mesh) > MOST_ROCKS:
+        raise mgs.InputError(
+            f"--mesh: {len(options.mesh)} files; differences are tested over {MOST_ROCKS} rocks at "
+            "most, leave some out"
+        )
+    rocks: list[Rock] = []
+    for k, mesh in enumerate(options.mesh):
+        if mesh.stem in [rock.scene for rock in rocks]:
+            raise mgs.InputError(f"--mesh {mesh}: {NAMESAKE}")
+        rocks.append(Rock(mesh.stem, 0, k, mesh.resolve(), file_digest(mesh)))
+    these: Sequence[Rock] = rocks or FRESH
+    asked = options.rocks or (len(rocks) or count)
+    if asked > len(these):
+        raise mgs.InputError(f"--rocks {asked}: there are 1 to {len(these)}")
+    return tuple(these[:asked])
+
+
+NAMESAKE = "there is one of this name already; leave it out, or rename its file"
 
 
 @dataclass(frozen=True)
@@ -168,7 +216,7 @@ def make_dataset(
             sections[section] |= values
         changed = SceneFile.model_validate(sections)
         synth_orbit(folder, changed, images, seed, mesh, test_views=size["tests"])
-    return {"frames": len(load_dataset(folder))}
+    return {"frames": len(mgs.load_dataset(folder))}
 
 
 def make_survey(root: Path, out: Path, dataset: str, seed: int) -> dict[str, Any]:
@@ -177,7 +225,11 @@ def make_survey(root: Path, out: Path, dataset: str, seed: int) -> dict[str, Any
     from mgs.survey.flight import SurveySettings, fly
     from mgs.survey.folder import save_survey
 
-    folder, data, settings = out / "survey", load_dataset(root / dataset), SurveySettings(seed=seed)
+    folder, data, settings = (
+        out / "survey",
+        mgs.load_dataset(root / dataset),
+        SurveySettings(seed=seed),
+    )
     shutil.rmtree(folder, ignore_errors=True)  # of a process that was killed
     with atomic_folder(folder) as unfinished:
         numbers = save_survey(unfinished, data, fly(data, settings), settings)
@@ -190,90 +242,28 @@ def make_prior(root: Path, out: Path, dataset: str, **settings: Any) -> dict[str
     folder = out / "prior"
     if not (folder / "prior.json").is_file():  # written last
         shutil.rmtree(folder, ignore_errors=True)
-        built = build_prior(load_dataset(root / dataset), PriorSettings(**settings))
+        built = mgs.build_prior(mgs.load_dataset(root / dataset), mgs.PriorSettings(**settings))
         with atomic_folder(folder) as unfinished:
-            save_prior(unfinished, built)
-    prior = load_prior(folder)
+            mgs.save_prior(unfinished, built)
+    prior = mgs.load_prior(folder)
     found = {"gaussians": len(prior.points) + prior.backed, "spacing": prior.spacing}
     kept = ("sampled_area", "resolution")
     return found | {key: prior.numbers[key] for key in kept if key in prior.numbers}
 
 
-def test_views_of(dataset: Dataset) -> Dataset:
+def test_views_of(dataset: mgs.Dataset) -> mgs.Dataset:
     """Test views of a dataset. Raises InputError where it has none."""
     tests = dataset.test_views()
     if tests is None:
-        raise InputError(
+        raise mgs.InputError(
             f"{dataset.root}: has no test views, by which models are judged; "
             "make them with `--test-views`"
         )
     return tests
 
 
-def judge(model: Gaussians, dataset: Dataset) -> dict[str, float]:
+def judge(model: mgs.Gaussians, dataset: mgs.Dataset) -> dict[str, float]:
     """Mean metrics of a model over the test views of a dataset (`mgs.evaluation`)."""
-    return dict(evaluate_model(model, (), (), test_frames=test_views_of(dataset).frames)["test"])
-
-
-def begun_run(root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]) -> Run:
-    """The run in OUT/run, which is started if it is not there. settings: of `mgs nbv`."""
-    for leftover in out.glob(".run.*.part"):  # of a process killed before the run began
-        shutil.rmtree(leftover)
-    run = out / "run"
-    if (run / "config.json").is_file():
-        return open_run(run)
-    train = {**COLOURS_ALONE, **settings.get("train", {})}
-    return start_run(root / dataset, run, prior=root / prior, **settings | {"train": train})
-
-
-def time_policy(
-    root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
-) -> dict[str, Any]:
-    """Run a policy in a new process, and measure its last model on all views.
-
-    Returns "images"; "test", "all" and "held_out" of `evaluate`; "seconds" of all steps without
-    evaluation; "choice_seconds", the mean of one choice (None without any); "peak_megabytes" of the
-    process at the end of the run.
-    """
-    return in_new_process(_timed, out, root, out, dataset, prior, settings)
-
-
-def _timed(
-    root: Path, out: Path, dataset: str, prior: str, settings: dict[str, Any]
-) -> dict[str, Any]:
-    run = begun_run(root, out, dataset, prior, settings)
-    steps = resume_nbv(run, policy=settings.get("policy")).state.steps
-    peak = peak_megabytes()
-    metrics = evaluate_run(run.folder, pictures=False)
-    seconds = [step["seconds"] for step in steps]
-    choices = [one["score"] for one in seconds[1:]]
-    return {key: metrics[key] for key in ("images", "test", "all", "held_out")} | {
-        "seconds": sum(one[stage] for one in seconds for stage in one if stage != "evaluate"),
-        "choice_seconds": sum(choices) / len(choices) if choices else None,
-        "peak_megabytes": peak,
-    }
-
-
-def in_new_process(
-    task: Callable[..., dict[str, Any]], out: Path, *arguments: Any
-) -> dict[str, Any]:
-    """Result of a function called in a new process, whose memory is its own. out: for messages.
-
-    Raises InputError if that process is killed, and what the function raises.
-    """
-    at_interrupt = (signal.SIGINT, signal.SIG_DFL)  # end silently
-    context = get_context("spawn")
-    with ProcessPoolExecutor(1, context, initializer=signal.signal, initargs=at_interrupt) as pool:
-        try:
-            return pool.submit(task, *arguments).result()
-        except BrokenProcessPool:
-            raise InputError(
-                f"{out}: its process was killed (is there too little memory?); "
-                "give the command again"
-            ) from None
-
-
-def peak_megabytes() -> float:
-    """Most memory that this process has held, megabytes. `getrusage` would include the parent's."""
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) * 1.024e-3
+    return dict(
+        mgs.evaluate_model(model, (), (), test_frames=test_views_of(dataset).frames)["test"]
+    )
