@@ -7,19 +7,15 @@ import numpy as np
 import pytest
 import synthetic
 import tiny
-from rich.console import Console
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
-from mgs.cli.nbv import resume_and_print
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset, target_of, write_transforms
 from mgs.evaluation import evaluate_model, render_view
 from mgs.images import write_png
 from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
-from mgs.reports.page_facts import measured, notes
-from mgs.run import folder as run_folder
 from mgs.run.checks import predicted_psnr
 from mgs.run.detectors import (
     DETECTORS,
@@ -33,8 +29,7 @@ from mgs.run.detectors import (
     view_indicators,
 )
 from mgs.run.ending import why_ended
-from mgs.run.folder import open_run
-from mgs.run.nbv import run_nbv, start_run
+from mgs.run.nbv import run_nbv
 from mgs.splat import as_drjit
 
 FITS = Before(outline=0.001, offset=0.01)
@@ -271,18 +266,6 @@ def test_a_side_that_no_seed_saw_is_no_drift_of_the_exposure(rock, tmp_path):
     state = run_nbv(rock, tmp_path / "run", **given).state
     assert not any("exposure" in warning for warning in warnings(state))
     assert "saturated" not in state.steps[-1]["indicators"], "a policy that ignores gains"
-
-
-def test_a_warning_is_printed_recorded_and_on_the_page(rock, tmp_path):
-    run = tmp_path / "run"
-    start_run(rock, run, budget=1, seeds=5, train={"passes": 3})
-    console = Console(record=True, width=300)
-    resume_and_print(run, console)
-    first = run_folder.read_checkpoint(run).steps[0]
-    (said,) = [warning for warning in first["warnings"] if "still fell" in warning]
-    assert f"step 0: {said}" in console.export_text()
-    assert f"step 0: {said}" in notes(open_run(run))
-    assert not any("indicators" in key for key in measured(first))
 
 
 def wrong_pose(frames):

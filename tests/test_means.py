@@ -8,7 +8,6 @@ import tiny
 from program import change_settings
 from refusals import refused
 
-from mgs import scene as scene_module
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
@@ -21,7 +20,7 @@ from mgs.prior.build import load_prior
 from mgs.reports.diagnostics import diagnose
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
-from mgs.run.nbv import resume_nbv, run_nbv, start_run
+from mgs.run.nbv import run_nbv, start_run
 from mgs.run.settings import NbvSettings
 from mgs.splat import MEANS, as_drjit, fisher, groups, render
 from mgs.view.subject import SCALARS, read_subject
@@ -181,25 +180,6 @@ def test_criteria_see_the_means_and_coverage_does_not(files, whole):
     frozen = run_nbv(files[0], out.parent / "frozen", **options(files, "frozen", budget=0)).state
     assert frozen.steps[0]["coverage"] == state.steps[0]["coverage"]
     assert np.abs(state.gaussians.means - prior.points).max() > 1e-3
-
-
-def test_interrupted_and_resumed_the_run_is_the_same(files, whole, tmp_path, monkeypatch):
-    out, state = whole
-    real, calls = scene_module.fit_gaussians, []
-
-    def struck(*arguments):
-        calls.append(1)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return real(*arguments)
-
-    monkeypatch.setattr(scene_module, "fit_gaussians", struck)
-    with pytest.raises(KeyboardInterrupt):
-        run_nbv(files[0], tmp_path / "run", **options(files, "free"))
-    resumed = resume_nbv(tmp_path / "run").state
-    assert resumed.taken == state.taken
-    assert resumed.gaussians == state.gaussians
-    assert (tmp_path / "run/gaussians.ply").read_bytes() == (out / "gaussians.ply").read_bytes()
 
 
 @pytest.mark.parametrize("policy", ["d-optimal", "coverage", "directional-d"])

@@ -10,10 +10,8 @@ import pytest
 import tiny
 from program import change_settings, command
 from refusals import refused
-from rich.console import Console
 
 from mgs.cli import nbv as nbv_command
-from mgs.cli.printing import print_run, step_lines
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.evaluation import psnr_measure
@@ -91,25 +89,6 @@ def test_a_mean_over_no_view_is_left_out(dataset):
     assert list(tested) == ["test_psnr", "test_psnr_mask"]
     alone = psnr_measure(load_dataset(dataset / "test"), ListCache())(model, [])
     assert tested["test_psnr"] == alone["psnr"]
-
-
-def test_what_is_printed_of_a_run(tmp_path):
-    """A quality that was not measured is a dash."""
-    views = {"count": 2, "psnr": 30.123, "ssim": 0.95, "psnr_mask": None, "ssim_mask": None}
-    line = {"step": 0, "name": None, "seed_names": ["a", "b"], "score": None, "coverage": 1.0}
-    line |= {"seconds": {"fit": 2.5}, "images": 2, "iterations": 14, "loss": 0.1}
-    line |= {"stop_reason": "pass-limit", "psnr": 20.0, "test_psnr": 30.12, "test_psnr_mask": 25.5}
-    state = Checkpoint(tiny.initial([]), np.zeros(0), np.zeros(0), [0], [line])
-    console = Console(record=True, width=80, force_terminal=True)
-    metrics = {"policy": "mine", "images": 2, "all": views, "test": views}
-    print_run(tmp_path, state, metrics, console)
-    shown = console.export_text()
-    cells = ["mine", "2", "30.12", "0.9500", "–", "–", "–", "100.00"]
-    assert cells in [line.split() for line in shown.splitlines()]
-    assert list(step_lines(line)) == [
-        "step 0: a, b, coverage 100.00 %, 7 passes to a loss of 0.1 (pass-limit), "
-        "PSNR of test views 30.12 dB, masked PSNR of test views 25.50 dB, 2.5 s"
-    ]
 
 
 @pytest.mark.parametrize("made", ["dataset", "random"])

@@ -12,7 +12,6 @@ import typer
 from program import command, said, steps
 from refusals import a_file, listing, occupied, refused
 
-from mgs import __version__
 from mgs.cli.app import COMMANDS, app
 from mgs.splat_ply import write_ply
 
@@ -155,12 +154,6 @@ def printed(capsys, *arguments) -> str:
     """Everything that `mgs ARGUMENTS` prints, in one line."""
     command(*arguments)
     return said(capsys)[0]
-
-
-def test_help_and_version(capsys):
-    assert "Usage" in printed(capsys)
-    assert "--background R G B" in printed(capsys, "render", "--help")
-    assert f"mgs {__version__}" in printed(capsys, "--version")
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -4,14 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from program import change_settings, command, steps, table_numbers
+from program import change_settings
 from tiny import resume, run
 
 from mgs.policy import criteria
-from mgs.reports.page_facts import notes
-from mgs.reports.tables import markdown_table
-from mgs.run.ending import GAIN_UNIT, run_end, why_ended
-from mgs.run.folder import open_run
+from mgs.run.ending import run_end, why_ended
 from mgs.run.settings import NbvSettings
 
 
@@ -90,39 +87,6 @@ def test_a_run_that_ended_goes_on_only_when_its_rule_is_changed(loaded, whole, t
     assert last.taken == whole.taken
     assert ["ended" in line for line in last.steps] == [False] * 5 + [True]
     np.testing.assert_array_equal(last.gaussians.sh, whole.gaussians.sh)
-
-
-def test_one_line_says_why_a_run_ended(dataset, prior, tmp_path, capsys):
-    """When it ends, when it is resumed, in the report and on the page."""
-
-    def mgs(*arguments) -> str:
-        command(*arguments)
-        return capsys.readouterr().out
-
-    start = ["nbv", dataset, "--prior", prior, "--budget", "2", "--set", "train.passes=1"]
-    early, whole = runs = [tmp_path / name for name in ("early", "whole")]
-    shown = mgs(*start, "--out", early, "--set", "stop_gain=1e3")
-    ended = steps(early)[-1]["ended"]
-    gain = f"would gain {ended['information_gain']:.4g} {GAIN_UNIT} after 0 chosen views"
-    next_view = f"the next view, {ended['name']}"
-    line = f"the run has ended: {next_view}, {gain}, less than stop_gain = 1000"
-    assert shown.count(line) == 1
-    assert mgs("nbv", "--resume", early).count(line) == 1
-    shown = mgs(*start, "--out", whole, "--policy", "random", "--batch", "2")
-    lines = [line for line in shown.splitlines() if ", coverage " in line]
-    assert [" passes" in line for line in lines] == [True, False, True]
-    for out in runs:
-        mgs("eval", out)
-    shown = mgs("report", *runs, "--out", tmp_path / "report")
-    rows = table_numbers(runs)
-    assert f"directional-i: a path of {rows[0]['path']:.2f} m; {line}\n" in shown
-    spent = "the run has ended: its budget is spent, 2 chosen views"
-    assert f"random: a path of {rows[1]['path']:.2f} m; {spent}\n" in shown
-    assert [row.get("ended") for row in rows] == ["gain", None]
-    table = [row.split("|")[-2].strip() for row in markdown_table(rows).splitlines()]
-    assert table == ["ended by", "---:", "gain", "–"]
-    assert "ended by" not in markdown_table(table_numbers([whole]))
-    assert f"T{line[1:]}." in notes(open_run(early))
 
 
 def test_reasons_in_words():
