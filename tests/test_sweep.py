@@ -91,11 +91,11 @@ def test_cells_of_a_study_have_one_name_each_and_all_they_need():
 
 
 def test_names_come_in_the_order_of_those_known():
-    assert names_of(None, "abc") == ["a", "b", "c"]
-    assert names_of("c, a,c", "abc") == ["a", "c"]
+    assert names_of(None, [*"abc"]) == ["a", "b", "c"]
+    assert names_of("c, a,c", [*"abc"]) == ["a", "c"]
     for only in ("", "a,", "d"):
         with pytest.raises(InputError, match=r"^--only"):
-            names_of(only, "abc")
+            names_of(only, [*"abc"])
 
 
 def add_slowly(root, out, x):

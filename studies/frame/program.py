@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
-Options = Mapping[str, Mapping[str, Any]]
+Options = dict[str, dict[str, Any]]
 """Options by name, with the arguments of `ArgumentParser.add_argument`."""
 
 
@@ -40,7 +40,7 @@ def at_least(least: int) -> Callable[[str], int]:
     return parse
 
 
-SCALE = {
+SCALE: Options = {
     "--scale": {"default": "quick", "help": "quick: minutes; the other: hours. Default: quick."}
 }
 WORKERS: Options = {
@@ -108,8 +108,10 @@ class Study:
         """Parser of the command line."""
         prog = f"python -m studies.{self.name}"
         parser = Parser(prog, description=self.about, allow_abbrev=False)
-        out = {"out": {"type": Path, "help": "Folder for everything; run again to continue."}}
-        for option, how in ((out | SCALE if self.sizes else {}) | dict(self.options)).items():
+        out: Options = {
+            "out": {"type": Path, "help": "Folder for everything; run again to continue."}
+        }
+        for option, how in ((out | SCALE if self.sizes else {}) | self.options).items():
             parser.add_argument(option, **how)
         return parser
 

@@ -160,7 +160,11 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
     levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(silent)
-    options = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "preload": PRELOAD}
+    options: dict[str, Any] = {
+        "host": "127.0.0.1",
+        "dashboard_address": "127.0.0.1:0",
+        "preload": PRELOAD,
+    }
     options |= {"threads_per_worker": 1, "memory_limit": 0, "silence_logs": silent}
     try:
         with dask.config.set(settings):
