@@ -12,6 +12,7 @@ Runs are timed one by one: let nothing else run meanwhile.
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 import time
@@ -19,8 +20,9 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -223,9 +225,7 @@ def in_new_process(
 
     Raises InputError if that process is killed, and what the function raises.
     """
-    at_interrupt = (signal.SIGINT, signal.SIG_DFL)  # end silently
-    context = get_context("spawn")
-    with ProcessPoolExecutor(1, context, initializer=signal.signal, initargs=at_interrupt) as pool:
+    with ProcessPoolExecutor(1, get_context("spawn"), initializer=_begin) as pool:
         try:
             return pool.submit(task, *arguments).result()
         except BrokenProcessPool:
@@ -233,6 +233,19 @@ def in_new_process(
                 f"{out}: its process was killed (is there too little memory?); "
                 "give the command again"
             ) from None
+
+
+def _begin() -> None:
+    """Begin a process that ends silently at Ctrl-C, and with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    parent = parent_process()
+    assert parent
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=wait, daemon=True).start()
 
 
 def peak_megabytes() -> float:
