@@ -256,7 +256,7 @@ SLEEP = Cell("sleep", "test_sweep:sleep")
 
 def sleep(root, out):
     """A task that outlives its scheduler."""
-    time.sleep(6)
+    time.sleep(3)
     return {}
 
 
@@ -264,7 +264,15 @@ def test_a_lost_scheduler_is_one_line(tmp_path, caplog):
     options = {"n_workers": 1, "threads_per_worker": 1, "host": "127.0.0.1", "memory_limit": 0}
     silence = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL + 1}
     with LocalCluster(**options, **silence) as cluster:
-        threading.Timer(2, cluster.close).start()
+
+        def lose():
+            while not (tmp_path / "cells/sleep").exists():
+                time.sleep(0.05)
+            cluster.close()
+
+        thread = threading.Thread(target=lose)
+        thread.start()
         with pytest.raises(InputError, match="the connection to the Dask scheduler is lost"):
             run_cells(tmp_path, [SLEEP], silent, scheduler=cluster.scheduler_address)
+        thread.join()
     assert [one.name for one in caplog.records if one.name == "distributed.client"] == []
