@@ -60,7 +60,7 @@ def fit(
         **merged(parse_settings(settings, fit), options),
     )
     numbers = run.prior.numbers
-    if numbers["from"] == "random" and prior is None:
+    if run.prior.kind == "random" and prior is None:
         console.print(
             f"start: {numbers['triangulated']:,} points of the cameras and "
             f"{numbers['n'] - numbers['triangulated']:,} random ones",

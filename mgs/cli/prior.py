@@ -153,7 +153,7 @@ def prior(
             console.print(f"prior from {chosen}" + ("" if source or points else WHY[chosen]))
             options = {"source": chosen, "points": points}
             result, segmented = _built(loaded, settings, folder, progress, **options)
-        if result.numbers["from"] != "random":
+        if result.kind != "random":
             progress("colours of the surface")
             agreed = math.nan if loaded.on_demand else colour_agreement(result, loaded.frames)
             wrong = outline_error(result.mesh, taken_frames(loaded))

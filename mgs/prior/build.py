@@ -80,6 +80,11 @@ class Prior:
         return html(repr(self), [cloud(self.points, 0.5 + self.normals / 2)])
 
     @property
+    def kind(self) -> str:
+        """What it was made from: depth, points, hull, mesh or random; empty if unknown."""
+        return str(self.numbers.get("from", ""))
+
+    @property
     def world(self) -> World:
         """World of the files of the dataset that the prior was built from."""
         return World(unit_up(self.numbers["up"])) if "up" in self.numbers else UPRIGHT

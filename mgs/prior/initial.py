@@ -94,7 +94,7 @@ def initial_gaussians(
     `prior.depth_tolerance` and the slope. A sample that no frame sees is grey. Raises InputError if
     a file of a frame cannot be read, and as `mesh_depth`.
     """
-    if prior.numbers.get("from") == "random":
+    if prior.kind == "random":
         start, seen = round_gaussians(prior.points, frames, gains, linear)
         return replace(start, antialiased=antialiased), seen
     n = len(prior.points)

@@ -8,7 +8,7 @@ otherwise. A fit that diverges ends the run (`mgs.fit.stopping`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -225,91 +225,70 @@ def means_drift(means: np.ndarray, start: np.ndarray, std: float) -> float:
 
 @dataclass(frozen=True)
 class Detector:
-    """limit: largest value without a warning. words(value, limit): the warning."""
+    """limit: largest value without a warning. words: the warning, with fields of `said`."""
 
     limit: float
-    words: Callable[[float, float], str]
+    words: str
 
-
-def percent(share: float, digits: int = 0) -> str:
-    """Format a share as per cent."""
-    return f"{100 * share:.{digits}f} %"
+    def said(self, value: float) -> str:
+        """The warning for a value; share, rest: it and the rest to 1 in per cent; most, least: the
+        same of the limit."""
+        percent = {"share": value, "rest": 1 - value, "most": self.limit, "least": 1 - self.limit}
+        numbers = {name: 100 * number for name, number in percent.items()}
+        return self.words.format(value=value, limit=self.limit, **numbers)
 
 
 DETECTORS: dict[str, Detector] = {
     "unconverged": Detector(
         0.15,  # good runs of few and small images: up to 0.11 in fits with one more view
-        lambda v, limit: (
-            f"the fit was stopped while its loss still fell by {percent(v, 1)} a pass "
-            f"(limit {percent(limit, 1)}); raise `train.passes`, and `warm_passes` for later fits"
-        ),
+        "the fit was stopped while its loss still fell by {share:.1f} % a pass (limit "
+        "{most:.1f} %); raise `train.passes`, and `warm_passes` for later fits",
     ),
     "worse": Detector(
         0.18,  # good runs of many views: up to 0.134, because a step raises other images' losses
-        lambda v, limit: (
-            f"every pass of the fit had a loss at least {percent(v)} above its start; "
-            "lower the learning rates (`train.rates`)"
-        ),
+        "every pass of the fit had a loss at least {share:.0f} % above its start; lower the "
+        "learning rates (`train.rates`)",
     ),
     "prior": Detector(
         0.006,
-        lambda v, limit: (
-            f"the prior's outline and the masks disagree in {percent(v, 1)} of the covered pixels "
-            f"of the median view (limit {percent(limit, 1)}); check prior, masks and poses"
-        ),
+        "the prior's outline and the masks disagree in {share:.1f} % of the covered pixels of the "
+        "median view (limit {most:.1f} %); check prior, masks and poses",
     ),
     "residual": Detector(
         0.145,
-        lambda v, limit: (
-            f"the fit leaves {percent(v)} of the images' variance inside the masks unexplained "
-            f"in the median view (limit {percent(limit, 1)}); check poses and masks, or give more "
-            "Gaussians"
-        ),
+        "the fit leaves {share:.0f} % of the images' variance inside the masks unexplained in the "
+        "median view (limit {most:.1f} %); check poses and masks, or give more Gaussians",
     ),
     "exposure": Detector(
         0.22,
-        lambda v, limit: (
-            "exposure drifts: one image as a whole is brighter or darker than the model fitted to "
-            f"all, by {percent(v)} of the spread of its pixels (limit {percent(limit)}); "
-            "try `exposure`"
-        ),
+        "exposure drifts: one image as a whole is brighter or darker than the model fitted to all, "
+        "by {share:.0f} % of the spread of its pixels (limit {most:.0f} %); try `exposure`",
     ),
     "pose": Detector(
         1.0,  # good runs: up to 0.96
-        lambda v, limit: (
-            f"in one view, prior and mask are {v:.1f} times farther apart than the limit, "
-            f"{percent(OFFSET)} of the rock's size or a pixel of the farthest views; "
-            "check its pose, its mask, and the prior"
-        ),
+        "in one view, prior and mask are {value:.1f} times farther apart than the limit, "
+        f"{100 * OFFSET:.0f} % of the rock's size or a pixel of the farthest views; check its "
+        "pose, its mask, and the prior",
     ),
     "outlier": Detector(
         2.25,  # 13 clean fits of rocks and photographs: up to 2.22
-        lambda v, limit: (
-            f"one view fits badly: its error after the fit is {v:.1f} times that of the views "
-            f"around it (limit {limit:.2f}); check its pose, mask and image"
-        ),
+        "one view fits badly: its error after the fit is {value:.1f} times that of the views "
+        "around it (limit {limit:.2f}); check its pose, mask and image",
     ),
     "means": Detector(
         4.0,  # means that were free on 2 and 4 views moved by 1.3 and 1.7, and did no harm
-        lambda v, limit: (
-            f"the means have left the prior's surface: they moved by {v:.1f} standard deviations "
-            f"of their prior (rms; limit {limit:.1f}); lower `train.rates.mean`"
-        ),
+        "the means have left the prior's surface: they moved by {value:.1f} standard deviations of "
+        "their prior (rms; limit {limit:.1f}); lower `train.rates.mean`",
     ),
     "coverage": Detector(
         0.3,
-        lambda v, limit: (
-            f"only {percent(1 - v)} of the prior's Gaussians are observed "
-            f"(limit {percent(1 - limit)}), so the others are known from the prior alone; "
-            "take views of the other sides"
-        ),
+        "only {rest:.0f} % of the prior's Gaussians are observed (limit {least:.0f} %), so the "
+        "others are known from the prior alone; take views of the other sides",
     ),
     "saturated": Detector(
         0.9,  # chosen: a tenth
-        lambda v, limit: (
-            f"gains are saturated: the view just taken gained {percent(1 - v)} of the run's "
-            f"largest information gain (limit {percent(1 - limit)}); further views add little"
-        ),
+        "gains are saturated: the view just taken gained {rest:.0f} % of the run's largest "
+        "information gain (limit {least:.0f} %); further views add little",
     ),
 }
 """Detector of each indicator, by its name."""
@@ -319,7 +298,7 @@ def alarms(indicators: Mapping[str, float], before: Mapping[str, float] | None =
     """Warnings of a step: for each number that exceeds its limit and did not in the step before."""
     before = before or {}
     return [
-        row.words(indicators[name], row.limit)
+        row.said(indicators[name])
         for name, row in DETECTORS.items()
         if indicators.get(name, -np.inf) > row.limit >= before.get(name, -np.inf)
     ]

@@ -53,7 +53,7 @@ from mgs.provenance import versions
 from mgs.run.ending import RunEnd
 from mgs.run.policy_file import label
 from mgs.run.records import Config, Metrics, Record, checked, read_checked
-from mgs.run.settings import NbvSettings, check_settings, validated
+from mgs.run.settings import NbvSettings, validated
 from mgs.splat_places import to_source
 from mgs.splat_ply import read_ply, write_ply
 
@@ -271,8 +271,7 @@ def open_run(folder: str | PathLike[str]) -> Run:
 
 
 def start(out: Path, settings: NbvSettings, dataset: Dataset) -> None:
-    """Write config.json, the first file of a run. Raises InputError as `check_settings`."""
-    check_settings(settings, len(dataset))
+    """Write config.json, the first file of a run."""
     config = {
         "settings": settings.model_dump(mode="json"),
         "versions": versions(),

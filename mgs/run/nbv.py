@@ -153,53 +153,44 @@ def start_run(
         raise InputError("nbv: `gaussians` builds a prior; leave it out, or leave out `prior`")
     if (prior, gaussians, source) == (None,) * 3 and (root / "prior/prior.json").is_file():
         prior = root / "prior"
-    loaded = dataset
-    up = up_of_prior(Path(prior)) if isinstance(prior, str | Path) else None
-    if not isinstance(loaded, Dataset) or (up and not np.allclose(up, loaded.world.up)):
-        loaded = load_dataset(root, to_capture=live is not None, up=up)
-    if live is not None and not loaded.on_demand:
+    folder = Path(prior) if isinstance(prior, str | Path) else None
+    up = up_of_prior(folder) if folder else None
+    if not isinstance(dataset, Dataset) or (up and not np.allclose(up, dataset.world.up)):
+        dataset = load_dataset(root, to_capture=live is not None, up=up)
+    if live is not None and not dataset.on_demand:
         raise InputError(f"{root}: all its images exist; leave out live capture")
-    images = root if live is None else out / DATASET
-    where = Path(prior) if isinstance(prior, str | Path) else out / "prior"
-    policy = settings.get("policy", NbvSettings.model_fields["policy"].default)
-    policy_name = name_of(policy) if isinstance(policy, str) or callable(policy) else policy
     automatic = settings.get("budget") == "auto"
-    if automatic:
-        if live is not None:
-            raise InputError("budget auto: needs the images of the seeds; give a number")
-        settings = settings | {"budget": 1}
-    weight = ALPHA_WEIGHT if loaded.outlined else 0.0
+    if automatic and live is not None:
+        raise InputError("budget auto: needs the images of the seeds; give a number")
+    images, where = root if live is None else out / DATASET, folder or out / "prior"
+    policy = settings.get("policy", NbvSettings.model_fields["policy"].default)
     paths = {"dataset": images.resolve(), "prior": where.resolve()}
-    values = paths | with_defaults(settings | {"policy": policy_name}, weight)
-    complete = _resolved(validated(NbvSettings, values), len(loaded), "budget" in settings)
+    mission = _settings(dataset, policy, settings | paths)
     rule = policy_of(policy)  # a user's policy fails here, before there is a folder
-    check_settings(complete, len(loaded))
-    found = load_prior(prior) if isinstance(prior, str | Path) else prior
-    inputs = [path for path in (root, prior) if isinstance(path, Path)]
+    check_settings(mission, len(dataset))
+    known: Any = load_prior(folder) if folder else prior
+    inputs = [path for path in (root, folder) if path]
     with atomic_folder(out, Ours(FILES, inputs) if holds_run(out) else None) as unfinished:
-        built = found or _built_prior(loaded, gaussians, source, complete.seed, progress)
-        if not isinstance(prior, str | Path):
-            save_prior(unfinished / "prior", built)
-        _check_near(built, loaded, where)
-        if built.numbers.get("from") == "random" and complete.train.means != "free":
-            free = "let means be free (`train.means`), or give depth, points or masks"
-            raise InputError(f"{where}: starts at random points, not on a surface; {free}")
-        if complete.exposure and built.numbers.get("triangulated") == 0:
-            raise InputError(
-                f"exposure: {where} has no surface on which to compare photographs; leave it "
-                "out, or give points or masks"
-            )
-        complete = complete.with_spacing(built.spacing, loose)
-        if complete.flies or complete.flight.no_fly or complete.flight.clearance is not None:
-            check_seeds(Scene(loaded, built, complete), complete)
+        surface = known or build_prior(
+            dataset.survey(),
+            PriorSettings(gaussians=gaussians, seed=mission.seed),
+            source=source,
+            on_stage=lambda stage: progress(f"prior: {stage}", 0, 1),
+        )
+        if folder is None:
+            save_prior(unfinished / "prior", surface)
+        _check_surface(surface, dataset, mission, where)
+        mission = mission.with_spacing(surface.spacing, loose)
+        if mission.flies or mission.flight.no_fly or mission.flight.clearance is not None:
+            check_seeds(Scene(dataset, surface, mission), mission)
         if automatic:
-            complete = _automatic(Scene(loaded, built, complete), complete, rule, progress)
+            mission = _automatic(Scene(dataset, surface, mission), mission, rule, progress)
         if live is not None:
-            begin(unfinished / DATASET, loaded, built)
-        start(unfinished, complete, loaded)
+            begin(unfinished / DATASET, dataset, surface)
+        start(unfinished, mission, dataset)
         if not isinstance(policy, str):
             (unfinished / POLICY_SOURCE).write_text(source_of(policy), encoding="utf-8")
-    return Run(out, complete, loaded if live is None else None, found, policy)
+    return Run(out, mission, dataset if live is None else None, known, policy)
 
 
 def start_fit(
@@ -219,38 +210,43 @@ def start_fit(
     from the points that came with the cameras and random ones, unless a prior is given: a surface
     of the object cannot explain what is around it. Arguments and errors as `start_run`.
     """
-    root = Path(dataset)
-    loaded, train = load_dataset(root), dict(settings.pop("train", {}))
-    found = Path(prior) if prior is not None else root / "prior"
-    known = gaussians is None and (prior is not None or (found / "prior.json").is_file())
-    source = load_prior(found).numbers.get("from") if known else source_of_prior(loaded.survey())
-    bare = prior is None and source == "points" and not has_masks(loaded.frames)
+    root, train = Path(dataset), dict(settings.pop("train", {}))
+    data, folder = load_dataset(root), Path(prior) if prior is not None else root / "prior"
+    built = gaussians is None and (prior is not None or (folder / "prior.json").is_file())
+    kind = load_prior(folder).kind if built else source_of_prior(data.survey())
+    bare = prior is None and kind == "points" and not has_masks(data.frames)
     whole = "random" if bare and train.get("means", "free") == "free" else None
-    source = whole or source
+    kind = whole or kind
     if train.get("density") == "adaptive":
-        recipe = as_3dgs(extent_of([frame.camera for frame in loaded.frames]))
+        recipe = as_3dgs(extent_of([frame.camera for frame in data.frames]))
         rates = recipe["rates"] | train.get("rates", {})
         train = {"passes": FREE_PASSES} | recipe | train | {"rates": rates}
         settings.setdefault("sh", MAX_SH_DEGREE)
-    train.setdefault("means", "free" if source in LOOSE else "frozen")
+    train.setdefault("means", "free" if kind in LOOSE else "frozen")
     loose = 1.0
-    if train["means"] == "free" and source in LOOSE:
-        loose = LOOSE[source]
+    if train["means"] == "free" and kind in LOOSE:
+        loose = LOOSE[kind]
         train = FREE_TRAIN | train
-        settings.setdefault("sh", FREE_SH[source])
-    every = {"seeds": len(loaded), "budget": 0, "train": train, "loose": loose}
-    built: dict[str, Any] = {"prior": prior, "gaussians": gaussians, "source": whole}
-    return start_run(root, out, progress=progress, **built, **settings | every)
+        settings.setdefault("sh", FREE_SH[kind])
+    every = {"seeds": len(data), "budget": 0, "train": train, "loose": loose}
+    start: dict[str, Any] = {"prior": prior, "gaussians": gaussians, "source": whole}
+    return start_run(root, out, progress=progress, **start, **settings | every)
 
 
-def _resolved(given: NbvSettings, count: int, budget_given: bool) -> NbvSettings:
-    """Settings that hold in any folder: the fit's seed, the budget."""
+def _settings(dataset: Dataset, policy: Any, values: dict[str, Any]) -> NbvSettings:
+    """Settings of a run with the defaults that depend on the dataset, and the fit's seed."""
+    known = isinstance(policy, str) or callable(policy)
+    values = values | {"policy": name_of(policy) if known else policy}
+    if values.get("budget") == "auto":
+        values["budget"] = 1
+    weight = ALPHA_WEIGHT if dataset.outlined else 0.0
+    settings = validated(NbvSettings, with_defaults(values, weight))
     resolved: dict[str, Any] = {}
-    if "seed" not in given.train.model_fields_set:
-        resolved["train"] = given.train.model_copy(update={"seed": given.seed})
-    if not budget_given:
-        resolved["budget"] = min(given.budget, max(0, count - given.seeds))
-    return given.model_copy(update=resolved)
+    if "seed" not in settings.train.model_fields_set:
+        resolved["train"] = settings.train.model_copy(update={"seed": settings.seed})
+    if "budget" not in values:
+        resolved["budget"] = min(settings.budget, max(0, len(dataset) - settings.seeds))
+    return settings.model_copy(update=resolved)
 
 
 def _automatic(
@@ -266,21 +262,9 @@ def _automatic(
         return settings.model_copy(update={"budget": enough_views(scene, state, policy, settings)})
 
 
-def _built_prior(
-    frames: Dataset, gaussians: Any, source: str | None, seed: int, progress: Progress
-) -> Prior:
-    """Build a prior of a dataset, or of its survey."""
-    asked = PriorSettings(gaussians=gaussians, seed=seed)
-    return build_prior(
-        frames.survey(),
-        asked,
-        source=source,
-        on_stage=lambda stage: progress(f"prior: {stage}", 0, 1),
-    )
-
-
-def _check_near(prior: Prior, dataset: Dataset, where: Path) -> None:
-    """Raises InputError where most cameras are nearer to the prior than NEAR: a wrong unit."""
+def _check_surface(prior: Prior, dataset: Dataset, settings: NbvSettings, where: Path) -> None:
+    """Raises InputError where most cameras are nearer to the prior than NEAR: a wrong unit; and
+    where a start at random points cannot be used as these settings ask."""
     positions = np.stack([frame.camera.position for frame in dataset.frames])
     nearest = float(np.median(cKDTree(prior.points).query(positions)[0]))
     if nearest < NEAR:
@@ -288,6 +272,14 @@ def _check_near(prior: Prior, dataset: Dataset, where: Path) -> None:
             f"{where}: the cameras are {nearest:.2g} from it, and nothing nearer "
             f"than {NEAR} is drawn; import the data with `unit`, the metres in a length of 1, "
             "and build the prior again"
+        )
+    if prior.kind == "random" and settings.train.means != "free":
+        free = "let means be free (`train.means`), or give depth, points or masks"
+        raise InputError(f"{where}: starts at random points, not on a surface; {free}")
+    if settings.exposure and prior.numbers.get("triangulated") == 0:
+        raise InputError(
+            f"exposure: {where} has no surface on which to compare photographs; leave it "
+            "out, or give points or masks"
         )
 
 

@@ -26,7 +26,6 @@ from mgs.run.ending import RunEnd, diverged, run_end
 from mgs.run.flight import flight_of, free, reachable
 from mgs.run.folder import (
     Checkpoint,
-    check_settings,
     read_checkpoint,
     write_checkpoint,
     write_steps,
@@ -34,7 +33,7 @@ from mgs.run.folder import (
 from mgs.run.loop import select_views, uncertainty
 from mgs.run.policies import Policy
 from mgs.run.policy_file import policy_of
-from mgs.run.settings import NbvSettings
+from mgs.run.settings import NbvSettings, check_settings
 from mgs.run.worth import planned_certificate
 from mgs.scene import Choice, Scene, State
 from mgs.splat_places import to_source
