@@ -32,7 +32,8 @@ def save_survey(
     numbers = survey_numbers(dataset, survey, settings)
     cloud = fuse_frames(write_survey(out, dataset, survey).frames)
     numbers["points"] = len(cloud.points)
-    write_cloud(out / "cloud.ply", SparseCloud(cloud.points, cloud.views))
+    leave = dataset.world.leave
+    write_cloud(out / "cloud.ply", SparseCloud(leave(cloud.points), leave(cloud.views)))
     draw_survey(out / "survey.png", dataset, survey, cloud, numbers)
     write_json(out / "survey.json", numbers)
     return numbers
