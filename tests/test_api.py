@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
+import trimesh
 from refusals import refused
 
 import mgs
@@ -119,3 +120,43 @@ def test_objects_are_short_in_text_and_have_pictures_in_notebooks(dataset, prior
         assert repr(one) == text
         assert one._repr_html_().startswith(f"<div>{text}</div>")
         assert one._repr_html_().count("<img") == pictures
+
+
+def test_priors_and_normals_of_arrays(tmp_path):
+    ball = trimesh.creation.icosphere(3)
+    ball.export(tmp_path / "ball.ply")
+    settings = mgs.PriorSettings(gaussians=300, backing=0)
+    prior = mgs.prior_from_mesh((ball.vertices, ball.faces[:, ::-1]), settings)
+    known = mgs.prior_from_mesh(tmp_path / "ball.ply", settings)
+    np.testing.assert_allclose(prior.points, known.points, atol=1e-6)
+    model, _ = mgs.initial_gaussians(prior, [])
+    K = np.array([[60, 0, 24], [0, 60, 18], [0, 0, 1.0]])
+    camera = mgs.Camera(K, 48, 36, mgs.look_at((3, 1, 1), (0, 0, 0)))
+    image, found = mgs.render(model, camera), mgs.normals(model, camera)
+    pixels = np.mgrid[:36, :48][::-1] + 0.5
+    rays = (pixels - K[:2, 2, None, None]) / 60 * np.asarray(image.depth)
+    points = np.stack([*rays, image.depth], -1) @ camera.world_to_camera[:3, :3] + camera.position
+    inside = np.asarray(image.alpha) > 0.9
+    assert (found[np.asarray(image.alpha) == 0] == 0).all()
+    assert (found[inside] * points[inside]).sum(1).mean() > 0.95
+    with pytest.raises(mgs.InputError, match="mesh: face 0 names vertex 9 of 3; repair"):
+        mgs.prior_from_mesh((np.eye(3), [[0, 1, 9]]), settings)
+
+
+def test_a_fit_takes_a_loss_of_its_own_and_says_what_is_wrong_with_images(dataset):
+    frames = mgs.load_dataset(dataset).frames[:2]
+    model, cameras = tiny.initial([]), [frame.camera for frame in frames]
+    images = [frame.rgb() for frame in frames]
+    few = mgs.TrainSettings(passes=2, tolerance=0)
+
+    def squared(drawn, pixels, weights, size, linear):
+        return (drawn - pixels) * (drawn - pixels)
+
+    own, usual = (mgs.fit_gaussians(model, cameras, images, few, loss=f) for f in (squared, None))
+    assert own.gaussians == usual.gaussians
+    doubled = mgs.fit_gaussians(model, cameras, images, few, loss=lambda *a: 2 * squared(*a))
+    np.testing.assert_allclose(doubled.losses[0], 2 * usual.losses[0], rtol=1e-5)
+    with pytest.raises(mgs.InputError, match=r"target: has shape \[2, 2, 3\], expected \[12,16"):
+        mgs.fit_gaussians(model, cameras[:1], [np.ones((2, 2, 3))])
+    with pytest.raises(mgs.InputError, match="there are 2 cameras, but 1 targets"):
+        mgs.fit_gaussians(model, cameras, images[:1])
