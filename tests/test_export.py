@@ -23,7 +23,7 @@ from mgs.errors import InputError, Notice
 from mgs.gaussians import Gaussians
 from mgs.images import read_mask
 from mgs.reports.evaluation import compare_models, evaluate
-from mgs.reports.exporting import difference, in_srgb, to_y_up
+from mgs.reports.exporting import in_srgb, to_y_up
 from mgs.rotation import rotmat_from_quat
 from mgs.run.folder import open_run
 from mgs.splat import reference, render
@@ -150,10 +150,6 @@ def test_a_model_far_from_the_origin(tmp_path):
         written(tmp_path, "compressed-ply", far)
     assert far.counted_from(np.subtract(place, 1)).origin == (1, 1, 1)
     assert near.counted_from(place) == near
-    faint = replace(far, sh=0.5 * far.sh)
-    assert difference(far, faint) == pytest.approx(
-        difference(near, replace(faint, origin=near.origin))
-    )
 
 
 def test_numbers_that_mean_no_number(tmp_path):
@@ -327,24 +323,23 @@ def test_the_command_converts_and_keeps_what_is_there(tmp_path, capsys):
 
 
 def test_the_export_of_a_run_fits_its_colours_again(dataset, prior, tmp_path, capsys):
-    """The printed PSNR is measured; for a file alone the loss by conversion is printed."""
+    """The printed PSNR is measured; of a file alone each colour is converted."""
     settings = {"prior": prior, "seeds": 4, "budget": 0, "train": {"passes": 10, "space": "linear"}}
     run = mgs.run_nbv(dataset, tmp_path / "run", **settings)
     command("export", tmp_path / "run", "--to", "ply", "--out", tmp_path / "fitted.ply")
     said = [float(number) for number in re.findall(r"([0-9.]+) dB", capsys.readouterr().out)]
     fitted, converted = read_ply(tmp_path / "fitted.ply"), in_srgb(run.state.gaussians)
-    models = run.state.gaussians, fitted, converted
-    np.testing.assert_allclose(compare_models(models, run)[1], said, atol=0.006)
-    assert said[2] < said[1]
+    measured = compare_models([run.state.gaussians, fitted, converted], run)[1]
+    np.testing.assert_allclose(measured[:2], said, atol=0.006)
+    assert measured[2] < measured[1], "colours that are fitted again are better"
     assert replace(fitted, sh=converted.sh) == converted, "only colours change"
     command(
         "export", tmp_path / "run/gaussians.ply", "--to", "ply", "--out", tmp_path / "alone.ply"
     )
-    (lost,) = re.findall(r"([0-9.]+) dB", capsys.readouterr().out)
+    assert "one by one" in capsys.readouterr().out
     assert read_ply(tmp_path / "alone.ply") == converted
-    assert 20 < float(lost) < 60
     command("export", tmp_path / "fitted.ply", "--to", "ply", "--out", tmp_path / "same.ply")
-    assert "dB" not in capsys.readouterr().out
+    assert "one by one" not in capsys.readouterr().out
     assert read_ply(tmp_path / "same.ply") == fitted
 
 

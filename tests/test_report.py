@@ -125,7 +125,7 @@ def test_report_writes_every_figure(runs, tmp_path, drawn):
         frames = {
             "candidate": range(tiny.FRAMES),
             "seed": run.indices[:3],
-            "chosen": run.indices[3:],
+            "chosen, in this order": run.indices[3:],
         }
         for label, indices in frames.items():
             np.testing.assert_allclose(shown[label], positions[list(indices)], atol=1e-9)

@@ -59,11 +59,7 @@ def fit(
         force=force,
         **merged(parse_settings(settings, fit), options),
     )
-    numbers = run.prior.numbers
-    if run.prior.kind == "random" and prior is None:
-        console.print(
-            f"start: {numbers['triangulated']:,} points of the cameras and "
-            f"{numbers['n'] - numbers['triangulated']:,} random ones",
-            soft_wrap=True,
-        )
+    if prior is None and (seen := run.prior.numbers.get("triangulated")) is not None:
+        others = run.prior.numbers["n"] - seen
+        console.print(f"start: {seen:,} points of the cameras and {others:,} random ones")
     resume_and_print(run, console, run.settings.policy)

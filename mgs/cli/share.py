@@ -58,9 +58,8 @@ def export(
             raise InputError(
                 f"{model}: its colours are sRGB already; leave out --colour-space linear"
             )
-        shown = gaussians
-        if shown.linear and colour_space == "srgb":
-            shown = _in_srgb(model, gaussians)
+        srgb = gaussians.linear and colour_space == "srgb"
+        shown = _in_srgb(model, gaussians) if srgb else gaussians
         shown = replace(shown, origin=gaussians.origin)
         shown = shown.with_degree(max(sh or 0, shown.sh_degree))
         write_gaussians(path, shown, to, to_y_up(up))
@@ -86,27 +85,24 @@ def _in_srgb(model: Path, linear: Gaussians) -> Gaussians:
     """Gaussians of a linear model, of this file or run folder, for sRGB blending. Prints what that
     costs."""
     from mgs.reports.evaluation import compare_models
-    from mgs.reports.exporting import as_imported, difference, in_srgb, refit_in_srgb
+    from mgs.reports.exporting import as_imported, in_srgb, refit_in_srgb
     from mgs.run.folder import open_run
 
     if not model.is_dir():
-        converted = in_srgb(linear)
         echo(
-            "colours are converted from linear RGB to sRGB one by one: blended there, pictures "
-            f"differ from the model's own by {difference(linear, converted):.1f} dB; "
-            "the export of a run folder fits them again"
+            "colours are converted from linear RGB to sRGB one by one, and mixtures are a little "
+            "darker; the export of a run folder fits them again"
         )
-        return converted
+        return in_srgb(linear)
     run = open_run(model)
     with progress_bar() as bar:
         fitted = refit_in_srgb(run, partial(bar, "fitting colours, blended in sRGB"))
-    name, values = compare_models([run.gaussians, in_srgb(run.gaussians), fitted], run)
+    name, values = compare_models([run.gaussians, fitted], run)
     if values is not None:
-        before, between, after = values
         echo(
-            f"PSNR of the {name} views: {before:.2f} dB blended in linear RGB, as in the run; "
-            f"{after:.2f} dB blended in sRGB, as exported, with colours fitted again to the views "
-            f"taken ({between:.2f} dB with converted colours)"
+            f"PSNR of the {name} views: {values[0]:.2f} dB blended in linear RGB, as in the run; "
+            f"{values[1]:.2f} dB blended in sRGB, as exported, with colours fitted again to the "
+            "views taken"
         )
     return as_imported(run, fitted)
 

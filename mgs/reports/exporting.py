@@ -8,15 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mgs.camera import Camera, look_at
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import target_of
 from mgs.data.world import Vector, levelled
-from mgs.evaluation import render_view
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.memory import Deferred
-from mgs.metrics import psnr
 from mgs.prior.exposure import exposure_of, without_gain
 from mgs.run.folder import Run, open_run
 from mgs.splat.reference import sh_basis
@@ -30,9 +27,6 @@ REFIT = TrainSettings(
     optimiser="adam", tolerance=0, rates=dict.fromkeys(RATES, 0.0) | {"colour": RATES["colour"]}
 )
 """Fit of colours alone, after which a linear model blends well in sRGB."""
-
-AROUND = 8
-"""Views in which `difference` compares two models."""
 
 PART = 1 << 16
 """Gaussians whose colours are converted at a time."""

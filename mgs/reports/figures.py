@@ -87,10 +87,8 @@ def orbit_figure(
         for axis in axes[len(choices) :]:
             axis.remove()
         _draw_length(axes[0], unit)
-        looks = (("candidate", "white", "#9a9a9a"), ("seed", SEED, SEED))
-        handles = [_disc(name, face, edge) for name, face, edge in looks]
-        handles.append(_disc("chosen, in this order", CHOSEN, CHOSEN))
-        figure.legend(handles=handles, loc="outside lower center", ncols=3 if columns > 1 else 1)
+        handles = axes[0].get_legend_handles_labels()
+        figure.legend(*handles, loc="outside lower center", ncols=3 if columns > 1 else 1)
         several = "the views that each policy chose" if len(choices) > 1 else "the chosen views"
         figure.suptitle(f"From above: {several}")
 
@@ -116,7 +114,7 @@ def draw_cameras(
     axis.scatter(*xy.T, s=14, label="candidate", **hollow)
     disc = {"s": 95, "linewidths": 0, "zorder": 3}
     axis.scatter(*xy[list(seeds)].T, color=SEED, label="seed", **disc)
-    axis.scatter(*xy[list(chosen)].T, color=CHOSEN, label="chosen", **disc)
+    axis.scatter(*xy[list(chosen)].T, color=CHOSEN, label="chosen, in this order", **disc)
     if newest is not None:
         axis.plot(*np.stack([xy[newest], centre]).T, color=NEWEST, linewidth=1)
         axis.scatter(*xy[newest], color=NEWEST, **disc)
@@ -131,28 +129,14 @@ def draw_cameras(
 
 def _draw_length(axis: Axes, unit: str) -> None:
     """Draw a bar of a round length into the lower left corner of axes."""
-    (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
-    wanted = (right - left) / 4
-    power = 10.0 ** np.floor(np.log10(wanted))
-    length = max(step * power for step in (1, 2, 5) if step * power <= wanted)
-    y = bottom + 0.02 * (top - bottom)
-    axis.plot([left, left + length], [y, y], color="black", linewidth=1.5)
-    axis.annotate(
-        f"{length:g} {unit}",
-        (left + length / 2, y),
-        (0, 3),
-        textcoords="offset points",
-        ha="center",
-        fontsize=8,
-    )
+    from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
-
-def _disc(name: str, face: str, edge: str) -> Any:
-    """Entry of a legend."""
-    from matplotlib.lines import Line2D
-
-    look: dict[str, Any] = {"marker": "o", "linestyle": "none", "markersize": 7}
-    return Line2D([], [], markerfacecolor=face, markeredgecolor=edge, label=name, **look)
+    longest = float(np.ptp(axis.get_xlim())) / 4
+    power = 10.0 ** np.floor(np.log10(longest))
+    length = max(step * power for step in (1, 2, 5) if step * power <= longest)
+    text, place = f"{length:g} {unit}", "lower left"
+    bar = AnchoredSizeBar(axis.transData, length, text, place, pad=0, frameon=False, label_top=True)
+    axis.add_artist(bar)
 
 
 def curves_figure(
