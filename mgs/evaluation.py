@@ -128,9 +128,9 @@ def psnr_over(
     truth = kept_within(IMAGE_BYTES, read, lambda parts: sum(part.nbytes for part in parts))
 
     def compared(index: int, rendered: np.ndarray, *_: np.ndarray) -> dict[str, float]:
-        image, known, rock = truth(index)
+        image, valid, rock = truth(index)
         linear = linear_from_srgb(image) if exposure else None
-        return compare_psnr(image, rendered, known, rock, linear)
+        return compare_psnr(image, rendered, valid, rock, linear)
 
     def measured(gaussians: Gaussians, chosen: Sequence[int]) -> dict[str, np.ndarray]:
         from mgs.splat import as_drjit
@@ -146,8 +146,8 @@ def psnr_over(
 
 def _psnr_means(values: Mapping[str, np.ndarray], prefix: str = "") -> dict[str, float]:
     """Mean of each array over the views that have it, if there are some; names with a prefix."""
-    known = {key: column[~np.isnan(column)] for key, column in values.items()}
-    return {prefix + key: float(column.mean()) for key, column in known.items() if len(column)}
+    measured = {key: column[~np.isnan(column)] for key, column in values.items()}
+    return {prefix + key: float(column.mean()) for key, column in measured.items() if len(column)}
 
 
 def _compared(
@@ -207,8 +207,8 @@ def evaluate_model(
     views: list[dict[str, Any]] = []
     progress(0, len(work))
     for (frame, _), metrics in zip(work, _compared(drawn, _measured, at_once), strict=True):
-        known = len(views) < len(frames) and frame.name in trained
-        views.append({"name": frame.name, "trained": known} | metrics)
+        in_training = len(views) < len(frames) and frame.name in trained
+        views.append({"name": frame.name, "trained": in_training} | metrics)
         progress(len(views), len(work))
     views, tests = views[: len(frames)], views[len(frames) :]
     result: dict[str, Any] = {"images": len(trained)}
@@ -230,13 +230,13 @@ def _measured(
     (truth, weight), mask = frame.target(), frame.mask()
     true_depth = frame.depth() if frame.depth_path else None
     shares = frame.rock_path is not None
-    found = compare(truth, rgb, mask, weight)
-    found |= compare_surface(
+    metrics = compare(truth, rgb, mask, weight)
+    metrics |= compare_surface(
         truth, alpha, depth, mask, weight, fractional=shares, true_depth=true_depth
     )
     if folder is not None:
-        write_comparison(folder / f"{frame.name}.png", truth[..., :3], rgb, found["psnr"])
-    return found
+        write_comparison(folder / f"{frame.name}.png", truth[..., :3], rgb, metrics["psnr"])
+    return metrics
 
 
 def _means(views: list[dict[str, Any]], whole: list[dict[str, Any]]) -> dict[str, Any]:

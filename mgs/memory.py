@@ -101,10 +101,10 @@ def _held(kind: int) -> float:
 def _spare() -> float:
     """Free memory, bytes; infinity if the system does not report it."""
     try:
-        found = re.search(r"MemAvailable:\s*(\d+) kB", MEMORY_FILE.read_text(encoding="ascii"))
+        line = re.search(r"MemAvailable:\s*(\d+) kB", MEMORY_FILE.read_text(encoding="ascii"))
     except OSError:
         return float("inf")
-    return 1024.0 * int(found[1]) if found else float("inf")
+    return 1024.0 * int(line[1]) if line else float("inf")
 
 
 PADDING = 64
@@ -156,17 +156,17 @@ def kept_within(
     Later keys are made again at each call. A fit uses its images again and again in changing
     orders, for which an LRU cache would mostly drop what is needed next.
     """
-    kept: dict[Any, Value] = {}
+    values: dict[Any, Value] = {}
     held = 0
 
     def get(key: Any) -> Value:
         nonlocal held
-        if key in kept:
-            return kept[key]
+        if key in values:
+            return values[key]
         value = make(key)
         needed = size(value)
         if held + needed <= budget:
-            kept[key] = value
+            values[key] = value
             held += needed
         return value
 

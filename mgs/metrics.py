@@ -123,17 +123,17 @@ def _check_same_shape(a: np.ndarray, b: np.ndarray) -> None:
 def compare_psnr(
     image: np.ndarray,
     rendered: np.ndarray,
-    known: np.ndarray,
+    valid: np.ndarray,
     rock: np.ndarray,
     linear: np.ndarray | None = None,
 ) -> dict[str, float]:
-    """PSNR of one view, dB: `psnr` over the known pixels, `psnr_mask` over the rock's.
+    """PSNR of one view, dB: `psnr` over the valid pixels, `psnr_mask` over the rock's.
 
-    image: [H,W,3], the truth, sRGB. rendered: [H,W,3] linear RGB. known, rock: [H,W] bool. With
+    image: [H,W,3], the truth, sRGB. rendered: [H,W,3] linear RGB. valid, rock: [H,W] bool. With
     linear, the truth as linear RGB, also `..._corrected` (`colour_corrected`). Raises InputError as
     `psnr`.
     """
-    masks = {"psnr": None if known.all() else known, "psnr_mask": rock}
+    masks = {"psnr": None if valid.all() else valid, "psnr_mask": rock}
     shown = srgb_from_linear(rendered)
     values = {name: psnr(image, shown, mask) for name, mask in masks.items()}
     if linear is not None:
@@ -151,12 +151,12 @@ def compare(
     mask: [H,W] bool, the rock. weight: [H,W], 0 where the truth is unknown
     (`mgs.data.frames.Frame.target`). Raises InputError as `psnr` and `ssim`.
     """
-    a, b, known = srgb_from_linear(truth[..., :3]), srgb_from_linear(rendered), weight > 0
+    a, b, valid = srgb_from_linear(truth[..., :3]), srgb_from_linear(rendered), weight > 0
     similarity = _similarity(a, b)
-    values = compare_psnr(a, rendered, known, mask & known, truth[..., :3]) | {
-        "ssim": _mean_ssim(*similarity, None if known.all() else known),
-        "ssim_mask": _mean_ssim(*similarity, mask & known),
-        "psnr_inside": psnr(a, b, (truth[..., 3] >= 1) & known),
+    values = compare_psnr(a, rendered, valid, mask & valid, truth[..., :3]) | {
+        "ssim": _mean_ssim(*similarity, None if valid.all() else valid),
+        "ssim_mask": _mean_ssim(*similarity, mask & valid),
+        "psnr_inside": psnr(a, b, (truth[..., 3] >= 1) & valid),
     }
     return {name: values[name] for name in METRICS}
 
@@ -182,17 +182,17 @@ def compare_surface(
       pixel where nothing is drawn is infinitely deep; NaN if the median is infinite.
     - see_through: share of the pixels wholly on the rock whose alpha is below OPAQUE.
     """
-    known = weight > 0
-    inside = (truth[..., 3] >= 1) & known
-    found = {"see_through": _mean(alpha[inside] < OPAQUE)}
+    valid = weight > 0
+    inside = (truth[..., 3] >= 1) & valid
+    metrics = {"see_through": _mean(alpha[inside] < OPAQUE)}
     if fractional:
-        found["alpha_mae"] = _mean(np.abs(alpha.astype(np.float64) - truth[..., 3])[known])
+        metrics["alpha_mae"] = _mean(np.abs(alpha.astype(np.float64) - truth[..., 3])[valid])
     if true_depth is not None:
-        rock = mask & known & (true_depth > 0)
+        rock = mask & valid & (true_depth > 0)
         behind = np.where(alpha > 0, depth.astype(np.float64) - true_depth, np.inf)[rock]
         median = float(np.median(np.abs(behind))) if behind.size else math.nan
-        found["depth_error"] = median if math.isfinite(median) else math.nan
-    return {name: found[name] for name in SURFACE_METRICS if name in found}
+        metrics["depth_error"] = median if math.isfinite(median) else math.nan
+    return {name: metrics[name] for name in SURFACE_METRICS if name in metrics}
 
 
 def _mean(values: np.ndarray) -> float:

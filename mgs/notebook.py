@@ -36,12 +36,12 @@ def html(text: str, pictures: Sequence[Image.Image]) -> str:
 
 def thumbnails(paths: Sequence[Path]) -> list[Image.Image]:
     """Small pictures of up to MOST_FILES of the files that exist and can be read, evenly chosen."""
-    found = [path for path in paths if path.is_file()]
-    chosen = np.unique(np.linspace(0, len(found) - 1, min(MOST_FILES, len(found))).astype(int))
+    files = [path for path in paths if path.is_file()]
+    chosen = np.unique(np.linspace(0, len(files) - 1, min(MOST_FILES, len(files))).astype(int))
     pictures = []
     for i in chosen:
         try:
-            with Image.open(found[i]) as image:
+            with Image.open(files[i]) as image:
                 small = image.convert("RGB")
         except OSError:
             continue

@@ -16,13 +16,13 @@ def versions() -> dict[str, str]:
 
     If mgs runs from a checkout, also its "commit".
     """
-    found = {"mgs": __version__, **_commit(), "python": platform.python_version()}
+    numbers = {"mgs": __version__, **_commit(), "python": platform.python_version()}
     for package in ("mitsuba", "drjit", "numpy"):
         try:
-            found[package] = version(package)
+            numbers[package] = version(package)
         except PackageNotFoundError:
-            found[package] = "unknown"
-    return found
+            numbers[package] = "unknown"
+    return numbers
 
 
 @cache

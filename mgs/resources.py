@@ -34,9 +34,9 @@ def scene_path(scene: str | Path) -> Path:
     folder = resource_folder("scenes")
     path = folder / f"{scene}.toml"
     if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
+        names = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
         raise InputError(
-            f"scene {str(scene)!r}: unknown; choose one of {known}, "
+            f"scene {str(scene)!r}: unknown; choose one of {names}, "
             "or give the path of a .toml file"
         )
     return path

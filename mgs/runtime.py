@@ -71,8 +71,8 @@ def load_libllvm(path: str) -> Libllvm:
         return Libllvm(path, (major, minor, patch))
     if not hasattr(library, "LLVMContextCreate"):
         raise InputError(f"libLLVM {path}: is another library, not libLLVM")
-    named = re.search(r"libLLVM-(\d+)", os.path.realpath(path))
-    return Libllvm(path, (int(named[1]) if named else 15, 0, 0))
+    version = re.search(r"libLLVM-(\d+)", os.path.realpath(path))
+    return Libllvm(path, (int(version[1]) if version else 15, 0, 0))
 
 
 def find_libllvm() -> Libllvm:
@@ -87,13 +87,13 @@ def find_libllvm() -> Libllvm:
     problems = []
     for path in candidates:
         try:
-            found = load_libllvm(path)
+            library = load_libllvm(path)
         except InputError as error:
             problems.append(str(error))
             continue
-        if found.version[0] >= MIN_LLVM:
-            return found
-        problems.append(f"libLLVM {path}: is version {found.version[0]}, older than {MIN_LLVM}")
+        if library.version[0] >= MIN_LLVM:
+            return library
+        problems.append(f"libLLVM {path}: is version {library.version[0]}, older than {MIN_LLVM}")
     if explicit:
         raise InputError(
             f"{problems[0]}, but {LIBRARY_VARIABLE} names it; unset that, or let it name {_GOOD}"
@@ -106,12 +106,12 @@ def _candidates() -> list[str]:
     usual = _installed(_DRJIT_FOLDERS, "libLLVM*.so.*")
     prefixes = {sys.prefix, os.environ.get("CONDA_PREFIX", sys.prefix)}
     more = (*(f"{prefix}/lib" for prefix in sorted(prefixes)), *_OTHER_FOLDERS)
-    found = list(dict.fromkeys(usual + _installed(more, "libLLVM*.so*")))
+    paths = list(dict.fromkeys(usual + _installed(more, "libLLVM*.so*")))
     try:
         ctypes.CDLL("libLLVM.so")
     except OSError:
-        return found
-    return ["libLLVM.so", *found]
+        return paths
+    return ["libLLVM.so", *paths]
 
 
 def _installed(folders: tuple[str, ...], pattern: str) -> list[str]:
@@ -135,8 +135,8 @@ def start() -> None:
     differentiable RGB in single precision; for one of LLVM if no libLLVM of version 19 or newer is
     found, or if Dr.Jit cannot use this processor with it; for one of CUDA if Dr.Jit finds no GPU.
     """
-    wanted = os.environ.get(VARIANT_VARIABLE) or VARIANT
-    if "mitsuba" not in sys.modules and wanted.startswith("llvm"):
+    variant = os.environ.get(VARIANT_VARIABLE) or VARIANT
+    if "mitsuba" not in sys.modules and variant.startswith("llvm"):
         _choose_libllvm()
     if "HOME" not in os.environ:  # Dr.Jit would print a line and compile every kernel anew
         os.environ.setdefault("DRJIT_CACHE_DIR", os.path.expanduser("~/.drjit"))
@@ -145,7 +145,7 @@ def start() -> None:
     if mi.variant() in _checked:
         return
     if mi.variant() is None:
-        _set_variant(wanted)
+        _set_variant(variant)
     _prepare_variant()
     _checked.add(mi.variant())
 

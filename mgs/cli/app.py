@@ -94,11 +94,11 @@ class _Commands(Mapping[str, Any]):
 
     def __getitem__(self, name: str) -> Any:
         file, function = COMMANDS[name][0].split(".")
-        called = getattr(import_module(f"mgs.cli.{file}"), function)
+        code = getattr(import_module(f"mgs.cli.{file}"), function)
         alone = typer.Typer(add_completion=False)
-        alone.command(name, cls=_Command)(called)
+        alone.command(name, cls=_Command)(code)
         command: Any = typer.main.get_command(alone)
-        describe(command, called.__doc__, getattr(called, "keys", ()))
+        describe(command, code.__doc__, getattr(code, "keys", ()))
         return command
 
 
@@ -118,9 +118,9 @@ class _Program(TyperGroup):
 app = typer.Typer(name="mgs", cls=_Program, add_completion=False, pretty_exceptions_enable=False)
 
 
-def _print_version(wanted: bool) -> None:
+def _print_version(on: bool) -> None:
     """Callback of --version."""
-    if wanted:
+    if on:
         from mgs.cli.terminal import echo
 
         echo(f"mgs {__version__}")
@@ -186,8 +186,8 @@ def _print_warning(message: Any, category: type, filename: str, line: int, *_: A
 
 def _hint(arguments: Sequence[str]) -> str:
     """End of the line of an interrupted command: the way to continue, if there is one."""
-    command, *given = arguments or [""]
-    options = [part for x in given for part in (x.split("=", 1) if x.startswith("--") else [x])]
+    command, *words = arguments or [""]
+    options = [part for x in words for part in (x.split("=", 1) if x.startswith("--") else [x])]
     if command in RESUMABLE:
         but = " without --force" if "--force" in options else ""
         return f"; run the same command again{but} to continue"

@@ -41,12 +41,12 @@ def _make_masks(path: Path, prior: Path) -> None:
     from mgs.data.masks import SHEET, make_masks
     from mgs.prior.build import load_prior
 
-    loaded, known = load_dataset(path), load_prior(prior)
+    data, mesh_prior = load_dataset(path), load_prior(prior)
     console = Terminal()
     with working_in(path), progress_bar("masks", console) as progress:
-        made = make_masks(loaded, known.mesh, partial(progress, "masks"))
+        masks = make_masks(data, mesh_prior.mesh, partial(progress, "masks"))
     console.print(
-        f"{path}: {len(made)} masks of {prior}; look at {path / SHEET} before you use them"
+        f"{path}: {len(masks)} masks of {prior}; look at {path / SHEET} before you use them"
     )
 
 
@@ -54,15 +54,15 @@ def _check(path: Path) -> None:
     from mgs.data.check import check_dataset, taken_frames
     from mgs.data.dataset import load_dataset
 
-    loaded = load_dataset(path)
+    data = load_dataset(path)
     console = Terminal()
     with progress_bar("reading", console) as progress:
-        check = check_dataset(loaded, partial(progress, "reading"))
-    camera, (low, high) = loaded.frames[0].camera, check.depth_range
-    missing = len(loaded) - len(taken_frames(loaded))
+        check = check_dataset(data, partial(progress, "reading"))
+    camera, (low, high) = data.frames[0].camera, check.depth_range
+    missing = len(data) - len(taken_frames(data))
     waiting = f" ({missing} of them on demand, not taken yet)" if missing else ""
     console.print(
-        f"{path}: {len(loaded)} frames{waiting}, {camera.width}x{camera.height}, "
+        f"{path}: {len(data)} frames{waiting}, {camera.width}x{camera.height}, "
         f"rock on {check.mask_share:.0%} of the pixels"
     )
     if high > 0:

@@ -50,9 +50,9 @@ def demo(out: Annotated[Path, typer.Argument()] = Path("demo"), seed: Seed = 0) 
     def run(*words: object) -> None:
         from mgs.cli.app import app
 
-        called = [str(word) for word in words]
-        console.print(f"$ mgs {shlex.join(called)}", soft_wrap=True)
-        app(called, prog_name="mgs", standalone_mode=False)
+        line = [str(word) for word in words]
+        console.print(f"$ mgs {shlex.join(line)}", soft_wrap=True)
+        app(line, prog_name="mgs", standalone_mode=False)
 
     heading(f"1/4 a photoreal orbit: 32 frames with depth and masks, and {TEST_VIEWS} test views")
     if not (dataset / "transforms.json").is_file():

@@ -92,8 +92,8 @@ def _resources() -> list[Row]:
     rows = []
     for name, pattern in (("scenes", "*.toml"), ("plugins", "*.py")):
         try:
-            found = sorted(path.stem for path in resource_folder(name).glob(pattern))
-            rows.append((name, ", ".join(found) or "none", ""))
+            names = sorted(path.stem for path in resource_folder(name).glob(pattern))
+            rows.append((name, ", ".join(names) or "none", ""))
         except InputError as error:
             rows.append((name, "missing", str(error)))
     return rows

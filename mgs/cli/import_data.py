@@ -85,14 +85,14 @@ def import_data(
         )
     unpacked = out.with_name(f"{out.name}.unpacked")
     with scratch_folder(unpacked) if is_bag(source) else nullcontext():
-        found = read_source(source, images, split, keyframes=keyframes, unpack=unpacked, pose=pose)
-        found = found if unit is None else found.in_metres(unit)
-        given = parse_up(up)
-        upward, reason = found.up_or_estimate() if given is None else (given, "as --up says")
+        shots = read_source(source, images, split, keyframes=keyframes, unpack=unpacked, pose=pose)
+        shots = shots if unit is None else shots.in_metres(unit)
+        axis = parse_up(up)
+        upward, reason = shots.up_or_estimate() if axis is None else (axis, "as --up says")
         if force:
             clear_folder(out, Ours(FILES, [path for path in (source, images, masks, mesh) if path]))
         finished = os.path.isfile(out / "transforms.json")  # else the import refuses what is there
-        source_shots, tests = found.set_apart(test_every)
+        source_shots, tests = shots.set_apart(test_every)
         with progress_bar("importing", console) as progress:
             result = import_source(
                 source_shots,
@@ -107,9 +107,9 @@ def import_data(
     if mesh is not None and mesh.suffix.lower() in GLTF:
         console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
     poses = agreement(result.frames)
-    if found.fit and (poses is None or found.fit.problem):
-        poses = found.fit
-    for note in [*found.notes, *_advice(found, result)]:
+    if shots.fit and (poses is None or shots.fit.problem):
+        poses = shots.fit
+    for note in [*shots.notes, *_advice(shots, result)]:
         notes.print(f"mgs: {note}", soft_wrap=True)
     fits = "poses not compared with the pictures, which share too few points"
     if poses:
@@ -118,20 +118,20 @@ def import_data(
         if poses.problem:
             notes.print(f"mgs: the poses {poses.problem} ({fits})", soft_wrap=True)
     world = f"up {_numbers(upward)}, {reason}"
-    _print_summary(console, found, tests, result, f"{fits}; {world}")
+    _print_summary(console, shots, tests, result, f"{fits}; {world}")
     console.print(f"{out} is finished already" if finished else f"wrote {out}", soft_wrap=True)
 
 
-def _advice(found: Source, result: Dataset) -> Iterator[str]:
+def _advice(source: Source, result: Dataset) -> Iterator[str]:
     """Lines on what the user should know or may want to do."""
     from mgs.images import exif_exposure
 
-    if found.no_cloud:
-        yield f"the points that the source names, {found.no_cloud}, do not exist"
-    if any(found.origin):
+    if source.no_cloud:
+        yield f"the points that the source names, {source.no_cloud}, do not exist"
+    if any(source.origin):
         yield (
             "the cameras are far from the origin, where float32 is coarse: "
-            f"{_numbers(found.origin)} is the origin now, from which all positions count; exports "
+            f"{_numbers(source.origin)} is the origin now, from which all positions count; exports "
             "add it again, and `mgs suggest --origin` is its latitude and longitude"
         )
     some = result.frames[:: max(1, len(result) // 10)]
@@ -144,7 +144,7 @@ def _advice(found: Source, result: Dataset) -> Iterator[str]:
         )
     if masks and all(mask.all() for mask in masks):
         yield "the masks cover their pictures whole: only the object must be white in them"
-    stops = [value for shot in found.shots if (value := exif_exposure(shot.image)) is not None]
+    stops = [value for shot in source.shots if (value := exif_exposure(shot.image)) is not None]
     if stops and max(stops) - min(stops) > EXPOSURE_DIFFERS:
         yield (
             f"by their EXIF, exposure differs by up to {max(stops) - min(stops):.1f} stops "
@@ -159,29 +159,29 @@ def _advice(found: Source, result: Dataset) -> Iterator[str]:
 
 
 def _print_summary(
-    console: Terminal, found: Source, tests: Source | None, result: Dataset, more: str
+    console: Terminal, source: Source, tests: Source | None, result: Dataset, more: str
 ) -> None:
     """Print what was imported of what was listed, and in which world."""
     frames, apart = result.frames, len(tests.shots) if tests else 0
-    total = len(found.shots) + found.left_out.total()
-    without = ", ".join(f"{count} {reason}" for reason, count in found.left_out.items())
+    total = len(source.shots) + source.left_out.total()
+    without = ", ".join(f"{count} {reason}" for reason, count in source.left_out.items())
     counts = {
         "with mask": sum(frame.mask_path is not None for frame in frames),
         "with alpha": sum(frame.rock_path is not None for frame in frames),
         "with depth": sum(frame.depth_path is not None for frame in frames),
-        "undistorted": sum(shot.lens is not None for shot in found.shots),
-        "turned by EXIF": sum(shot.turned for shot in found.shots),
+        "undistorted": sum(shot.lens is not None for shot in source.shots),
+        "turned by EXIF": sum(shot.turned for shot in source.shots),
     }
     lengths = "metres" if result.unit == "m" else f"{result.unit}s (give --unit)"
     parts = [
-        f"{found.kind}: {len(frames)} frames of {total} images",
+        f"{source.kind}: {len(frames)} frames of {total} images",
         *([f"{apart} test views, which are never fitted"] if apart else []),
         *([f"left out {without}"] if without else []),
         *(f"{count} {what}" for what, count in counts.items() if count),
-        *([f"{len(found.sparse.points):,} points"] if found.sparse else []),
+        *([f"{len(source.sparse.points):,} points"] if source.sparse else []),
         more,
         f"lengths in {lengths}",
-        f"origin {_numbers(found.origin)}",
+        f"origin {_numbers(source.origin)}",
     ]
     console.print("; ".join(parts), soft_wrap=True)
 

@@ -52,7 +52,7 @@ def evaluate(
     from mgs.run.folder import open_run
 
     runtime.start()
-    rows, said = list[dict[str, Any]](), list[str]()
+    rows, lines = list[dict[str, Any]](), list[str]()
     with progress_bar() as bar:
         progress = partial(bar, "rendering and comparing")
         for subject in subjects:
@@ -63,7 +63,7 @@ def evaluate(
                         f"--dataset: is for a file, and {subject} has its own dataset; leave it out"
                     )
                 run = open_run(subject)
-                evaluate_run(run, pictures=pictures, progress=progress, say=said.append)
+                evaluate_run(run, pictures=pictures, progress=progress, say=lines.append)
                 folder = f" ({subject.resolve().name})" if len(subjects) > 1 else ""
                 rows += comparison_rows({f"{run.label}{folder}": run})
                 smaller = [subject / name for name in (REFITTED, PRUNED)]
@@ -71,9 +71,9 @@ def evaluate(
             for path in files:
                 name = path.name if path == subject else f"  {path.stem.partition('_')[2]}"
                 rows.append(metrics_row(name, measured(path, dataset, progress=progress)))
-                said.append(f"wrote {path.with_suffix('.metrics.json')}")
+                lines.append(f"wrote {path.with_suffix('.metrics.json')}")
     print_quality(Terminal(), rows)
-    _print(said)
+    _print(lines)
 
 
 def diagnose(
@@ -94,8 +94,8 @@ def diagnose(
     from mgs.reports.diagnostics import diagnose as mapped
     from mgs.run.folder import open_run
 
-    wanted = None if views is None else [name.strip() for name in views.split(",") if name.strip()]
-    if wanted == []:
+    names = None if views is None else [name.strip() for name in views.split(",") if name.strip()]
+    if names == []:
         raise InputError(
             f"--views {views!r}: names no frame; give some, as in kf_0003,kf_0010, or leave it out"
         )
@@ -105,7 +105,7 @@ def diagnose(
     runtime.start()
     for run, folder in zip(runs, folders, strict=True):
         with folder_locked(folder), progress_bar() as bar:
-            written = mapped(run, wanted, partial(bar, "mapping"))
+            written = mapped(run, names, partial(bar, "mapping"))
         for path in written:
             echo(f"wrote {path}")
 
@@ -170,13 +170,13 @@ def _pruned(result: PrunedRun, noise: float) -> list[str]:
     return lines
 
 
-def _refitted(found: RefittedRun) -> list[str]:
+def _refitted(result: RefittedRun) -> list[str]:
     """Describe a refitted run."""
-    model, left_out = found.lean, found.lean.left_out
-    share = model.parameters / found.before
+    model, left_out = result.lean, result.lean.left_out
+    share = model.parameters / result.before
     shares = ", ".join(f"{kind} {mask.mean():.0%}" for kind, mask in model.learned.items())
     lines = [
-        f"{model.parameters:,} parameters are learned, {share:.0%} of the run's {found.before:,}",
+        f"{model.parameters:,} parameters are learned, {share:.0%} of the run's {result.before:,}",
         f"learned by: {shares} of the Gaussians",
     ]
     if left_out:
@@ -188,11 +188,11 @@ def _refitted(found: RefittedRun) -> list[str]:
         )
     else:
         lines.append("SH degree 0: no other was tried")
-    if not found.psnr:
+    if not result.psnr:
         return [*lines, "PSNR: there are no views on which to compare the models"]
-    own, whole, lean = found.psnr
+    own, whole, lean = result.psnr
     lines.append(
-        f"PSNR on the {found.views} views: {lean:.2f} dB, {whole:.2f} dB where all parameters are "
+        f"PSNR on the {result.views} views: {lean:.2f} dB, {whole:.2f} dB where all parameters are "
         f"fitted in the same way; of the run's own model {own:.2f} dB"
     )
     return lines

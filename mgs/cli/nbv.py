@@ -149,9 +149,9 @@ def start_and_print(
 
     with progress_bar("starting", console) as progress:
         run = (start or start_run)(dataset, out, progress=progress, **settings)
-    found = run.settings.prior
-    if settings.get("prior") is None and found.parent == dataset.resolve():
-        console.print(f"prior: {found}", soft_wrap=True)
+    folder = run.settings.prior
+    if settings.get("prior") is None and folder.parent == dataset.resolve():
+        console.print(f"prior: {folder}", soft_wrap=True)
     if run.settings.flight.no_fly or run.settings.flight.clearance is not None:
         may = allowed(scene_of(run), run.settings)
         where = f"of {len(may)} poses are ruled out by flight.no_fly and flight.clearance"
@@ -178,13 +178,13 @@ def resume_and_print(
     from mgs.run.nbv import resume_nbv
 
     run = open_run(run)
-    total, known = run.settings.seeds + run.settings.budget, list[dict[str, Any]]()
+    total, steps = run.settings.seeds + run.settings.budget, list[dict[str, Any]]()
     with progress_bar("reading", console) as progress:
 
         def on_step(state: Checkpoint) -> None:
             progress.whole(f"{run.folder.name}: images", len(state.taken), total)
-            new = state.steps[len(known) :]
-            known.extend(new)
+            new = state.steps[len(steps) :]
+            steps.extend(new)
             for line in [line for step in new for line in step_lines(step)]:
                 progress.print(line)
 

@@ -53,8 +53,8 @@ def render(
     from mgs.run.folder import open_run
 
     if not all(0 <= value <= 1 for value in background):
-        given = " ".join(map(str, background))
-        raise InputError(f"--background {given}: must be three numbers from 0 to 1")
+        numbers = " ".join(map(str, background))
+        raise InputError(f"--background {numbers}: must be three numbers from 0 to 1")
     if cameras is None:
         if not subject.is_dir():
             raise InputError(f"{subject}: has no cameras; give --cameras TRANSFORMS.json")

@@ -66,8 +66,8 @@ ROWS = (
     ("sampled_area", "area that some frame sees, A", "{sampled_area:.4f} {unit}²"),
     ("sampled_area", "samples, N = A / spacing²", "{n:,} = {sampled_area:.4f} / {spacing:.6f}²"),
     ("apart", "closest pixel, on the surface", "{pixel}; samples lie {apart:.3g} pixels apart"),
-    ("radius", "points of the cameras", "{triangulated:,}"),
-    ("radius", "points in all", "{n:,}, in and around a ball of radius {radius}"),
+    ("triangulated", "points of the cameras", "{triangulated:,}"),
+    ("radius", "random points", "{scattered:,}, in and around a ball of radius {radius}"),
     ("sum", "Gaussians", "{sum:,}: a sample each, and {backed:,} behind the surface"),
     ("colour_agreement", "colour variance that all frames agree on", "{colour_agreement:.0%}"),
     ("outline_error", "outline against masks, median", "{outline_error:.2%} of pixels"),
@@ -136,7 +136,7 @@ def prior(
         raise InputError(
             "prior: --mesh gives the surface, and --source or --points build one; give one of them"
         )
-    loaded = load_dataset(dataset, up=axis)
+    data = load_dataset(dataset, up=axis)
     folder = out if out is not None else below(dataset, "prior")
     number = parse_gaussians(gaussians)
     settings = PriorSettings(number, spacing, poisson_depth, seed, backing)
@@ -145,21 +145,21 @@ def prior(
     with atomic_folder(folder, ours) as unfinished, progress_bar(console=console) as progress:
         segmented = None
         if mesh is not None:
-            result = prior_from_mesh(mesh, settings, loaded)
+            result = prior_from_mesh(mesh, settings, data)
             if mesh.suffix.lower() in GLTF:
                 console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
         else:
-            chosen = source_of(loaded, source, points)
+            chosen = source_of(data, source, points)
             console.print(f"prior from {chosen}" + ("" if source or points else WHY[chosen]))
             options = {"source": chosen, "points": points}
-            result, segmented = _built(loaded, settings, folder, progress, **options)
+            result, segmented = _built(data, settings, folder, progress, **options)
         if result.kind != "random":
             progress("colours of the surface")
-            agreed = math.nan if loaded.on_demand else colour_agreement(result, loaded.frames)
-            wrong = outline_error(result.mesh, taken_frames(loaded))
-            checks = {"colour_agreement": agreed, "outline_error": wrong}
-            known = {key: value for key, value in checks.items() if not math.isnan(value)}
-            result = replace(result, numbers=result.numbers | known)
+            agreement = math.nan if data.on_demand else colour_agreement(result, data.frames)
+            wrong = outline_error(result.mesh, taken_frames(data))
+            checks = {"colour_agreement": agreement, "outline_error": wrong}
+            finite = {key: value for key, value in checks.items() if not math.isnan(value)}
+            result = replace(result, numbers=result.numbers | finite)
         progress("figure")
         built = result
         if up == "auto" and "plane_normal" in result.numbers:
@@ -167,10 +167,10 @@ def prior(
         save_prior(unfinished, result)
         draw_prior(unfinished / "prior.png", built, segmented)
     console.print(_table(result.numbers))
-    agreed = result.numbers.get("colour_agreement", 1.0)
-    if agreed < AGREEMENT:
+    agreement = result.numbers.get("colour_agreement", 1.0)
+    if agreement < AGREEMENT:
         console.print(
-            f"the photographs agree on only {agreed:.0%} of the surface's colours (on a correct "
+            f"the photographs agree on only {agreement:.0%} of the surface's colours (on a correct "
             f"surface on {AGREEMENT:.0%} or more), so it may be wrong; fit with `--means free`",
             soft_wrap=True,
         )
@@ -212,6 +212,7 @@ def _table(numbers: dict[str, Any]) -> Table:
     resolution, unit = numbers.get("resolution", {}), numbers["unit"]
     shown = numbers | numbers.get("truth", {}) | {"up": _up(numbers)}
     shown |= {"sum": numbers["n"] + numbers["backed"]}
+    shown |= {"scattered": numbers["n"] - numbers.get("triangulated", 0)}
     if resolution:
         apart = resolution["spacing"] / resolution["pixel"]
         shown |= {"pixel": resolution["pixel"], "apart": apart}

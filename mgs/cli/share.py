@@ -121,7 +121,7 @@ def _targets(
 def video(
     runs: list[Path],
     out: Path | None = None,
-    beside: Literal["truth", "uncertainty"] | None = None,
+    beside: Literal["uncertainty"] | None = None,
     story: bool = False,
     seconds: Annotated[float | None, typer.Option(min=0.1, max=3600)] = None,
     fps: Annotated[int | None, typer.Option(min=1, max=60)] = None,
@@ -131,10 +131,9 @@ def video(
     """Make a video of each run: a turntable of its model, or the model view by view.
 
     - out: File to write: .mp4 (needs imageio-ffmpeg), .gif or .png. Default: RUN/video.mp4.
-    - beside: Second picture: the true images, at the dataset's own views, or the map of what is
-      unknown.
+    - beside: Second picture: the map of what is unknown.
     - story: Show the model after each view of the run; repeats the fits.
-    - seconds: Length, seconds. Default: 8, or 1 per view with --story or --beside truth.
+    - seconds: Length, seconds. Default: 8, or 1 per view with --story.
     - fps: Frames per second of a turntable. Default: 25.
     - width: Width of a picture in pixels. Default: the cameras' own.
     """
@@ -143,27 +142,25 @@ def video(
     from mgs.reports.video import check_film, path_frames, write_film
     from mgs.run.folder import open_run
 
-    one_by_one = story or beside == "truth"
-    unused: dict[str, object] = {"--fps": fps} if one_by_one else {}
-    unused |= {"--beside": beside, "--width": width} if story else {}
-    if given := [name for name, value in unused.items() if value is not None]:
-        why = "--story" if story else "--beside truth"
-        raise InputError(f"{given[0]}: is not used with {why}; leave out one of them")
+    unused: dict[str, object] = (
+        {"--beside": beside, "--width": width, "--fps": fps} if story else {}
+    )
+    if names := [name for name, value in unused.items() if value is not None]:
+        raise InputError(f"{names[0]}: is not used with --story; leave out one of them")
     fps = fps or 25
     targets = _targets(runs, [run / "video.mp4" for run in runs], out, force)
     check_film(targets[0][1])
     runtime.start()
     for run, target in targets:
         opened = open_run(run)
-        taken, views = len(opened.state.taken), len(opened.dataset)
         with progress_bar("drawing") as bar:
             if story:
-                frames, count = story_frames(opened, bar), taken
+                frames, count = story_frames(opened, bar), len(opened.state.taken)
+                each = (seconds or count) / count
             else:
-                count = views if beside == "truth" else max(1, round((seconds or 8.0) * fps))
+                count, each = max(1, round((seconds or 8) * fps)), 1 / fps
                 wide = width or opened.dataset.frames[0].camera.width
                 frames = path_frames(opened, beside, count, wide)
-            each = (seconds or float(count)) / count if one_by_one else 1 / fps
             lengths = [each] * (count - 1) + [3 * each if story else each]
             write_film(target, frames, lengths, partial(bar.whole, "frames"))
         size = target.stat().st_size / 1e6

@@ -83,7 +83,7 @@ def synth_orbit(
     if force:
         clear_folder(out, Ours(FILES, [path for path in (mesh, Path(scene)) if path]))
     with progress_bar("rendering", console) as progress:
-        made = rendered(
+        dataset = rendered(
             out,
             settings,
             preset,
@@ -99,10 +99,10 @@ def synth_orbit(
             size=_parse_size(size),
             spp=spp,
         )
-    camera, none = made.frames[0].camera, ", none rendered" if on_demand else ""
+    camera, none = dataset.frames[0].camera, ", none rendered" if on_demand else ""
     look = "" if on_demand and not test_views else f"; look at {out / 'contact_sheet.png'}"
     console.print(
-        f"{out}: {len(made)} frames{none} and {test_views} test views, "
+        f"{out}: {len(dataset)} frames{none} and {test_views} test views, "
         f"{camera.width}x{camera.height}{look}"
     )
 

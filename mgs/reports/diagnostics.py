@@ -203,23 +203,23 @@ def _norm(channel: str, data: np.ndarray) -> Any:
 
 
 def choose_views(
-    frames: Sequence[Frame], trained: Sequence[str], wanted: Sequence[str] | None
+    frames: Sequence[Frame], trained: Sequence[str], names: Sequence[str] | None
 ) -> list[Frame]:
-    """The frames to draw: those named in `wanted`, or else VIEWS frames spread evenly over those
+    """The frames to draw: those of these names, or else VIEWS frames spread evenly over those
     not trained on.
 
     trained: names of the training frames; if these are all, the choice is among all frames. Raises
     InputError for a name that no frame has.
     """
-    if wanted:
+    if names:
         by_name = {frame.name: frame for frame in frames}
-        for name in wanted:
+        for name in names:
             if name not in by_name:
                 raise InputError(
                     f"views {name}: no such frame; "
                     f"the dataset has {frames[0].name} to {frames[-1].name}"
                 )
-        return [by_name[name] for name in wanted]
+        return [by_name[name] for name in names]
     pool = [frame for frame in frames if frame.name not in trained] or list(frames)
     spread = np.linspace(0, len(pool), min(VIEWS, len(pool)), endpoint=False).astype(int)
     return [pool[i] for i in spread]
@@ -227,18 +227,18 @@ def choose_views(
 
 def diagnose(
     run: str | PathLike[str],
-    wanted: Sequence[str] | None = None,
+    views: Sequence[str] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
     """Write RUN/diagnostics: information.ply, and NAME.exr and NAME.png of each view. Returns the
     paths.
 
-    wanted: names of frames (`choose_views`). progress: called as progress(views done, all). Raises
+    views: names of frames (`choose_views`). progress: called as progress(views done, all). Raises
     InputError for an unknown view, and as `open_run`.
     """
     opened = open_run(run)
     gaussians, trained = opened.state.gaussians, [frame.name for frame in opened.taken]
-    frames = choose_views(opened.dataset.frames, trained, wanted)
+    frames = choose_views(opened.dataset.frames, trained, views)
     scalars, out = run_scalars(opened), opened.folder / "diagnostics"
     write_information_ply(out / "information.ply", opened.model, scalars)
     written = [out / "information.ply"]

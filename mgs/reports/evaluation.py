@@ -97,10 +97,10 @@ def _subject(gaussians: Gaussians, frames: Sequence[Frame], trained: list[str]) 
     views = [
         [frame.name, camera_digest(frame.camera), frame_digests(frame, kinds)] for frame in frames
     ]
-    known = {name: version for name, version in versions().items() if name != "commit"}
+    software = {name: version for name, version in versions().items() if name != "commit"}
     marks = gaussians.antialiased, gaussians.linear
     model = array_digest(getattr(gaussians, name) for name in ARRAYS), *marks
-    text = json.dumps([*model, views, trained, known])
+    text = json.dumps([*model, views, trained, software])
     return array_digest([np.frombuffer(text.encode(), np.uint8)])
 
 

@@ -87,20 +87,6 @@ def refit_in_srgb(run: Run, progress: Callable[[int, int], None]) -> Gaussians:
     return fit_gaussians(in_srgb(run.state.gaussians), cameras, targets, REFIT, progress).gaussians
 
 
-def difference(one: Gaussians, other: Gaussians) -> float:
-    """PSNR of the pictures of two models of the same means against each other, dB, over AROUND
-    views from all sides."""
-    centre = one.means.mean(0, dtype=np.float64)
-    radius = max(float(np.percentile(np.linalg.norm(one.means - centre, axis=1), 99)), 1e-6)
-    K, back = np.array([[320, 0, 160], [0, 320, 120], [0, 0, 1]]), np.negative(one.origin).tolist()
-    pictures = []
-    for turn in 2 * np.pi * np.arange(AROUND) / AROUND:
-        eye = centre + 3 * radius * np.array([np.cos(turn), np.sin(turn), np.sin(2 * turn)])
-        camera = Camera(K, 320, 240, look_at(eye, centre)).seen_from(back)
-        pictures.append([srgb_from_linear(render_view(g, camera)[0]) for g in (one, other)])
-    return psnr(*np.concatenate(pictures, 1))
-
-
 def to_y_up(up: Vector) -> np.ndarray:
     """Rotation [3,3] of a world with this upward direction into glTF's, in which +Y is up."""
     return np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) @ levelled(up)

@@ -134,8 +134,8 @@ def compared_frames(runs: Sequence[Run]) -> list[Frame]:
     dataset = runs[0].dataset
     there = dataset.with_images({frame.name for run in runs for frame in run.taken})
     tests = dataset.test_views()
-    named = [replace(f, name=f"test/{f.name}") for f in (tests.frames if tests else ())]
-    views = [*_spread(least_trained(runs, there)), *_spread(named)]
+    dome = [replace(f, name=f"test/{f.name}") for f in (tests.frames if tests else ())]
+    views = [*_spread(least_trained(runs, there)), *_spread(dome)]
     if not views or any(run.measured is None for run in runs):
         return views
     first, of = shown_view(runs)

@@ -83,8 +83,8 @@ def measured_views(run: Run) -> list[dict[str, Any]]:
 
 def psnr_of(run: Run, view: str) -> str:
     """PSNR of a view as part of a caption; empty if it was not measured."""
-    found = {one["name"]: one["psnr"] for one in measured_views(run)}.get(view)
-    return "" if found is None else f", {found:.2f} dB"
+    psnr = {one["name"]: one["psnr"] for one in measured_views(run)}.get(view)
+    return "" if psnr is None else f", {psnr:.2f} dB"
 
 
 def setting_rows(runs: Mapping[str, Run]) -> list[tuple[str, list[str], bool]]:
@@ -93,8 +93,8 @@ def setting_rows(runs: Mapping[str, Run]) -> list[tuple[str, list[str], bool]]:
     columns = []
     for run in runs.values():
         versions = run.config.get("versions", {}).items()
-        named = {f"version of {name}": version for name, version in versions}
-        columns.append(_texts(run.config["settings"]) | named)
+        numbers = {f"version of {name}": version for name, version in versions}
+        columns.append(_texts(run.config["settings"]) | numbers)
     rows = []
     for key in dict.fromkeys(key for column in columns for key in column):
         values = [column.get(key, "–") for column in columns]
@@ -104,11 +104,11 @@ def setting_rows(runs: Mapping[str, Run]) -> list[tuple[str, list[str], bool]]:
 
 def _texts(values: Mapping[str, Any], path: str = "") -> dict[str, str]:
     """Nested settings as text, by their keys joined by dots."""
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for key, value in values.items():
         name = f"{path}{key}"
-        found |= _texts(value, f"{name}.") if isinstance(value, dict) else {name: str(value)}
-    return found
+        texts |= _texts(value, f"{name}.") if isinstance(value, dict) else {name: str(value)}
+    return texts
 
 
 def links(run: Run, page: Path) -> list[tuple[str, str]]:

@@ -179,13 +179,13 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
         trace = _points(name, eyes[which], marker)
         return trace | {"hovertext": texts, "hoverinfo": "text+x+y+z"}
 
-    left = [i for i in range(len(eyes)) if i not in taken]
+    candidates = [i for i in range(len(eyes)) if i not in taken]
     prices = run.steps[0].get("certificate", {}).get("prices", {})
     circle: dict[str, Any] = {"size": 3, "color": "#9a9a9a", "symbol": "circle-open"}
     others = "candidates"
-    if left and all(names[i] in prices for i in left):
+    if candidates and all(names[i] in prices for i in candidates):
         bar = {"title": {"text": "price"}, "thickness": 12, "len": 0.6, "x": -0.1}
-        colours = {"color": [prices[names[i]] for i in left], "colorscale": "Cividis"}
+        colours = {"color": [prices[names[i]] for i in candidates], "colorscale": "Cividis"}
         circle = {"size": 5, **colours, "showscale": True, "colorbar": bar}
         others = "candidates, by price"
     diamond = {"size": 6, "color": "#D55E00", "symbol": "diamond"}
@@ -198,7 +198,7 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     here = {"size": 12, "color": "#dd1111", "symbol": "circle-open"}
     traces = [
         _model_points(run.gaussians),
-        markers(others, left, [names[i] for i in left], **circle),
+        markers(others, candidates, [names[i] for i in candidates], **circle),
         _frusta([cameras[i] for i in taken], length),
         markers("seeds", seeds, [names[i] for i in seeds], **diamond),
         path,

@@ -62,12 +62,12 @@ def prune_run(
     gaussians, names = opened.state.gaussians, [frame.name for frame in opened.taken]
     say("pruning")
     cameras = [frame.camera for frame in opened.dataset.frames if frame.name in names]
-    found = prune(gaussians, cameras, noise)
-    smaller = gaussians[found.kept]
+    pruned = prune(gaussians, cameras, noise)
+    smaller = gaussians[pruned.kept]
     say("comparing")
     views, psnr = compare_models([gaussians, smaller], opened)
     write_ply(opened.folder / PRUNED, to_source(smaller, opened.dataset.world))
-    return PrunedRun(len(gaussians), len(smaller), found.predicted, found.actual, views, psnr)
+    return PrunedRun(len(gaussians), len(smaller), pruned.predicted, pruned.actual, views, psnr)
 
 
 @dataclass(frozen=True)
@@ -107,9 +107,9 @@ def refit_run(
 
     if not 0 <= loss <= LARGEST_LOSS:
         raise InputError(f"loss {loss}: must be from 0 to {LARGEST_LOSS:g} dB")
-    for (name, known), value in zip(CHOICES.items(), (learn, sh), strict=True):
-        if value not in known:
-            raise InputError(f"{name} {value!r}: unknown; choose one of {', '.join(known)}")
+    for (name, choices), value in zip(CHOICES.items(), (learn, sh), strict=True):
+        if value not in choices:
+            raise InputError(f"{name} {value!r}: unknown; choose one of {', '.join(choices)}")
     if (learn, sh) == ("all", "0"):
         raise InputError("learn all and sh 0 leave nothing to choose; leave out one of them")
     opened = open_run(run)
@@ -123,12 +123,12 @@ def refit_run(
     digest = inputs.prior_digest(prior)
     inputs.check_unchanged(opened.folder, opened.state.inputs, digest, settings, opened.dataset)
     images = images_of(Scene(opened.dataset, prior, settings), opened.taken)
-    found = lean_fit(images, settings, learn, sh, loss, say=say)
+    lean = lean_fit(images, settings, learn, sh, loss, say=say)
     say("comparing")
-    views, psnr = compare_models([own, found.whole, found.gaussians], opened)
-    marks = {f"learned_{kind}": mask for kind, mask in found.learned.items()}
-    write_ply(path, to_source(found.gaussians, opened.dataset.world), marks)
-    return RefittedRun(len(own) * parameters_of_each(settings), found, views, psnr)
+    views, psnr = compare_models([own, lean.whole, lean.gaussians], opened)
+    marks = {f"learned_{kind}": mask for kind, mask in lean.learned.items()}
+    write_ply(path, to_source(lean.gaussians, opened.dataset.world), marks)
+    return RefittedRun(len(own) * parameters_of_each(settings), lean, views, psnr)
 
 
 def parameters_of_each(settings: NbvSettings) -> int:

@@ -61,8 +61,8 @@ def _shown_view(run: Run, model: State, unknown: dict[str, np.ndarray]) -> Frame
     new = [frame for i, frame in enumerate(frames) if i not in run.state.taken]
     others = tests.frames if tests is not None else run.dataset.with_images({f.name for f in new})
     choice = list(others or run.taken)
-    left = [_left(view_maps(model.gaussians, frame.camera, unknown)) for frame in choice]
-    least_known = [f for f, mean in zip(choice, left, strict=True) if mean >= np.median(left)]
+    shares = [_left(view_maps(model.gaussians, frame.camera, unknown)) for frame in choice]
+    least_known = [f for f, mean in zip(choice, shares, strict=True) if mean >= np.median(shares)]
     return max(least_known, key=lambda frame: srgb_from_linear(frame.masked_rgb()).mean())
 
 

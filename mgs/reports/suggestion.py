@@ -29,22 +29,22 @@ MOST_PICTURES, PICTURE_WIDTH = 6, 200
 """Views in the figure, and pixels of the width of their pictures."""
 
 
-def write_suggestion(out: Path, run: Run, found: Suggestion) -> None:
+def write_suggestion(out: Path, run: Run, suggestion: Suggestion) -> None:
     """Write suggestions.json, transforms.json and suggestions.png into the folder `out`.
 
     transforms.json is a dataset of the planned poses in flying order; their pictures belong in
     images/. Raises InputError if a file cannot be written.
     """
-    write_json(out / "suggestions.json", numbers(run, found))
+    write_json(out / "suggestions.json", numbers(run, suggestion))
     frames = [
         Frame(view.name, view.camera, float(k), out / f"images/{view.name}.png", on_demand=True)
-        for k, view in enumerate(found.plan)
+        for k, view in enumerate(suggestion.plan)
     ]
     write_transforms(out, frames, run.dataset.world, {"convention": CONVENTION})
-    draw_suggestion(out / "suggestions.png", run, found)
+    draw_suggestion(out / "suggestions.png", run, suggestion)
 
 
-def numbers(run: Run, found: Suggestion) -> dict[str, Any]:
+def numbers(run: Run, suggestion: Suggestion) -> dict[str, Any]:
     """Contents of suggestions.json."""
     units = {
         "information_gain": f"Eq. 7, {GAIN_UNIT}",
@@ -58,21 +58,21 @@ def numbers(run: Run, found: Suggestion) -> dict[str, Any]:
         "images": len(run.taken),
         "convention": CONVENTION,
         "units": units,
-        "flight": {"metres": found.metres, "seconds": found.seconds},
-        "certificate": _certificate(found),
-        "dropped": found.dropped,
-        "plan": [_record(view, world) for view in found.plan],
-        "ranking": [_record(view, world) for view in found.ranking],
+        "flight": {"metres": suggestion.metres, "seconds": suggestion.seconds},
+        "certificate": _certificate(suggestion),
+        "dropped": suggestion.dropped,
+        "plan": [_record(view, world) for view in suggestion.plan],
+        "ranking": [_record(view, world) for view in suggestion.ranking],
     }
 
 
-def _certificate(found: Suggestion) -> dict[str, Any] | None:
+def _certificate(suggestion: Suggestion) -> dict[str, Any] | None:
     """The certificate with prices by name of the candidate."""
-    if found.certificate is None:
+    if suggestion.certificate is None:
         return None
-    names = [view.name for view in found.ranking]
-    prices = dict(zip(names, found.certificate.prices, strict=True))
-    return asdict(found.certificate) | {"prices": prices}
+    names = [view.name for view in suggestion.ranking]
+    prices = dict(zip(names, suggestion.certificate.prices, strict=True))
+    return asdict(suggestion.certificate) | {"prices": prices}
 
 
 def _record(view: View, world: World) -> dict[str, Any]:
@@ -81,7 +81,7 @@ def _record(view: View, world: World) -> dict[str, Any]:
     return values | {"transform_matrix": pose.tolist()}
 
 
-def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
+def draw_suggestion(path: str | Path, run: Run, suggestion: Suggestion) -> None:
     """Draw the site from above, for the first planned views what the model shows from there and how
     uncertain it is, and the curve of the certificate.
 
@@ -89,16 +89,16 @@ def draw_suggestion(path: str | Path, run: Run, found: Suggestion) -> None:
     """
     from mgs.plotting import NO_GRID, crop, drawing
 
-    views = found.plan[:MOST_PICTURES]
+    views = suggestion.plan[:MOST_PICTURES]
     scalars = {"uncertainty": run_scalars(run)["uncertainty"]}
-    curve = found.certificate.curve if found.certificate else []
+    curve = suggestion.certificate.curve if suggestion.certificate else []
     widths = [3.6, *[1.7] * len(views), *[3.2] * bool(curve)]
     with drawing(path, 0.4 + sum(widths), 4.2, NO_GRID, dpi=120) as figure:
         grid = figure.add_gridspec(2, len(widths), width_ratios=widths)
         if curve:
             _curve(figure.add_subplot(grid[:, -1]), curve)
         site = figure.add_subplot(grid[:, 0])
-        _from_above(site, run, found)
+        _from_above(site, run, suggestion)
         for k, view in enumerate(views, 1):
             small = view.camera.resized(min(view.camera.width, PICTURE_WIDTH))
             maps = view_maps(run.state.gaussians, small, scalars)
@@ -125,23 +125,23 @@ def _curve(axis: Any, curve: Sequence[Mapping[str, float]]) -> None:
     axis.legend(fontsize=7, handlelength=1, labelspacing=0.3)
 
 
-def _from_above(axis: Any, run: Run, found: Suggestion) -> None:
+def _from_above(axis: Any, run: Run, suggestion: Suggestion) -> None:
     """Draw images, candidates by gain, and the planned way, from above."""
 
     def level(points: Any) -> np.ndarray:
         return np.atleast_2d(points)[:, :2]
 
     images = level([frame.camera.position for frame in taken_in_order(run)])
-    ranked = level([view.camera.position for view in found.ranking])
-    gains, label = [view.information_gain for view in found.ranking], f"gain ({GAIN_UNIT})"
-    if found.certificate:
-        gains, label = found.certificate.prices, "price: share of the largest gain"
+    ranked = level([view.camera.position for view in suggestion.ranking])
+    gains, label = [view.information_gain for view in suggestion.ranking], f"gain ({GAIN_UNIT})"
+    if suggestion.certificate:
+        gains, label = suggestion.certificate.prices, "price: share of the largest gain"
     axis.scatter(*level(run.prior.points[::7]).T, s=0.5, color="#b0a898", rasterized=True)
     axis.scatter(*images.T, marker="^", s=26, color="black", label="images so far")
     dots = axis.scatter(*ranked.T, c=gains, s=18, cmap="viridis", label="candidates")
-    stops = [level(view.camera.position) for view in found.plan]
+    stops = [level(view.camera.position) for view in suggestion.plan]
     way = [images[:1]]
-    for corners, stop in zip(found.corners, [*stops, images[:1]], strict=True):
+    for corners, stop in zip(suggestion.corners, [*stops, images[:1]], strict=True):
         way += [level(corners)] * (len(corners) > 0) + [stop]
     axis.plot(*np.concatenate(way).T, color="#d1495b", linewidth=1.2)
     axis.scatter(*np.concatenate(stops).T, s=110, color="#d1495b", zorder=3, label="to take next")
@@ -149,5 +149,5 @@ def _from_above(axis: Any, run: Run, found: Suggestion) -> None:
         axis.text(*stop[0], str(k), color="white", fontsize=8, ha="center", va="center", zorder=4)
     unit = run.dataset.unit
     axis.set(aspect="equal", xlabel=f"x ({unit})", ylabel=f"y ({unit})")
-    axis.set_title(f"from above: a flight of {found.metres:.1f} {unit}")
+    axis.set_title(f"from above: a flight of {suggestion.metres:.1f} {unit}")
     axis.figure.colorbar(dots, ax=axis, shrink=0.6, aspect=20, label=label)

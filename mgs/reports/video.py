@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from mgs.camera import Camera, look_at
-from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Dataset
 from mgs.errors import InputError
 from mgs.files import atomic_path
@@ -57,18 +56,8 @@ def camera_path(dataset: Dataset, means: np.ndarray, count: int, width: int) -> 
 
 
 def path_frames(run: Run, beside: str | None, count: int, width: int) -> Film:
-    """Frames of a turntable; with beside="uncertainty", the map of what is unknown to the right.
-
-    With beside="truth", the frames are the dataset's views themselves, in their order, beside their
-    images.
-    """
+    """Frames of a turntable; with beside="uncertainty", the map of what is unknown to the right."""
     model = run.state.gaussians
-    if beside == "truth":
-        for frame in run.dataset.frames:
-            camera = frame.camera.resized(width + width % 2)
-            truth = _resized(srgb_from_linear(frame.masked_rgb()), camera)
-            yield _side_by_side(truth, picture(view_maps(model, camera, {})))
-        return
     scalars = {"uncertainty": run_scalars(run)["uncertainty"]} if beside else {}
     for camera in camera_path(run.dataset, model.means, count, width):
         maps = view_maps(model, camera, scalars)
@@ -80,15 +69,6 @@ def _unknown(maps: dict[str, np.ndarray]) -> np.ndarray:
     """Map of the variance that is left, sRGB in [0,1] [H,W,3]."""
     visible = maps["A"][..., None] >= VISIBLE
     return np.where(visible, painted(maps["uncertainty"], UNKNOWN) / np.float32(255), 0)
-
-
-def _resized(image: np.ndarray, camera: Camera) -> np.ndarray:
-    """Image in the size of a camera."""
-    import cv2
-
-    return np.asarray(
-        cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    )
 
 
 def _side_by_side(*pictures: np.ndarray) -> np.ndarray:

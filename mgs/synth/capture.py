@@ -41,16 +41,16 @@ def capture_of(dataset: Dataset) -> Callable[[Frame], Frame]:
         if is_done(frame):
             return frame
         photographer, orbit, exact = prepared()
-        known = orbit.get(frame.name)
-        if known is not None:
-            change = np.abs(known.camera.world_to_camera - frame.camera.world_to_camera).max()
-        if known is None or (exact and change >= POSE_TOLERANCE):
+        own = orbit.get(frame.name)
+        if own is not None:
+            change = np.abs(own.camera.world_to_camera - frame.camera.world_to_camera).max()
+        if own is None or (exact and change >= POSE_TOLERANCE):
             where = f"{dataset.root / 'transforms.json'}: frame {frame.name}"
             raise InputError(
                 f"{where} is not one of the scene's orbit, so it cannot be rendered; "
                 "restore or remove it"
             )
-        photographer.take(known)
+        photographer.take(own)
         return frame
 
     return capture

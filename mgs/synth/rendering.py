@@ -359,18 +359,18 @@ def _meter(
                 "repair its mesh"
             )
         values.append(rgb.max(-1)[depth > 0])
-    wanted = ROCK_EXPOSURE / float(np.mean(means))
-    if np.quantile(np.concatenate(values), 1 - MAX_CLIPPED) * wanted <= 1:
-        return wanted
+    target = ROCK_EXPOSURE / float(np.mean(means))
+    if np.quantile(np.concatenate(values), 1 - MAX_CLIPPED) * target <= 1:
+        return target
     values = []
     for index in chosen:
         rendered = scene.render(cameras[index], spp, derive_seed(seed, f"meter {index}"), denoise)
         values.append(rendered.rgb.max(-1)[rendered.depth > 0])
     exposure = 1 / float(np.quantile(np.concatenate(values), 1 - MAX_CLIPPED))
-    if exposure >= wanted:
-        return wanted
+    if exposure >= target:
+        return target
     say(
-        f"exposure: {wanted / exposure:.3g} times lower than so dark a rock needs, so that about "
+        f"exposure: {target / exposure:.3g} times lower than so dark a rock needs, so that about "
         f"{MAX_CLIPPED:.0%} of rock and ground clips, not more"
     )
     return exposure

@@ -77,11 +77,11 @@ def _leave_out_bad_faces(mesh: trimesh.Trimesh) -> None:
     """Remove, in place, all but the `distinct_faces`, and unused vertices. Vertices of removed
     faces get new normals, since opposite faces may have spoilt theirs; all others keep the file's.
     """
-    kept = distinct_faces(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
-    if len(kept) == len(mesh.faces):
+    faces = distinct_faces(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+    if len(faces) == len(mesh.faces):
         return
-    normals, spoilt = mesh.vertex_normals.copy(), np.unique(np.delete(mesh.faces, kept, axis=0))
-    mesh.update_faces(kept)
+    normals, spoilt = mesh.vertex_normals.copy(), np.unique(np.delete(mesh.faces, faces, axis=0))
+    mesh.update_faces(faces)
     normals[spoilt] = mesh.vertex_normals[spoilt]
     mesh.vertex_normals = normals  # type: ignore[method-assign]  # a property
     mesh.remove_unreferenced_vertices()

@@ -159,8 +159,8 @@ def load_scene_file(scene: str | Path, **orbit: Any) -> SceneFile:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            known = ", ".join(_keys_beside(first["loc"]))
-            raise InputError(f"{path}: unknown key {key!r}; choose one of {known}") from None
+            keys = ", ".join(_keys_beside(first["loc"]))
+            raise InputError(f"{path}: unknown key {key!r}; choose one of {keys}") from None
         raise InputError(
             f"{path}: {key}: {first['msg']} (is {repr(first['input'])[:80]}); correct it"
         ) from None

@@ -57,11 +57,11 @@ class Access:
 
     def refusal(self, path: str, headers: Any) -> str | None:
         """Why a request is refused; None if it is answered. headers: of websockets."""
-        asked, origin = headers.get("Host", ""), headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != asked:
+        host, origin = headers.get("Host", ""), headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != host:
             return "the request comes from another website"
         if self.token is None:
-            name = urlsplit(f"//{asked}").hostname
+            name = urlsplit(f"//{host}").hostname
             return None if name in LOCAL else "the request names another host"
         tokens = parse_qs(urlsplit(path).query).get("token", [])
         cookie = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)

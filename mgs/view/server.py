@@ -119,13 +119,13 @@ class Viewer:
                 self.stamp, self.subject = stamp, read_subject(self.path, self.follow)
                 self._renew()
         for client in list(self.clients.values()):
-            asked = client.moved, self.version
-            due = client.drawn != asked and now >= client.moved + REST
+            state = client.moved, self.version
+            due = client.drawn != state and now >= client.moved + REST
             if due and self.subject.gaussians is not None:
                 try:
                     self._draw(client)
                 except Exception:  # whatever a window sent, the others go on
-                    client.drawn = asked  # but not what it asked for meanwhile
+                    client.drawn = state  # but not what it asked for meanwhile
 
     def _stamp(self) -> list[int]:
         """Times of change of the files that a step or `mgs eval` writes."""
@@ -297,8 +297,8 @@ class Viewer:
 
     def _draw(self, client: _Client) -> None:
         """Draw the layer for a browser whose camera rests: Gaussians, and the kernel's image."""
-        asked, subject, known = (client.moved, self.version), self.subject, self.layer.options
-        layer = self.layer.value if self.layer.value in known else known[0]
+        state, subject, names = (client.moved, self.version), self.subject, self.layer.options
+        layer = self.layer.value if self.layer.value in names else names[0]
         g = subject.model
         if client.splats is None or layer != client.layer:
             colours = layers.gaussian_colours(subject, layer) / 255
@@ -314,7 +314,7 @@ class Viewer:
         if self.exact.value and self.gaussians.value and camera is not None:
             image, depth, ends = layers.kernel_image(subject, camera, layer)
             self.legend.content = layers.legend(layer, ends, subject.unit)
-            if asked[0] == client.moved:
+            if state[0] == client.moved:
                 client.splats.visible, client.covered = False, True
                 client.handle.scene.set_background_image(image, format="png", depth=depth)
         else:
@@ -323,7 +323,7 @@ class Viewer:
             if layer == "depth":
                 self.legend.content = "Depth is drawn by the kernel, at rest."
             self._uncover(client)
-        client.drawn = asked
+        client.drawn = state
 
 
 def window_camera(camera: Any) -> Camera | None:
