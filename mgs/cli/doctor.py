@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
-import platform
 from importlib.util import find_spec
 
 import typer
@@ -13,10 +11,8 @@ from rich.table import Table
 from mgs import runtime
 from mgs.cli.terminal import Terminal
 from mgs.errors import EXTRAS, InputError
+from mgs.provenance import versions
 from mgs.resources import resource_folder
-
-PACKAGES = ("mgs", "mitsuba", "drjit", "numpy")
-"""Packages whose versions are printed."""
 
 Row = tuple[str, str, str]
 """Name, value, and what is wrong with it, or ""."""
@@ -44,13 +40,11 @@ def doctor() -> None:
 
 def _software() -> list[Row]:
     """Python and packages."""
-    rows = [("python", platform.python_version(), "")]
-    for package in PACKAGES:
-        try:
-            rows.append((package, importlib.metadata.version(package), ""))
-        except importlib.metadata.PackageNotFoundError:
-            mend = "install mgs again (`make setup`, or `pip install .`)"
-            rows.append((package, "missing", f"the package {package} is missing; {mend}"))
+    rows = []
+    for name, version in versions().items():
+        mend = "install mgs again (`make setup`, or `pip install .`)"
+        lacks = f"the package {name} is missing; {mend}" if version == "unknown" else ""
+        rows.append((name, version, lacks))
     for extra in dict.fromkeys(EXTRAS.values()):
         names = [name for name, of in EXTRAS.items() if of == extra]
         absent = [name for name in names if find_spec(name) is None]

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from mgs.cli.nbv import resume_and_print, start_and_print
-from mgs.cli.options import Settings, given, merged, parse_gaussians, parse_settings, with_keys
+from mgs.cli.options import Settings, merged, not_none, parse_gaussians, parse_settings, with_keys
 from mgs.run.settings import NbvSettings
 
 
@@ -47,8 +47,8 @@ def fit(
     from mgs.run.nbv import start_fit
 
     console = Terminal()
-    train = given(passes=passes, means=means, density=density, loss=loss)
-    options = given(sh=sh, exposure=exposure, seed=seed) | {"train": train}
+    train = not_none(passes=passes, means=means, density=density, loss=loss)
+    options = not_none(sh=sh, exposure=exposure, seed=seed) | {"train": train}
     run = start_and_print(
         dataset,
         out,

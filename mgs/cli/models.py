@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from mgs import runtime
-from mgs.cli.options import given
+from mgs.cli.options import not_none
 from mgs.cli.printing import print_quality
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal, echo
@@ -138,7 +138,7 @@ def simplify(
     from mgs.reports.simplify import PRUNED, REFITTED, prune_run, refit_run
     from mgs.run.folder import open_run
 
-    of_prune, of_refit = given(noise=noise), given(learn=learn, sh=sh, loss=loss)
+    of_prune, of_refit = not_none(noise=noise), not_none(learn=learn, sh=sh, loss=loss)
     if other := of_refit if method == "prune" else of_prune:
         raise InputError(f"--{next(iter(other))}: is not used by the method {method}; leave it out")
     name = PRUNED if method == "prune" else REFITTED

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from pydantic import BaseModel, ConfigDict, Field
 
-from mgs.cli.options import Settings, given, merged, parse_settings, with_keys
+from mgs.cli.options import Settings, merged, not_none, parse_settings, with_keys
 from mgs.run.policies import POLICIES
 from mgs.run.policy_file import in_file
 from mgs.run.settings import NbvSettings, Positive, settings_in, validated
@@ -84,8 +84,8 @@ def nbv(
     values = parse_settings(settings, nbv)
     live = live_capture(capture_command, capture_folder, values.pop("capture", {}))
     if resume is not None:
-        others = given(dataset=dataset, out=out, prior=prior, gaussians=gaussians, budget=budget)
-        others |= given(seeds=seeds, batch=batch, seed=seed, config=config, force=force or None)
+        others = not_none(dataset=dataset, out=out, prior=prior, gaussians=gaussians, budget=budget)
+        others |= not_none(seeds=seeds, batch=batch, seed=seed, config=config, force=force or None)
         for name in others | values:
             where = f"--resume takes its settings from {resume / 'config.json'}; change it there"
             raise InputError(f"nbv: {name}: {where}")
@@ -96,7 +96,7 @@ def nbv(
     own = recorded.get("policy", "")
     if in_file(own) and policy is None:
         raise InputError(f"{config}: its policy is a program, {own}; to run it, add --policy {own}")
-    values |= given(policy=policy, budget=budget, seeds=seeds, batch=batch, seed=seed)
+    values |= not_none(policy=policy, budget=budget, seeds=seeds, batch=batch, seed=seed)
     dataset = dataset or values.get("dataset")
     if gaussians is None:
         prior = prior or values.get("prior")

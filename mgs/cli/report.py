@@ -25,8 +25,7 @@ def report(
     view, and make a table.
 
     If the dataset has no test views, PSNR is over all views, and the view drawn is one that the
-    fewest runs were trained on. Figures need runs that are finished and measured by `mgs eval`;
-    nothing is computed again.
+    fewest runs were trained on. Figures need runs that are finished and measured by `mgs eval`.
 
     The page of --html takes unfinished runs, too, and draws the model that the run folder holds.
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from rich.table import Table
 
 from mgs import runtime
-from mgs.cli.options import Count, Settings, given, parse_gaussians, parse_settings, with_keys
+from mgs.cli.options import Count, Settings, not_none, parse_gaussians, parse_settings, with_keys
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
@@ -113,7 +113,7 @@ def suggest(
         )
     values = parse_settings(settings, suggest)
     asked = validated(Candidates, values)
-    changes = given(flight=values.get("flight"), policy=policy, enough=values.get("enough"))
+    changes = not_none(flight=values.get("flight"), policy=policy, enough=values.get("enough"))
     count = parse_gaussians(views, "views") or 1
     ours = Ours(FILES, [path for path in (source, poses, prior) if path]) if force else None
     if out is not None:
@@ -169,7 +169,9 @@ def _run(source: Path, scratch: Path, settings: dict[str, Any], progress: Any) -
                 raise InputError(f"suggest: {source} is a run with its model; leave out `{name}`")
         return open_run(source)
     count = len(load_dataset(source))
-    run = start_run(source, scratch, seeds=count, budget=0, progress=progress, **given(**settings))
+    run = start_run(
+        source, scratch, seeds=count, budget=0, progress=progress, **not_none(**settings)
+    )
     return resume_nbv(run, progress=progress)
 
 
@@ -182,7 +184,7 @@ def _candidates(
     from mgs.data.meshes import distances_to_mesh
     from mgs.run.candidates import MOST_POSES, Site, place_poses, read_poses
 
-    shapes = given(dome=dome, ring=asked.ring, grid=asked.grid)
+    shapes = not_none(dome=dome, ring=asked.ring, grid=asked.grid)
     if len(shapes) + (poses is not None) > 1:
         raise InputError("suggest: `poses`, `dome`, `ring`, `grid`: give one of them")
     site = Site(run.prior, run.taken[-1].camera, run.dataset.world)
