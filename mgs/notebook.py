@@ -25,13 +25,15 @@ MOST_FILES = 6
 
 def html(text: str, pictures: Sequence[Image.Image]) -> str:
     """A line of text above a row of pictures, which are part of the HTML."""
-    row = ""
-    for picture in pictures:
-        buffer = BytesIO()
-        picture.save(buffer, "PNG")
-        data = b64encode(buffer.getvalue()).decode()
-        row += f'<img src="data:image/png;base64,{data}" style="margin:2px">'
+    row = "".join(f'<img src="{data_uri(one, "PNG")}" style="margin:2px">' for one in pictures)
     return f"<div>{escape(text)}</div><div>{row}</div>"
+
+
+def data_uri(picture: Image.Image, kind: str, **options: int) -> str:
+    """A picture as the address of an <img>. kind, options: of its file, as Pillow takes them."""
+    buffer = BytesIO()
+    picture.save(buffer, kind, **options)
+    return f"data:image/{kind.lower()};base64,{b64encode(buffer.getvalue()).decode()}"
 
 
 def thumbnails(paths: Sequence[Path]) -> list[Image.Image]:

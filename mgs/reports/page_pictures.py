@@ -7,8 +7,6 @@ uncertainty are by the exact Fisher information, at that model, of the views tak
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,6 +15,7 @@ import numpy as np
 
 from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
+from mgs.notebook import data_uri
 from mgs.plotting import crop, painted
 from mgs.policy.criteria import uncertainty
 from mgs.reports.diagnostics import VISIBLE, view_maps
@@ -55,7 +54,7 @@ class Album:
     def add_colours(self, name: str, linear: np.ndarray) -> None:
         """Add a picture of linear RGB [H,W,3]."""
         pixels = np.round(srgb_from_linear(linear) * 255).astype(np.uint8)
-        self.pictures[name] = data_uri(self._small(pixels))
+        self.pictures[name] = web_picture(self._small(pixels))
 
     def add_error(self, name: str, truth: np.ndarray, rendered: np.ndarray) -> None:
         """Add the mean absolute difference of the sRGB channels of two images, linear RGB
@@ -68,7 +67,7 @@ class Album:
         VISIBLE."""
         colours = painted(values, UNCERTAINTY_COLOURS)
         colours[alpha < VISIBLE] = GREY
-        self.pictures[name] = data_uri(self._small(colours))
+        self.pictures[name] = web_picture(self._small(colours))
 
     def finish(self) -> float:
         """Turn the error maps into pictures; return the error at the end of their colour scale.
@@ -79,7 +78,7 @@ class Album:
         limit = max(round(limit, 3), 1 / 255)
         for name, error in self.errors.items():
             shown = painted(error.astype(np.float32) / limit, ERROR_COLOURS)
-            self.pictures[name] = data_uri(shown)
+            self.pictures[name] = web_picture(shown)
         self.errors.clear()
         return limit
 
@@ -95,14 +94,12 @@ class Album:
         return np.asarray(picture)
 
 
-def data_uri(pixels: np.ndarray) -> str:
+def web_picture(pixels: np.ndarray) -> str:
     """Encode sRGB pixels, uint8 [h,w,3], as the WebP address of an <img>."""
     from PIL import Image
 
-    file = io.BytesIO()
     picture = Image.fromarray(np.ascontiguousarray(pixels))
-    picture.save(file, format="WEBP", quality=QUALITY, method=4)
-    return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode("ascii")
+    return data_uri(picture, "WEBP", quality=QUALITY, method=4)
 
 
 def new_album(frames: Sequence[Frame], count: int) -> Album:
