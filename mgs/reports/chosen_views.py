@@ -57,12 +57,9 @@ def _points(gaussians: Gaussians) -> np.ndarray:
     """Table of the centres and sRGB colours of opaque Gaussians."""
     g = gaussians[gaussians.opacities >= OPAQUE]
     colours = np.round(255 * srgb_from_linear(g.rgb) if g.linear else 255 * np.clip(g.rgb, 0, 1))
-    names = ("red", "green", "blue")
-    table = np.empty(len(g), [*((axis, "f8") for axis in "xyz"), *((name, "u1") for name in names)])
-    for k in range(3):
-        table["xyz"[k]] = g.means[:, k].astype(np.float64) + g.origin[k]
-        table[names[k]] = colours[:, k]
-    return table
+    columns = [*(g.means.astype(np.float64) + g.origin).T, *colours.astype(np.uint8).T]
+    layout = [*((axis, "f8") for axis in "xyz"), *((k, "u1") for k in ("red", "green", "blue"))]
+    return np.rec.fromarrays(columns, dtype=layout)
 
 
 def _copied(out: Path, frame: Frame, mask: str) -> Frame:
