@@ -100,9 +100,9 @@ def remove_leftovers(folder: Path) -> None:
 
 def not_writable(path: Path, error: Exception) -> InputError:
     """InputError for a path that cannot be written, with the reason of the system."""
+    reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
     return InputError(
-        f"{path}: cannot be written ({getattr(error, 'strerror', None) or error}); "
-        "choose a place you may write to, with room"
+        f"{path}: cannot be written ({reason}); choose a place you may write to, with room"
     )
 
 

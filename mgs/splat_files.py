@@ -5,9 +5,12 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
+import os
 import struct
 import warnings
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -239,9 +242,13 @@ def _write_spz(path: Path, gaussians: Gaussians) -> None:
     fields = (g.means, g.log_scales, g.quats, g.logit_opacities, g.sh[:, 0])
     arrays = [np.ascontiguousarray(values, np.float32) for values in fields]
     higher = np.ascontiguousarray(g.sh[:, 1:], np.float32) if g.sh.shape[1] > 1 else None
+    data = bytearray()
     with atomic_path(path) as temporary:
         codec.write_spz(str(temporary), *arrays, higher, fractional_bits=bits)
-        if g.antialiased:  # the codec leaves the flags empty
+        with suppress(EOFError):  # the codec does not notice a full disk
             data = bytearray(gzip.decompress(temporary.read_bytes()))
+        if len(data) != 16 + len(g) * (20 + 3 * (g.sh.shape[1] - 1)):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        if g.antialiased:  # the codec leaves the flags empty
             data[14] |= SPZ_ANTIALIASED
             temporary.write_bytes(gzip.compress(data, 6, mtime=0))

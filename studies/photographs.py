@@ -5,7 +5,6 @@ Fits are timed one by one: let nothing else run meanwhile.
 
 from __future__ import annotations
 
-import csv
 import math
 import shlex
 import shutil
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import mgs
-from mgs.files import reading
+from mgs.files import read_csv
 from mgs.run.nbv import start_fit
 from studies.chart import check_dataset
 from studies.frame.case import judge
@@ -70,10 +69,8 @@ def read_peer(file: Path, datasets: Sequence[str]) -> list[Row]:
     NUMBERS are optional, and `dataset`, one of these names: by default the first. Raises InputError
     for other contents.
     """
-    with reading(file):
-        lines = list(
-            csv.DictReader(file.read_text(encoding="utf-8", errors="replace").splitlines())
-        )
+    head, *rows = [row for _, row in read_csv(file)] or [[]]
+    lines = [dict(zip(head, row, strict=False)) for row in rows]
     try:
         numbers = [{k: float(v) for k, v in line.items() if k in NUMBERS} for line in lines]
         found = [row[key] for row in numbers for key in NUMBERS[:2]]
