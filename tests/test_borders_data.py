@@ -91,6 +91,11 @@ def bag_of(tmp_path, data, kind):
                 robot.odometry("/wheels", time + 0.01, wrong(body, k))
             if kind == "wheels and filter":
                 robot.odometry("/filter", time, body)
+            if kind == "motion capture":
+                step = robot.bag.pose("Transform", "Vector3", body)
+                values = robot.bag.header(time, "room"), "base_link", step
+                name = "geometry_msgs/msg/TransformStamped"
+                robot.bag.write("/mocap/robot", name, time, *values)
             if kind in ("body", "pose only"):
                 pose = body if kind == "body" else body @ MOUNT
                 robot.bag.stamped("/local/pose", time, pose)
@@ -108,6 +113,7 @@ def bag_of(tmp_path, data, kind):
         ("wheels and filter", "/filter", 12),
         ("body", "/local/pose", 12),
         ("pose only", "/local/pose", 12),
+        ("motion capture", "/mocap/robot", 12),
     ],
 )
 def test_poses_of_a_bag_are_those_that_move_the_camera(tmp_path, data, kind, pose, frames):
@@ -117,7 +123,7 @@ def test_poses_of_a_bag_are_those_that_move_the_camera(tmp_path, data, kind, pos
     assert source.left_out.total() == 12 - frames
 
 
-@pytest.mark.parametrize("kind", ["static", "wheels and filter", "body", "pose only"])
+@pytest.mark.parametrize("kind", ["static", "wheels and filter", "body", "motion capture"])
 def test_a_bag_whose_poses_are_not_plain_is_refused(tmp_path, data, kind):
     with pytest.raises(InputError, match=r"does not move|come from|no tf or odometry leads"):
         read_source(bag_of(tmp_path, data, kind), unpack=tmp_path / "x")

@@ -7,6 +7,7 @@ import struct
 import sys
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -262,6 +263,14 @@ def test_short_quaternions_are_rotations(tmp_path):
     write_ply(tmp_path / "x.ply", replace(model, quats=model.quats * np.float32(1e-20)))
     read = load_gaussians(tmp_path / "x.ply")
     np.testing.assert_allclose(covariances(read), covariances(model), atol=1e-6)
+
+
+def test_an_spz_that_is_cut_off_when_written_is_refused(tmp_path, monkeypatch):
+    codec = pytest.importorskip("gsply_cpp")
+    monkeypatch.setattr(codec, "write_spz", lambda path, *_, **__: Path(path).touch())
+    with pytest.raises(InputError, match="No space left on device"):
+        written(tmp_path, "spz", gaussians(0))
+    assert not list(tmp_path.iterdir())
 
 
 def test_float32_too_far_from_the_origin_is_noticed(tmp_path):
