@@ -408,22 +408,31 @@ def _is_lock(path: Path, or_empty: bool = False) -> bool:
 
 
 @contextmanager
-def scratch_folder(path: str | Path) -> Iterator[Path]:
+def scratch_folder(path: str | Path, resumable: bool = False) -> Iterator[Path]:
     """Context manager: a folder for temporary files, removed after the block with all its contents.
 
-    What a killed process left in it is removed first. Raises InputError if a folder of this name is
-    there that mgs did not make, or that another process uses.
+    What a killed process left in it is removed first. resumable: it is not, and an interrupted
+    block leaves it; one that refuses its input does not. Raises InputError if a folder of this name
+    is there that mgs did not make, or that another process uses.
     """
     path = Path(path)
     _check_leftover(path)
+    ended = True
     try:
         with folder_locked(path):
-            _clear(path)
+            if not resumable:
+                _clear(path)
             try:
                 yield path
+            except BaseException as error:
+                ended = not resumable or isinstance(error, InputError)
+                raise
             finally:
-                _clear(path)
+                if ended:
+                    _clear(path)
     finally:
+        if not ended and path.is_dir():  # which has something to continue
+            (path / LOCK).write_text(MARK, encoding="ascii")
         with suppress(OSError):
             path.rmdir()
 

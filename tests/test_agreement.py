@@ -2,6 +2,8 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
@@ -10,9 +12,11 @@ import synthetic
 from program import command, said
 
 from mgs.camera import Camera, look_at
-from mgs.data.agreement import BODY, FLIP, agreement, observed
+from mgs.data import agreement as poses
+from mgs.data.agreement import BODY, FLIP, observed
 from mgs.data.dataset import write_transforms
 from mgs.data.frames import Frame
+from mgs.data.structure import Matcher
 from mgs.images import write_exr, write_png
 
 
@@ -34,6 +38,11 @@ def frames(tmp_path_factory):
         write_png(path, np.repeat(grey[..., None], 3, -1), linear=False)
         made.append(Frame(path.stem, camera, float(k), path))
     return made
+
+
+def agreement(frames):
+    with TemporaryDirectory() as folder:
+        return poses.agreement(frames, Matcher.of_frames(frames, Path(folder)))
 
 
 def wrong(frames, change):

@@ -377,7 +377,7 @@ BAD: dict[str, tuple[Spoil, list[str], str]] = {
     "no images": (lambda root: shutil.rmtree(root / "images"), [], "none of the 8 images"),
     "corrupt JPEG": (corrupt_jpeg, [], "kf_0000.jpg: not a readable image"),
     "points in one place": (points_in_one_place, [], "points.ply: has values that are not finite"),
-    "no source": (lambda root: root / "images", [], "holds no transforms.json"),
+    "no source": (lambda root: root / "images", [], "photographs can be placed"),
     "one mask missing": (
         lambda root: (root / "masks/kf_0000.png").unlink(), MASKS, "no mask for image kf_0000.png",
     ),

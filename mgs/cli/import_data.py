@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,8 +16,10 @@ from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import Ours, clear_folder, scratch_folder
+from mgs.progress import listening
 
 if TYPE_CHECKING:
+    from mgs.data.clouds import SparseCloud
     from mgs.data.dataset import Dataset
     from mgs.data.shots import Source
 
@@ -45,6 +46,7 @@ def import_data(
     downscale: Annotated[int, typer.Option(min=1)] = 1,
     up: str = "auto",
     unit: float | None = None,
+    distance: str | None = None,
     test_every: Annotated[int | None, typer.Option(min=2)] = None,
     pose: str | None = None,
     split: str = "train",
@@ -58,7 +60,7 @@ def import_data(
     kept in sparse.ply for `mgs prior`. The same command continues an interrupted import.
 
     - source: A transforms.json or a folder with one, a COLMAP model (sparse/0), ROS bag, Metashape
-      XML, or a folder of TUM RGB-D, Open3D or RTAB-Map.
+      XML, a folder of TUM RGB-D, Open3D or RTAB-Map, or a folder of photographs alone.
     - out: Folder to write: new, empty, or left by an interrupted import.
     - images: Folder of the images (default: SOURCE/images), or topic of a bag.
     - keyframes: Of a recording, import frames at least this time or distance apart: 0.5s or 0.2m.
@@ -68,47 +70,64 @@ def import_data(
     - downscale K: Average blocks of K x K pixels; 4 suits 12 megapixels.
     - up: Up direction: X,Y,Z in the source's world, or auto: from how cameras were held.
     - unit: Metres per unit of length of the source. Default: as the source says, if it does.
+    - distance A,B,METRES: Distance between the cameras of two images, which gives the scale.
     - test_every N: Make the first and every further Nth image, by name, a test view; 8 is usual.
     - pose TOPIC: Topic of a bag's poses of the camera, or of the body that carries it.
     - split: Split of NeRF-synthetic data to import: train, val or test.
     """
     from mgs.data.agreement import agreement
     from mgs.data.bags import is_bag
+    from mgs.data.clouds import write_cloud
     from mgs.data.importers import import_source
     from mgs.data.meshes import GLTF
+    from mgs.data.photographs import KIND as PHOTOGRAPHS
     from mgs.data.sources import read_source
+    from mgs.data.structure import CLOUD, Matcher, lacks_points
 
     console, notes = Terminal(), Terminal(stderr=True)
     if masks is not None and mesh is not None:
         raise InputError(
             "import: --masks and --mesh both say where masks come from; give one of them"
         )
+    if unit is not None and distance is not None:
+        raise InputError("import: --unit and --distance both give the scale; give one of them")
     unpacked = out.with_name(f"{out.name}.unpacked")
-    with scratch_folder(unpacked) if is_bag(source) else nullcontext():
+    with (
+        scratch_folder(unpacked, resumable=not is_bag(source)) as scratch,
+        progress_bar("reading", console) as progress,
+        listening(progress),
+    ):
         shots = read_source(source, images, split, keyframes=keyframes, unpack=unpacked, pose=pose)
         shots = shots if unit is None else shots.in_metres(unit)
+        shots = shots if distance is None else shots.with_distance(distance)
         axis = parse_up(up)
         upward, reason = shots.up_or_estimate() if axis is None else (axis, "as --up says")
         if force:
             clear_folder(out, Ours(FILES, [path for path in (source, images, masks, mesh) if path]))
         finished = os.path.isfile(out / "transforms.json")  # else the import refuses what is there
         source_shots, tests = shots.set_apart(test_every)
-        with progress_bar("importing", console) as progress:
-            result = import_source(
-                source_shots,
-                out,
-                masks=masks,
-                mesh=mesh,
-                downscale=downscale,
-                up=upward,
-                tests=tests,
-                on_frame=partial(progress, "importing"),
-            )
+        result = import_source(
+            source_shots,
+            out,
+            masks=masks,
+            mesh=mesh,
+            downscale=downscale,
+            up=upward,
+            tests=tests,
+            on_frame=partial(progress, "importing"),
+        )
+        poses, cloud = shots.fit, shots.sparse
+        if shots.kind != PHOTOGRAPHS:
+            matcher = Matcher.of_frames(result.frames, scratch / "matches")
+            compared = agreement(result.frames, matcher)
+            poses = poses if compared is None or (poses and poses.problem) else compared
+            if lacks_points(result) and not (poses and poses.problem):
+                cameras = [result.world.leave(frame.camera) for frame in result.frames]
+                cloud = matcher.triangulated(cameras)
+                if cloud is not None:
+                    write_cloud(out / CLOUD, cloud)
     if mesh is not None and mesh.suffix.lower() in GLTF:
         console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
-    poses = agreement(result.frames)
-    if shots.fit and (poses is None or shots.fit.problem):
-        poses = shots.fit
     for note in [*shots.notes, *_advice(shots, result)]:
         notes.print(f"mgs: {note}", soft_wrap=True)
     fits = "poses not compared with the pictures, which share too few points"
@@ -117,9 +136,20 @@ def import_data(
         fits = f"poses compared by {poses.evidence}{error}"
         if poses.problem:
             notes.print(f"mgs: the poses {poses.problem} ({fits})", soft_wrap=True)
+    if cloud is not None:
+        fits = f"{_points(cloud)}; {fits}"
     world = f"up {_numbers(upward)}, {reason}"
     _print_summary(console, shots, tests, result, f"{fits}; {world}")
     console.print(f"{out} is finished already" if finished else f"wrote {out}", soft_wrap=True)
+
+
+def _points(cloud: SparseCloud) -> str:
+    """Number of points, and their reprojection error if known."""
+    text = f"{len(cloud.points):,} points"
+    if cloud.error is None or cloud.track is None:
+        return text
+    error = float(np.average(cloud.error, weights=cloud.track))
+    return f"{text} with a reprojection error of {error:.2f} pixels"
 
 
 def _advice(source: Source, result: Dataset) -> Iterator[str]:
@@ -178,7 +208,6 @@ def _print_summary(
         *([f"{apart} test views, which are never fitted"] if apart else []),
         *([f"left out {without}"] if without else []),
         *(f"{count} {what}" for what, count in counts.items() if count),
-        *([f"{len(source.sparse.points):,} points"] if source.sparse else []),
         more,
         f"lengths in {lengths}",
         f"origin {_numbers(source.origin)}",

@@ -6,22 +6,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mgs.camera import Camera
-from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
 from mgs.data.visibility import in_image, nearest_point
 
+if TYPE_CHECKING:
+    from mgs.data.structure import Matcher
+
 PAIRS = 12
 """Most pairs of neighbours that are compared."""
-
-WIDEST = 1000
-"""Width, pixels, to which wider pictures are reduced for matching."""
-
-RATIO = 0.75
-"""Largest ratio of the distances to the best and the second best match (Lowe 2004)."""
 
 LEAST_MATCHES, LEAST_SHARE, LEAST_PAIRS = 40, 0.6, 2
 """Fewest matches of a pair that agree with one epipolar geometry, and their least share of all
@@ -91,16 +88,22 @@ class Agreement:
     problem: str = ""
 
 
-def agreement(frames: Sequence[Frame]) -> Agreement | None:
+def agreement(frames: Sequence[Frame], matcher: Matcher) -> Agreement | None:
     """Compare poses with what pictures of neighbours in time show: points matched in them, else
-    their depth, else the place that all cameras look at. None where nothing can be compared."""
-    first = np.unique(np.linspace(0, max(len(frames) - 2, 0), PAIRS).astype(int))
-    pairs = [(frames[k], frames[k + 1]) for k in first if len(frames) > 1]
-    matched = [
-        (one.camera, other.camera, *points)
-        for one, other in pairs
-        if (points := _matches(one, other)) is not None
-    ]
+    their depth, else the place that all cameras look at. None where nothing can be compared.
+
+    matcher: of the frames' images.
+    """
+    places = np.unique(np.linspace(0, max(len(frames) - 2, 0), PAIRS).astype(int)).tolist()
+    places = places if len(frames) > 1 else []
+    matcher.match((place, place + 1) for place in places)
+    pairs, matched = [], []
+    for place in places:
+        one, other = frames[place], frames[place + 1]
+        a, b, count = matcher.between(place, place + 1)
+        pairs.append((one, other))
+        if len(a) >= max(LEAST_MATCHES, LEAST_SHARE * count):
+            matched.append((one.camera, other.camera, a, b))
     width, found = frames[0].camera.width, []
     if len(matched) >= LEAST_PAIRS:
         count = sum(len(points) for _, _, points, _ in matched)
@@ -248,34 +251,6 @@ def _depth_error(
         return np.inf
     pixels = zoom * other.camera.K[0, 0] * np.abs(1 - depth[usable] / z[usable])
     return float(np.median(pixels))
-
-
-def _matches(one: Frame, other: Frame) -> tuple[np.ndarray, np.ndarray] | None:
-    """Pixels [N,2] of the same points in two pictures, by SIFT; None where they are too few."""
-    import cv2
-
-    sift, features = cv2.SIFT.create(1000), []
-    for frame in (one, other):
-        grey = np.round(255 * srgb_from_linear(frame.rgb()).mean(-1)).astype(np.uint8)
-        scale = min(1.0, WIDEST / grey.shape[1])
-        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        points, descriptors = sift.detectAndCompute(grey, None)
-        if descriptors is None or len(points) < LEAST_MATCHES:
-            return None
-        features.append((np.array([point.pt for point in points]), descriptors, scale))
-    (a, da, scale_a), (b, db, scale_b) = features
-    nearest = cv2.BFMatcher().knnMatch(da, db, k=2)
-    good = [
-        x for x, y in (two for two in nearest if len(two) == 2) if x.distance < RATIO * y.distance
-    ]
-    if len(good) < LEAST_MATCHES:
-        return None
-    a, b = a[[match.queryIdx for match in good]], b[[match.trainIdx for match in good]]
-    _, inliers = cv2.findFundamentalMat(a, b, cv2.FM_RANSAC, 1.0, 0.99)
-    if inliers is None or inliers.sum() < max(LEAST_MATCHES, LEAST_SHARE * len(good)):
-        return None
-    chosen = inliers.ravel().astype(bool)
-    return (a[chosen] + 0.5) / scale_a, (b[chosen] + 0.5) / scale_b
 
 
 def _epipolar_error(

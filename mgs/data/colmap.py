@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -11,10 +13,10 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.agreement import observed
-from mgs.data.clouds import SparseCloud
 from mgs.data.dataset import FRAME_INTERVAL
 from mgs.data.lens import Lens
 from mgs.data.shots import Shot, Source, frame_name, natural
+from mgs.data.structure import cloud_of
 from mgs.errors import InputError
 from mgs.files import parsing, reading
 
@@ -108,16 +110,31 @@ def read_colmap(source: Path, models: list[Path], images: Path) -> Source:
             f"others ({others}), each in a world of its own"
         )
     reconstruction, names = _opened(model)
-    shots = []
-    ordered = sorted(reconstruction.images.values(), key=lambda image: names[image.image_id])
-    for index, image in enumerate(ordered):
-        name = names[image.image_id]
-        camera, lens = _camera(f"{model}: image {name!r}", image)
+    files = {}
+    for number, name in names.items():
         path = images / PureWindowsPath(name) if not (images / name).exists() else images / name
+        files[number] = name, path
+    return replace(source_of(reconstruction, files, f"{model}: image"), notes=tuple(notes))
+
+
+def source_of(
+    reconstruction: Any, files: Mapping[int, tuple[str, Path]], where: str, kind: str = "COLMAP"
+) -> Source:
+    """Images, sorted by name, and points of a reconstruction of pycolmap.
+
+    files: name and path of each image by its number. where: start of messages about an image.
+    Raises InputError if a lens is not supported.
+    """
+    shots = []
+    placed = [image for image in reconstruction.images.values() if image.has_pose]
+    ordered = sorted(placed, key=lambda image: files[image.image_id])
+    for index, image in enumerate(ordered):
+        name, path = files[image.image_id]
+        camera, lens = _camera(f"{where} {name!r}", image)
         shots.append(Shot(frame_name(name), camera, lens, FRAME_INTERVAL * index, path))
     some = ordered[:: max(1, len(ordered) // COMPARED)]
     fit = observed([_observed(image, reconstruction) for image in some])
-    return Source("COLMAP", shots, notes=tuple(notes), sparse=_cloud(reconstruction), fit=fit)
+    return Source(kind, shots, sparse=cloud_of(reconstruction), fit=fit)
 
 
 def _observed(image: Any, reconstruction: Any) -> tuple[Camera, np.ndarray, np.ndarray]:
@@ -214,25 +231,3 @@ def _camera(where: str, image: Any) -> tuple[Camera, Lens | None]:
         return Camera(K, lens.width, lens.height, pose), found
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-
-
-def _cloud(reconstruction: Any) -> SparseCloud | None:
-    """Triangulated points that some image saw. COLMAP writes -1 for an unknown error."""
-    centres = {
-        image.image_id: image.projection_center() for image in reconstruction.images.values()
-    }
-    points, views, tracks, errors = [], [], [], []
-    for point in reconstruction.points3D.values():
-        seen = {element.image_id for element in point.track.elements}
-        if seen:
-            rays = np.stack([centres[image] for image in seen]) - point.xyz
-            points.append(point.xyz)
-            views.append((rays / np.linalg.norm(rays, axis=1, keepdims=True)).mean(0))
-            tracks.append(float(len(seen)))
-            errors.append(point.error)
-    if not points:
-        return None
-    directions, error = np.stack(views), np.array(errors)
-    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
-    known = error if (error >= 0).all() else None
-    return SparseCloud(np.stack(points), directions, np.array(tracks), known)

@@ -82,6 +82,25 @@ class Source:
         origin = x * unit, y * unit, z * unit
         return replace(self, shots=shots, sparse=sparse, unit="m", origin=origin)
 
+    def with_distance(self, text: str) -> Source:
+        """Scale to metres by a known distance between two cameras: A,B,METRES, with the names of
+        their images. Raises InputError for another text, unknown names and cameras in one place."""
+        words = [word.strip() for word in text.split(",")]
+        eyes = {shot.name: shot.camera.position for shot in self.shots}
+        names = [frame_name(word) for word in words[:2]]
+        try:
+            metres = float(words[2])
+        except (IndexError, ValueError):
+            metres = np.nan
+        if len(words) != 3 or not 0 < metres < np.inf:
+            raise InputError(f"import: distance {text!r}: expected A,B,METRES, as in a.jpg,b.jpg,2")
+        if lacking := [name for name in names if name not in eyes]:
+            raise InputError(f"import: distance {text!r}: no camera of {lacking[0]}; correct it")
+        apart = float(np.linalg.norm(eyes[names[0]] - eyes[names[1]]))
+        if apart == 0:
+            raise InputError(f"import: distance {text!r}: its cameras are in one place; correct it")
+        return self.in_metres(metres / apart)
+
     def near_origin(self) -> Source:
         """Move the origin to the cameras, in whole units, if they are FAR from it."""
         eyes = np.stack([shot.camera.position for shot in self.shots])
@@ -161,6 +180,8 @@ def turned_by_exif(source: Source) -> Source:
     their side show which by the size of their cameras. Where none does, the pictures are taken as
     they are stored, and a note says so.
     """
+    if any(shot.turned for shot in source.shots):
+        return source
     tags = [exif_orientation(shot.image) for shot in source.shots]
     shown = set()
     for shot, tag in zip(source.shots, tags, strict=True):

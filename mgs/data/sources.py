@@ -17,6 +17,7 @@ from mgs.data.colmap import models_in, read_colmap
 from mgs.data.dataset import finite_number, posed_camera, read_records, timestamp_of, unit_of
 from mgs.data.lens import Lens
 from mgs.data.metashape import is_metashape, read_metashape
+from mgs.data.photographs import photographs_in, read_photographs
 from mgs.data.rgbd_folders import (
     is_open3d,
     is_rtabmap,
@@ -25,7 +26,7 @@ from mgs.data.rgbd_folders import (
     read_rtabmap,
     read_tum,
 )
-from mgs.data.shots import Shot, Source, checked, frame_name, turned_by_exif
+from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, checked, frame_name, turned_by_exif
 from mgs.data.tracks import Spacing
 from mgs.data.world import unit_up
 from mgs.errors import InputError
@@ -80,12 +81,13 @@ def read_source(
     """Recognise the format of a source, and read its cameras and file names.
 
     source: a transforms.json or its folder; a folder with NeRF-synthetic's transforms_SPLIT.json;
-    a folder with a COLMAP model in itself, sparse/ or sparse/N/; or one of RECORDINGS. images: the
-    image folder, by default SOURCE/images, or that of the names in transforms.json; of a bag the
-    topic. split: train, val or test. keyframes: `Spacing` of a recording. unpack: folder for the
-    images of a bag, by default SOURCE.unpacked. pose: topic of a bag's poses. Raises InputError if
-    no format is recognised, no image exists, a frame is listed twice, or a camera model is not
-    supported.
+    a folder with a COLMAP model in itself, sparse/ or sparse/N/; one of RECORDINGS; or a folder of
+    photographs alone. images: the image folder, by default SOURCE/images, or that of the names in
+    transforms.json; of a bag the topic. split: train, val or test. keyframes: `Spacing` of a
+    recording. unpack: folder for the images of a bag and the matches of photographs, by default
+    SOURCE.unpacked. pose: topic of a bag's poses. Raises InputError if no format is recognised, no
+    image exists, a frame is listed twice, a camera model is not supported, or photographs cannot be
+    placed.
     """
     source = Path(source)
     source.exists()  # an OSError of the source itself is not one of a file that it names
@@ -112,21 +114,25 @@ def _recognised(
             f"{source}: no such file or folder; "
             "give a transforms.json, its folder, or a COLMAP folder"
         )
+    if source.suffix.lower() in PICTURE_SUFFIXES and source.is_file():
+        raise InputError(f"{source}: is one picture; give the folder of all photographs")
     path = source if source.is_file() else source / "transforms.json"
     split_path = source / f"transforms_{split}.json"
+    folder = unpack or source.with_name(f"{source.name}.unpacked")
     recording = next((kind for kind, (fits, _) in RECORDINGS.items() if fits(source)), None)
     if recording is not None:
-        folder = unpack or source.with_name(f"{source.name}.unpacked")
         reader = RECORDINGS[recording][1]
         return reader(source, images, Spacing.parse(keyframes), folder, pose)
     if path.is_file() or split_path.is_file():
         return _read_transforms(path if path.is_file() else split_path, images)
     if models := models_in(source):
         return read_colmap(source, models, images if images is not None else source / "images")
+    if paths := photographs_in(images or source):
+        return read_photographs(images or source, paths, folder / "matches")
     raise InputError(
-        f"{source}: holds no transforms.json, transforms_{split}.json or COLMAP model "
-        "(cameras, images and points3D, .bin or .txt, in sparse/0, sparse or the folder "
-        f"itself), and is no {', '.join(RECORDINGS)}"
+        f"{source}: holds no photographs (PNG, JPEG, TIFF, WebP), transforms.json, "
+        f"transforms_{split}.json or COLMAP model (cameras, images and points3D, .bin or .txt, in "
+        f"sparse/0, sparse or the folder itself), and is no {', '.join(RECORDINGS)}"
     )
 
 

@@ -12,6 +12,7 @@ from mgs.data.clouds import read_cloud
 from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame
 from mgs.data.meshes import Mesh
+from mgs.data.structure import CLOUD
 from mgs.data.visibility import has_masks, in_image
 from mgs.errors import InputError
 from mgs.prior.hull import visual_hull
@@ -23,9 +24,6 @@ from mgs.survey.fusion import focus, voxel_means
 
 SOURCES = ("depth", "mesh", "points", "hull", "random")
 """Sources of a prior."""
-
-CLOUD = "sparse.ply"
-"""File of a dataset with the points that came with its cameras."""
 
 LEAST_PHOTOGRAPHS = 8
 """Fewest photographs without depth for a surface."""

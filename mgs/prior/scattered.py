@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 from mgs.data.clouds import read_cloud, views_of
 from mgs.data.dataset import Dataset
 from mgs.data.meshes import Mesh
+from mgs.data.structure import CLOUD
 from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError
-from mgs.prior.photographs import CLOUD
 from mgs.prior.points import MASK_SHARE, reliable
 from mgs.prior.resolution import MOST_GAUSSIANS
 from mgs.prior.settings import PriorSettings

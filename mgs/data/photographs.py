@@ -1,0 +1,235 @@
+"""Photographs alone as a source: their poses by incremental structure from motion (pycolmap)."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.data.colmap import source_of
+from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, natural
+from mgs.data.structure import Matcher
+from mgs.data.world import PLUS_Z
+from mgs.errors import InputError
+from mgs.images import exif_orientation, image_size
+from mgs.progress import report
+
+KIND = "photographs"
+
+FEWEST = 3
+"""Fewest photographs that can be placed."""
+
+EXHAUSTIVE = 150
+"""Most photographs of which all pairs are matched. Of more, those near each other in order are."""
+
+NEAR = 10
+"""Photographs after each in order that it is then matched with, and at distances of powers of 2."""
+
+LEAST_FEATURES = 100
+"""Fewest features of a photograph that is neither blurred nor blank."""
+
+LEAST_MATCHES = 15
+"""Fewest matches that one epipolar geometry explains, for two photographs to overlap."""
+
+GPS_ERROR = 0.1
+"""Largest median distance of cameras from their positions by GPS, over the extent of these, for
+GPS to give the scale."""
+
+NAMED = 10
+"""Most photographs that a line names."""
+
+
+def photographs_in(source: Path) -> list[Path]:
+    """Pictures in a folder and the folders in it, or in its folder `images`; none if it is none."""
+    root = source / "images" if (source / "images").is_dir() else source
+    paths = [path for path in root.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES]
+    return sorted((path for path in paths if path.is_file()), key=natural)
+
+
+def read_photographs(source: Path, paths: Sequence[Path], folder: Path) -> Source:
+    """Poses, lenses and points of photographs, of the largest part that hangs together.
+
+    folder: for matches, which a later call continues. With GPS in their EXIF that fits, the world
+    is in metres, +Y north and +Z up. Raises InputError if fewer than FEWEST can be placed.
+    """
+    import pycolmap
+
+    paths, dropped = _usable(paths)
+    if len(paths) < FEWEST:
+        raise InputError(
+            f"{source}: holds {len(paths)} photographs that can be used; take at least {FEWEST}, "
+            f"better 20, that overlap{_and_names(dropped)}"
+        )
+    matcher = Matcher(paths, folder)
+    matcher.match(_pairs(len(paths)))
+    models = _models(matcher, len(paths))
+    with closing(pycolmap.Database.open(matcher.database)) as database:
+        numbers = {image.name: image.image_id for image in database.read_all_images()}
+        files = {
+            numbers[name]: (path.relative_to(source).as_posix(), path)
+            for name, path in zip(matcher.names, paths, strict=True)
+            if name in numbers
+        }
+        why = _reasons(database, files, models)
+        if not models:
+            raise InputError(
+                f"{source}: none of {len(paths)} photographs can be placed; take sharp ones, each "
+                f"of which shows most of what the one before shows{_and_names(why | dropped)}"
+            )
+        georeferenced = _to_gps(models[0], database)
+    found = source_of(models[0], files, f"{source}: photograph", KIND)
+    shots = [_turned(shot) for shot in found.shots]
+    why |= dropped
+    lines = (f"left out {names}" for names in _by_reason(why))
+    left_out = Counter(why.values())
+    result = replace(found, shots=shots, left_out=left_out, notes=tuple(lines))
+    if georeferenced is None:
+        return result
+    note = (
+        f"GPS gives scale and place: `--origin {georeferenced}` of `mgs suggest` is that of the "
+        "world's 0"
+    )
+    return replace(result, up=PLUS_Z, unit="m", notes=(*result.notes, note))
+
+
+def _usable(paths: Sequence[Path]) -> tuple[list[Path], dict[str, str]]:
+    """Photographs that can be read and are no copies, and why the others are left out, by name."""
+    usable, dropped, seen = [], dict[str, str](), dict[str, str]()
+    for path in paths:
+        try:
+            image_size(path)
+        except InputError:
+            dropped[path.name] = "that cannot be read"
+            continue
+        copy = hashlib.sha256(path.read_bytes()).hexdigest()
+        if copy in seen:
+            dropped[path.name] = "that are copies of others"
+            continue
+        seen[copy] = path.name
+        usable.append(path)
+    return usable, dropped
+
+
+def _pairs(count: int) -> list[tuple[int, int]]:
+    """Pairs of photographs to match."""
+    steps = list(range(1, count))
+    if count > EXHAUSTIVE:
+        steps = [*range(1, NEAR + 1), *(2**k for k in range(4, count.bit_length()))]
+    return [(one, one + step) for step in steps for one in range(count - step)]
+
+
+def _models(matcher: Matcher, count: int) -> list[Any]:
+    """Reconstructions of the photographs, the largest first; those of a call before, if any."""
+    import pycolmap
+
+    folder = matcher.folder / "models"
+    if not (folder / "done").is_file():
+        folder.mkdir(exist_ok=True)
+        options = pycolmap.IncrementalPipelineOptions(
+            min_model_size=FEWEST, extract_colors=False, random_seed=0
+        )
+        options.mapper.random_seed = options.triangulation.random_seed = 0
+        placed = iter(range(2, count * options.max_num_models))
+        report("placing photographs", 0, count)
+        pycolmap.incremental_mapping(
+            matcher.database,
+            matcher.folder,
+            folder,
+            options=options,
+            next_image_callback=lambda: report(
+                "placing photographs", min(next(placed), count), count
+            ),
+        )
+        (folder / "done").touch()
+    models = [pycolmap.Reconstruction(path) for path in sorted(folder.iterdir()) if path.is_dir()]
+    models = [model for model in models if model.num_reg_images() >= FEWEST]
+    return sorted(models, key=lambda model: -model.num_reg_images())
+
+
+def _reasons(
+    database: Any, files: dict[int, tuple[str, Path]], models: Sequence[Any]
+) -> dict[str, str]:
+    """Reason why each photograph is not in the first model, by its name."""
+    pairs, matches = database.read_two_view_geometry_num_inliers()
+    import pycolmap
+
+    overlapping = set()
+    for pair, number in zip(pairs, matches, strict=True):
+        if number >= LEAST_MATCHES:
+            overlapping |= set(pycolmap.pair_id_to_image_pair(pair))
+    placed = [
+        {image.image_id for image in model.images.values() if image.has_pose} for model in models
+    ]
+    why = {}
+    for number, (name, _) in files.items():
+        if placed and number in placed[0]:
+            continue
+        if any(number in others for others in placed[1:]):
+            why[name] = "of another scene, or of a part that nothing joins to the largest"
+        elif database.num_keypoints_for_image(number) < LEAST_FEATURES:
+            why[name] = "that are blurred or blank"
+        elif number not in overlapping:
+            why[name] = "that overlap with no other"
+        else:
+            why[name] = "that share too few points with those placed"
+    return why
+
+
+def _by_reason(why: dict[str, str]) -> list[str]:
+    """Names of photographs, at most NAMED, with the reason they have in common."""
+    lines = []
+    for reason in dict.fromkeys(why.values()):
+        names = [name for name, own in why.items() if own == reason]
+        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+        lines.append(f"{', '.join(names[:NAMED])}{more}, {reason}")
+    return lines
+
+
+def _and_names(why: dict[str, str]) -> str:
+    return "".join(f"; {line}" for line in _by_reason(why))
+
+
+def _turned(shot: Shot) -> Shot:
+    """Shot whose camera is that of the picture turned by its EXIF orientation."""
+    return replace(shot, turned=True) if exif_orientation(shot.image) > 1 else shot
+
+
+def _to_gps(model: Any, database: Any) -> str | None:
+    """Move a reconstruction to metres east, north and up of its first camera by the GPS positions
+    in EXIF; latitude, longitude and altitude of that, or None where they do not fit."""
+    import pycolmap
+
+    wgs84 = pycolmap.PosePriorCoordinateSystem.WGS84
+    places = {
+        prior.corr_data_id.id: prior.position.ravel()
+        for prior in database.read_all_pose_priors()
+        if prior.coordinate_system == wgs84 and np.isfinite(prior.position).all()
+    }
+    images = [image for image in model.images.values() if image.has_pose]
+    images = [image for image in images if image.image_id in places]
+    if len(images) < FEWEST:
+        return None
+    geodetic = np.stack([places[image.image_id] for image in images])
+    first = geodetic[0]
+    metres = pycolmap.GPSTransform().ellipsoid_to_enu(geodetic, *first)
+    eyes = np.stack([image.projection_center() for image in images])
+    extent = float(np.linalg.norm(np.ptp(metres, axis=0)))
+    spread = np.linalg.svd(metres - metres.mean(0), compute_uv=False)
+    if extent == 0 or spread[1] < GPS_ERROR * spread[0]:  # on a line, which may turn about itself
+        return None
+    options = pycolmap.RANSACOptions(max_error=GPS_ERROR * extent, random_seed=0)
+    found = pycolmap.estimate_sim3d_robust(eyes, metres, options)
+    if found is None:
+        return None
+    similarity = found["tgt_from_src"] if isinstance(found, dict) else found
+    moved = np.stack([similarity * eye for eye in eyes])
+    if np.median(np.linalg.norm(moved - metres, axis=1)) > GPS_ERROR * extent:
+        return None
+    model.transform(similarity)
+    return ",".join(f"{value:.8g}" for value in first)

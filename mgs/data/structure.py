@@ -1,0 +1,226 @@
+"""Structure from motion by pycolmap: matches between pictures, points at known poses, and poses of
+photographs alone.
+
+Random numbers have fixed seeds. Threads work in any order, so poses of photographs repeat to their
+accuracy, not bit for bit.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mgs.camera import Camera
+from mgs.data.clouds import SparseCloud
+from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame
+from mgs.data.lens import Lens
+from mgs.files import read_json, write_json
+from mgs.images import exif_orientation, unlimited_headers
+from mgs.progress import report
+
+WIDEST = 1000
+"""Longer side, pixels, to which larger pictures are reduced for features."""
+
+FEATURES = 4096
+"""Most features of a picture."""
+
+PICTURES_AT_ONCE, PAIRS_AT_ONCE = 8, 64
+"""Pictures and pairs of one call of pycolmap, after which progress is reported."""
+
+ALIKE = 16
+"""Pictures that each is matched with where poses are known: the most alike by pose."""
+
+CLOUD = "sparse.ply"
+"""File of a dataset with its triangulated points."""
+
+LEAST_POINTS = 100
+"""Fewest triangulated points from which a fit can start."""
+
+
+class Matcher:
+    """Features and matches of pictures, kept in a database of COLMAP.
+
+    pictures: files. cameras: of pycolmap, one for each picture, by default as EXIF says; equal ones
+    are taken as one camera.
+    folder: of the database, which a later Matcher of the same pictures continues.
+    """
+
+    def __init__(self, pictures: Sequence[Path], folder: Path, cameras: Sequence[Any] = ()) -> None:
+        import PIL.Image  # noqa: F401  # after pycolmap, writing a PNG would crash in its zlib
+        import pycolmap
+
+        pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+        self.folder, self.database = folder, folder / "database.db"
+        # Names of any characters become plain ones.
+        self.names = [f"{place:06d}{path.suffix}" for place, path in enumerate(pictures)]
+        about = [[str(path.resolve()), path.stat().st_mtime_ns] for path in pictures]
+        record = folder / "pictures.json"
+        if not record.is_file() or read_json(record) != about:
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+            for name, path in zip(self.names, pictures, strict=True):
+                _link_upright(path, folder / name)
+            write_json(record, about)
+        reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+        self.cameras = cameras or [
+            pycolmap.infer_camera_from_image(folder / name, reader) for name in self.names
+        ]
+
+    @classmethod
+    def of_frames(cls, frames: Sequence[Frame], folder: Path) -> Matcher:
+        """Matcher of the images of a dataset."""
+        cameras = []
+        for camera in (frame.camera for frame in frames):
+            K = camera.K
+            lens = Lens("PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+            cameras.append(lens.camera(camera.width, camera.height))
+        return cls([frame.image_path for frame in frames], folder, cameras)
+
+    def match(self, pairs: Iterable[tuple[int, int]]) -> None:
+        """Match pairs of pictures, given by their places; what is matched already is not again."""
+        import pycolmap
+
+        every = sorted({(min(pair), max(pair)) for pair in pairs})
+        self._extract(sorted({place for pair in every for place in pair}))
+        options, listed = pycolmap.TwoViewGeometryOptions(), self.folder / "pairs.txt"
+        options.ransac.random_seed = 0
+        for start in range(0, len(every), PAIRS_AT_ONCE):
+            report("matching pictures", start, len(every))
+            lines = [
+                f"{self.names[one]} {self.names[other]}\n"
+                for one, other in every[start : start + PAIRS_AT_ONCE]
+            ]
+            listed.write_text("".join(lines), encoding="utf-8")
+            pycolmap.match_image_pairs(
+                self.database,
+                pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
+                verification_options=options,
+            )
+
+    def _extract(self, places: Sequence[int]) -> None:
+        """Find the features of pictures that have none yet."""
+        import pycolmap
+
+        groups = defaultdict[str, list[int]](list)
+        numbers = dict[str, int]()
+        with closing(pycolmap.Database.open(self.database)) as database:
+            known = {image.name for image in database.read_all_images()}
+            for place in places:
+                if self.names[place] not in known:
+                    groups[str(self.cameras[place].todict())].append(place)
+            for key, members in groups.items():
+                numbers[key] = database.write_camera(self.cameras[members[0]])
+        options = pycolmap.FeatureExtractionOptions(max_image_size=WIDEST)
+        options.sift.max_num_features = FEATURES
+        done, total = 0, sum(map(len, groups.values()))
+        for key, members in groups.items():
+            reader = pycolmap.ImageReaderOptions(existing_camera_id=numbers[key])
+            for start in range(0, len(members), PICTURES_AT_ONCE):
+                report("features of pictures", done, total)
+                some = members[start : start + PICTURES_AT_ONCE]
+                pycolmap.extract_features(
+                    self.database,
+                    self.folder,
+                    image_names=[self.names[place] for place in some],
+                    reader_options=reader,
+                    extraction_options=options,
+                )
+                done += len(some)
+
+    def between(self, one: int, other: int) -> tuple[np.ndarray, np.ndarray, int]:
+        """Pixels [N,2] of the same points in two pictures that one epipolar geometry explains, and
+        the number of all matches."""
+        import pycolmap
+
+        with closing(pycolmap.Database.open(self.database)) as database:
+            images = [database.read_image_with_name(self.names[place]) for place in (one, other)]
+            a, b = (image.image_id for image in images if image)
+            pairs = database.read_two_view_geometry(a, b).inlier_matches
+            pixels = (database.read_keypoints(number)[:, :2] for number in (a, b))
+            first, second = (np.asarray(points, np.float64) for points in pixels)
+            return first[pairs[:, 0]], second[pairs[:, 1]], len(database.read_matches(a, b))
+
+    def triangulated(self, cameras: Sequence[Camera]) -> SparseCloud | None:
+        """Points of the matches at the poses of cameras; None if they are under LEAST_POINTS."""
+        import pycolmap
+
+        self.match(alike(cameras))
+        report("triangulating", 0, 0)
+        model = pycolmap.Reconstruction()
+        with closing(pycolmap.Database.open(self.database)) as database:
+            for lens in database.read_all_cameras():
+                model.add_camera_with_trivial_rig(lens)
+            for name, camera in zip(self.names, cameras, strict=True):
+                if image := database.read_image_with_name(name):
+                    pose = pycolmap.Rigid3d(camera.world_to_camera[:3])
+                    model.add_image_with_trivial_frame(image, pose)
+        options = pycolmap.IncrementalPipelineOptions(extract_colors=False, random_seed=0)
+        options.triangulation.random_seed = 0
+        result = pycolmap.triangulate_points(
+            model, self.database, self.folder, self.folder, options=options
+        )
+        cloud = cloud_of(result)
+        return cloud if cloud is not None and len(cloud.points) >= LEAST_POINTS else None
+
+
+def _link_upright(path: Path, link: Path) -> None:
+    """Link a picture, or write it turned by its EXIF orientation, with its other EXIF data."""
+    from PIL import Image, ImageOps
+
+    if exif_orientation(path) == 1:
+        link.symlink_to(path.resolve())
+        return
+    with unlimited_headers(), Image.open(path) as image:
+        upright = ImageOps.exif_transpose(image)
+        upright.save(link, exif=upright.getexif(), quality=95)
+
+
+def lacks_points(dataset: Dataset) -> bool:
+    """Whether nothing in a dataset says where its surfaces are: no points, depth or masks."""
+    shaped = any(frame.depth_path or frame.mask_path or frame.rock_path for frame in dataset.frames)
+    return not shaped and not (dataset.root / CLOUD).is_file()
+
+
+def alike(cameras: Sequence[Camera]) -> set[tuple[int, int]]:
+    """Pairs of places of each camera and the ALIKE that are nearest to it by distance, over the
+    extent of all, plus the angle between their axes, radians."""
+    eyes = np.stack([camera.position for camera in cameras])
+    axes = np.stack([camera.world_to_camera[2, :3] for camera in cameras])
+    extent = max(float(np.ptp(eyes, axis=0).max()), 1e-12)
+    pairs = set()
+    for place in range(len(cameras)):
+        away = np.linalg.norm(eyes - eyes[place], axis=1) / extent
+        away += np.arccos(np.clip(axes @ axes[place], -1, 1))
+        away[place] = np.inf
+        nearest = np.argsort(away, kind="stable")[: min(ALIKE, len(cameras) - 1)]
+        pairs |= {(min(place, other), max(place, other)) for other in nearest.tolist()}
+    return pairs
+
+
+def cloud_of(reconstruction: Any) -> SparseCloud | None:
+    """Triangulated points that some image saw. COLMAP writes -1 for an unknown error."""
+    centres = {
+        image.image_id: image.projection_center() for image in reconstruction.images.values()
+    }
+    points, views, tracks, errors = [], [], [], []
+    for point in reconstruction.points3D.values():
+        seen = {element.image_id for element in point.track.elements}
+        if seen:
+            rays = np.stack([centres[image] for image in seen]) - point.xyz
+            points.append(point.xyz)
+            views.append((rays / np.linalg.norm(rays, axis=1, keepdims=True)).mean(0))
+            tracks.append(float(len(seen)))
+            errors.append(point.error)
+    if not points:
+        return None
+    directions, error = np.stack(views), np.array(errors)
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+    known = error if (error >= 0).all() else None
+    return SparseCloud(np.stack(points), directions, np.array(tracks), known)

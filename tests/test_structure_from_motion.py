@@ -1,0 +1,190 @@
+"""Points triangulated at given poses, and poses of photographs alone, against the truth."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import synthetic
+from PIL import ExifTags, Image
+from program import command, exit_code, said
+from scipy.ndimage import map_coordinates
+
+from mgs.camera import Camera, look_at
+from mgs.data.clouds import read_cloud
+from mgs.data.dataset import load_dataset, write_transforms
+from mgs.data.frames import Frame
+from mgs.data.importers import import_source
+from mgs.data.sources import read_source
+from mgs.errors import InputError
+from mgs.images import write_png
+
+WIDTH, HEIGHT = 320, 240
+
+
+def views(root, cameras, seed=0):
+    """Frames that show the rock and its ground, with a texture of noise."""
+    rng, frames = np.random.default_rng(seed), []
+    noise = [rng.random((40, 40, 40)) for _ in range(2)]
+    for k, camera in enumerate(cameras):
+        depth, _, points = synthetic.cast(camera, [(synthetic.CENTRE, synthetic.AXES)])
+        grey = sum(
+            map_coordinates(grid, step * points.reshape(-1, 3).T, order=1, mode="grid-wrap")
+            for grid, step in zip(noise, (8, 25), strict=True)
+        ).reshape(depth.shape)
+        path = root / f"images/view {k:02d}.png"
+        pixels = np.where(depth > 0, grey / 2, 0)
+        write_png(path, np.repeat(pixels[..., None], 3, -1).astype(np.float32), linear=False)
+        frames.append(Frame(path.stem, camera, float(k), path))
+    return frames
+
+
+def arc(count, step=8.0):
+    """Cameras on an arc about the rock, `step` degrees apart, at two heights."""
+    K = np.array([[1.1 * WIDTH, 0, WIDTH / 2], [0, 1.1 * WIDTH, HEIGHT / 2], [0, 0, 1]])
+    angles = np.radians(step * np.arange(count))
+    eyes = [[2.6 * np.cos(a), 2.6 * np.sin(a), 1.2 + 0.4 * (k % 2)] for k, a in enumerate(angles)]
+    return [Camera(K, WIDTH, HEIGHT, look_at(eye, synthetic.CENTRE)) for eye in eyes]
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    return views(tmp_path_factory.mktemp("views"), arc(12))
+
+
+def distances(points):
+    """Distance of each point [N,3] from the ground or the rock."""
+    return np.minimum(np.abs(points[:, 2]), np.abs(synthetic.level(points)) * synthetic.AXES.min())
+
+
+def test_poses_without_points_get_them(frames, tmp_path, capsys):
+    root = frames[0].image_path.parent.parent
+    write_transforms(root, frames)
+    command("import", root, "--out", tmp_path / "d")
+    assert "points with a reprojection error of 0." in said(capsys)[0]
+    points = read_cloud(tmp_path / "d/sparse.ply").points
+    assert len(points) > 300
+    assert np.median(distances(points)) < 0.005
+
+
+def test_wrong_poses_get_no_points(frames, tmp_path, capsys):
+    root = frames[0].image_path.parent.parent
+    shuffled = [frames[(5 * k) % 12].camera for k in range(12)]
+    write_transforms(root, [replace(f, camera=c) for f, c in zip(frames, shuffled, strict=True)])
+    command("import", root, "--out", tmp_path / "d")
+    assert "do not belong to these pictures" in said(capsys)[1]
+    assert not (tmp_path / "d/sparse.ply").exists()
+
+
+def test_pictures_without_texture_get_no_points(tmp_path):
+    frames = synthetic.write_dataset(tmp_path / "plain", depth=False).frames
+    write_transforms(tmp_path / "plain", [replace(frame, mask_path=None) for frame in frames])
+    command("import", tmp_path / "plain", "--out", tmp_path / "d")
+    assert not (tmp_path / "d/sparse.ply").exists()
+    assert len(load_dataset(tmp_path / "d")) == len(frames)
+
+
+@pytest.fixture(scope="module")
+def placed(frames, tmp_path_factory):
+    """Import of the same pictures as JPEG without poses: one lies on its side and says so in its
+    EXIF, all have GPS, and there are a copy, a blank one and one that is cut off."""
+    root = tmp_path_factory.mktemp("photographs") / "photos"
+    root.mkdir()
+    for k, frame in enumerate(frames):
+        image = Image.open(frame.image_path)
+        exif = image.getexif()
+        east, north, up = frame.camera.position
+        gps = exif.get_ifd(ExifTags.IFD.GPSInfo)
+        gps.update({1: "N", 2: degrees(48 + north / 111_320), 3: "E", 5: b"\0", 6: float(up + 10)})
+        gps[4] = degrees(11 + east / (111_320 * np.cos(np.radians(48))))
+        if k == 3:
+            exif[ExifTags.Base.Orientation] = 6
+            image = image.transpose(Image.Transpose.ROTATE_90)
+        image.save(root / f"{frame.name}.jpg", exif=exif, quality=98)
+    shutil.copy(root / "view 00.jpg", root / "z copy.jpg")
+    Image.new("RGB", (WIDTH, HEIGHT), "grey").save(root / "blank.jpg")
+    (root / "cut off.jpg").write_bytes((root / "view 01.jpg").read_bytes()[:100])
+    source = read_source(root, unpack=root.parent / "again")
+    return import_source(read_source(root), root.parent / "d"), source
+
+
+def degrees(value):
+    """Degrees, minutes and seconds of EXIF."""
+    minutes = 60 * (value % 1)
+    return (float(int(value)), float(int(minutes)), 60 * (minutes % 1))
+
+
+def test_photographs_alone_get_their_poses_in_metres(frames, placed):
+    found, source = placed
+    true = {frame.name: frame.camera for frame in frames}
+    assert sorted(frame.name for frame in found.frames) == sorted(true)
+    assert (source.unit, source.up) == ("m", (0, 0, 1))
+    offsets, angles = [], []
+    middle = np.mean([camera.position for camera in true.values()], axis=0)
+    centre = np.mean([frame.camera.position for frame in found.frames], axis=0)
+    for frame in found.frames:
+        camera = true[frame.name]
+        offsets.append((frame.camera.position - centre) - (camera.position - middle))
+        turn = frame.camera.world_to_camera[:3, :3] @ camera.world_to_camera[:3, :3].T
+        angles.append(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
+    assert np.median(np.linalg.norm(offsets, axis=1)) < 0.03
+    assert np.median(angles) < 0.5
+
+
+def test_poses_of_photographs_repeat(placed):
+    for frame, shot in zip(placed[0].frames, placed[1].shots, strict=True):
+        poses = frame.camera.world_to_camera, shot.camera.world_to_camera
+        assert np.allclose(*poses, atol=0.01)
+
+
+def test_photographs_that_are_left_out_are_named_with_the_reason(placed):
+    assert sum(placed[1].left_out.values()) == 3
+    notes = " ".join(placed[1].notes)
+    for name, why in {"z copy": "copies", "blank": "blurred", "cut off": "cannot be read"}.items():
+        assert f"{name}.jpg, that" in notes
+        assert why in notes
+
+
+def test_a_distance_gives_the_scale(placed):
+    scaled = placed[1].with_distance("view 00.jpg, view 06.jpg, 10")
+    eyes = {shot.name: shot.camera.position for shot in scaled.shots}
+    assert np.linalg.norm(eyes["view 00"] - eyes["view 06"]) == pytest.approx(10)
+    for wrong in ("view 00.jpg,10", "view 00.jpg,other,10", "view 00.jpg,view 01.jpg,0"):
+        with pytest.raises(InputError, match="distance"):
+            placed[1].with_distance(wrong)
+
+
+@pytest.mark.parametrize("case", ["one", "apart", "file", "none"])
+def test_photographs_that_cannot_be_placed_are_refused(case, frames, tmp_path, capsys):
+    root = tmp_path / "photos"
+    root.mkdir()
+    picked = {"one": frames[:1], "file": frames[:1], "none": [], "apart": frames[::6]}[case]
+    for frame in picked:
+        shutil.copy(frame.image_path, root)
+    if case == "apart":
+        noise = np.random.default_rng(1).random((2, HEIGHT, WIDTH, 3)).astype(np.float32)
+        for k, pixels in enumerate(noise):
+            write_png(root / f"noise{k}.png", pixels)
+    source = root / frames[0].image_path.name if case == "file" else root
+    assert exit_code("import", source, "--out", tmp_path / "d") == 2
+    words = {"one": "holds 1 photo", "apart": "can be placed", "file": "the folder of all"}
+    assert words.get(case, "holds no photographs") in said(capsys)[1]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]
+
+
+def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, monkeypatch):
+    root = frames[0].image_path.parent
+    out, matches = tmp_path / "d", tmp_path / "d.unpacked/matches/database.db"
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("pycolmap.incremental_mapping", stop)
+        assert exit_code("import", root, "--out", out) == 130
+    written = matches.stat().st_size
+    assert written > 100_000
+    monkeypatch.setattr("pycolmap.extract_features", stop)
+    command("import", root, "--out", out)
+    assert len(load_dataset(out)) == len(frames)
+    assert not (tmp_path / "d.unpacked").exists()
