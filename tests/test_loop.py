@@ -25,6 +25,18 @@ def test_a_loop_in_memory_gives_the_same_views_and_gaussians(dataset, prior, tmp
     assert state.gaussians == whole.gaussians
 
 
+def test_a_run_from_a_prior_in_memory_goes_on_from_its_folder(dataset, tmp_path):
+    """Points of files are float32: a run takes its prior as its folder holds it."""
+    model = mgs.ModelSettings(train={"passes": 3})
+    scene = mgs.Scene(mgs.load_dataset(dataset), mgs.build_prior(dataset, gaussians=300), model)
+    for budget, out in ((1, "short"), (2, "whole")):
+        mgs.nbv(scene, mgs.Uniform(), out=tmp_path / out, seeds=3, budget=budget)
+    config = tmp_path / "short/config.json"
+    config.write_text(config.read_text().replace('"budget": 1', '"budget": 2'))
+    again = mgs.resume_nbv(tmp_path / "short").state
+    assert again.gaussians == mgs.open_run(tmp_path / "whole").state.gaussians
+
+
 def test_a_run_that_blends_srgb(dataset, prior, tmp_path):
     """Pictures and PSNR are like those of a linear run; its PLY says that it holds sRGB."""
     views, errors = {}, {}

@@ -168,10 +168,10 @@ def start_run(
     mission = _settings(dataset, policy, settings | paths)
     rule = policy_of(policy)  # a user's policy fails here, before there is a folder
     check_settings(mission, len(dataset))
-    known: Any = load_prior(folder) if folder else prior
+    stored = load_prior(folder) if folder else None
     inputs = [path for path in (root, folder) if path]
     with atomic_folder(out, Ours(FILES, inputs) if holds_run(out) else None) as unfinished:
-        surface = known or build_prior(
+        surface: Any = stored or prior or build_prior(
             dataset.survey(),
             PriorSettings(gaussians=gaussians, seed=mission.seed),
             source=source,
@@ -190,7 +190,7 @@ def start_run(
         start(unfinished, mission, dataset)
         if not isinstance(policy, str):
             (unfinished / POLICY_SOURCE).write_text(source_of(policy), encoding="utf-8")
-    return Run(out, mission, dataset if live is None else None, known, policy)
+    return Run(out, mission, dataset if live is None else None, stored, policy)
 
 
 def start_fit(
