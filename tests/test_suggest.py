@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,7 +17,8 @@ import mgs
 from mgs.camera import Camera, heading_and_pitch, look_at
 from mgs.data import flight_plan
 from mgs.data.dataset import load_cameras, load_dataset
-from mgs.data.world import World
+from mgs.data.world import World, unit_up
+from mgs.reports.suggestion import write_suggestion
 from mgs.run.candidates import Site, inside, place_poses, read_poses
 from mgs.run.folder import open_run
 from mgs.run.suggest import coarse_prior, suggest
@@ -191,6 +193,24 @@ def test_poses_of_a_csv(site, tmp_path):
     np.testing.assert_allclose(
         third.camera_to_world[:3], np.eye(4)[:3] + [[0, 0, 0, k] for k in (1, 2, 3)]
     )
+
+
+def test_poses_leave_and_come_in_the_coordinates_of_the_data(run, site, tmp_path, monkeypatch):
+    """A world whose origin was moved."""
+    opened, far = open_run(run), np.array([448262.0, 5411932, 412])
+    world = World(unit_up([0.3, -0.8, 0.2]), "m", tuple(far))
+    camera = site.camera([1.4, -1.8, 1.2])
+    found, written = suggest(opened, [("a", camera)]), []
+    for k, one in enumerate((world.home, world)):
+        (tmp_path / str(k)).mkdir()
+        monkeypatch.setattr(opened, "dataset", replace(opened.dataset, world=one))
+        write_suggestion(tmp_path / str(k), opened, found)
+        written.append(load_cameras(tmp_path / f"{k}/transforms.json")[0][1].position)
+    np.testing.assert_allclose(written[1] - written[0], far, atol=1e-6)
+    site = Site(site.prior, site.like, world)
+    for k in (0, 1):
+        ((_, back),) = read_poses(tmp_path / f"{k}/transforms.json", site)
+        np.testing.assert_allclose(back.world_to_camera, camera.world_to_camera, atol=1e-6)
 
 
 def test_points_inside_a_mesh_with_a_hole(site):

@@ -161,8 +161,8 @@ def _advice(source: Source, result: Dataset) -> Iterator[str]:
     if any(source.origin):
         yield (
             "the cameras are far from the origin, where float32 is coarse: "
-            f"{_numbers(source.origin)} is the origin now, from which all positions count; exports "
-            "add it again, and `mgs suggest --origin` is its latitude and longitude"
+            f"{_numbers(source.origin)} is the origin now; exports and suggested poses add it "
+            "again, and a flight plan needs its latitude and longitude as `mgs suggest --origin`"
         )
     some = result.frames[:: max(1, len(result) // 10)]
     masks = [frame.mask() for frame in some if frame.mask_path]

@@ -54,6 +54,15 @@ class World:
         """Turn a camera, or points or directions [N,3], back into this world."""
         return self._turned(thing, self.turn.T)
 
+    def whole(self, camera: Camera) -> Camera:
+        """Upright camera counted from the origin of the imported data, to be written in `home`."""
+        return camera.seen_from(self.enter(np.negative(self.origin)))
+
+    @property
+    def home(self) -> World:
+        """This world without an origin that was moved."""
+        return World(self.up, self.unit)
+
     def _turned(self, thing: Thing, turn: np.ndarray) -> Thing:
         if self.up == PLUS_Z:
             return thing

@@ -43,12 +43,11 @@ def write_views(out: Path, run: Run, kind: str, every: bool = False) -> str:
     if every:
         frames = list(run.dataset.with_images([frame.name for frame in frames]))
     points = _points(as_imported(run, run.gaussians))
-    back, world = world.enter(np.negative(world.origin)).tolist(), World(world.up, world.unit)
-    frames = [replace(frame, camera=frame.camera.seen_from(back)) for frame in frames]
+    frames = [replace(frame, camera=world.whole(frame.camera)) for frame in frames]
     if kind == "nerfstudio":
-        _write_nerfstudio(out, frames, points, world)
+        _write_nerfstudio(out, frames, points, world.home)
     else:
-        _write_colmap(out, frames, points, world)
+        _write_colmap(out, frames, points, world.home)
     masks = sum(frame.mask_path is not None or frame.rock_path is not None for frame in frames)
     return f"{len(frames)} views, {masks} masks and {len(points):,} points"
 

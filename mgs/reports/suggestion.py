@@ -32,15 +32,16 @@ MOST_PICTURES, PICTURE_WIDTH = 6, 200
 def write_suggestion(out: Path, run: Run, suggestion: Suggestion) -> None:
     """Write suggestions.json, transforms.json and suggestions.png into the folder `out`.
 
-    transforms.json is a dataset of the planned poses in flying order; their pictures belong in
-    images/. Raises InputError if a file cannot be written.
+    transforms.json is a dataset of the planned poses in flying order, in the coordinates of the
+    data that was imported; their pictures belong in images/. Raises InputError if a file cannot be
+    written.
     """
     write_json(out / "suggestions.json", numbers(run, suggestion))
-    frames = [
-        Frame(view.name, view.camera, float(k), out / f"images/{view.name}.png", on_demand=True)
-        for k, view in enumerate(suggestion.plan)
-    ]
-    write_transforms(out, frames, run.dataset.world, {"convention": CONVENTION})
+    world, frames = run.dataset.world, []
+    for k, view in enumerate(suggestion.plan):
+        image = out / f"images/{view.name}.png"
+        frames.append(Frame(view.name, world.whole(view.camera), float(k), image, on_demand=True))
+    write_transforms(out, frames, world.home, {"convention": CONVENTION})
     draw_suggestion(out / "suggestions.png", run, suggestion)
 
 
@@ -77,7 +78,7 @@ def _certificate(suggestion: Suggestion) -> dict[str, Any] | None:
 
 def _record(view: View, world: World) -> dict[str, Any]:
     values = {key: value for key, value in asdict(view).items() if key != "camera"}
-    pose = opengl_from_opencv(world.leave(view.camera).world_to_camera)
+    pose = opengl_from_opencv(world.leave(world.whole(view.camera)).world_to_camera)
     return values | {"transform_matrix": pose.tolist()}
 
 

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mgs.camera import Camera, look_at
+from mgs.data.clouds import towards
 from mgs.data.dataset import load_cameras
 from mgs.data.meshes import Mesh, distances_to_mesh
-from mgs.data.world import UPRIGHT, World
+from mgs.data.world import UPRIGHT, Thing, World
 from mgs.errors import InputError
 from mgs.files import read_csv
 from mgs.prior.build import Prior
@@ -59,6 +60,15 @@ class Site:
         pose = look_at(eye, self.centre if target is None else target)
         return Camera(self.like.K, self.like.width, self.like.height, pose)
 
+    def enter(self, thing: Thing) -> Thing:
+        """`World.enter` of a camera or a point [3], counted from the dataset's origin or from that
+        of the imported data (`towards`)."""
+        point = thing.position if isinstance(thing, Camera) else thing
+        shift = point - towards(point[None], self.world.origin)[0]
+        if shift.any():
+            thing = thing.seen_from(shift) if isinstance(thing, Camera) else thing - shift
+        return self.world.enter(thing)
+
 
 def read_poses(path: str | Path, site: Site) -> list[Named]:
     """Poses of a transforms.json, or of a CSV with the columns x, y, z, and optionally name, a
@@ -72,7 +82,7 @@ def read_poses(path: str | Path, site: Site) -> list[Named]:
         poses = _read_csv(path, site)
     else:
         cameras = load_cameras(path, site.like)
-        poses = [(Path(name).stem, site.world.enter(camera)) for name, camera in cameras]
+        poses = [(Path(name).stem, site.enter(camera)) for name, camera in cameras]
     if len(poses) > MOST_POSES:
         raise InputError(f"{path}: lists {len(poses):,} poses, more than {MOST_POSES:,}; thin them")
     names = [name for name, _ in poses]
@@ -118,8 +128,9 @@ def _csv_pose(where: str, index: int, columns: list[str], row: list[str], site: 
     if "qw" not in numbers:
         target = np.array([numbers[key] for key in TARGET]) if "target_x" in numbers else None
         try:
-            enter = site.world.enter
-            return name, site.camera(enter(eye), None if target is None else enter(target))
+            return name, site.camera(
+                site.enter(eye), None if target is None else site.enter(target)
+            )
         except InputError:
             raise InputError(f"{where}: looks at its own position; correct it") from None
     quaternion = np.array([numbers[key] for key in QUATERNION])
@@ -129,7 +140,7 @@ def _csv_pose(where: str, index: int, columns: list[str], row: list[str], site: 
     pose[:3, :3] = rotmat_from_quat(quaternion).T
     pose[:3, 3] = -pose[:3, :3] @ eye
     camera = Camera(site.like.K, site.like.width, site.like.height, pose)
-    return name, site.world.enter(camera)
+    return name, site.enter(camera)
 
 
 def place_poses(
