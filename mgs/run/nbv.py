@@ -171,11 +171,15 @@ def start_run(
     stored = load_prior(folder) if folder else None
     inputs = [path for path in (root, folder) if path]
     with atomic_folder(out, Ours(FILES, inputs) if holds_run(out) else None) as unfinished:
-        surface: Any = stored or prior or build_prior(
-            dataset.survey(),
-            PriorSettings(gaussians=gaussians, seed=mission.seed),
-            source=source,
-            on_stage=lambda stage: progress(f"prior: {stage}", 0, 1),
+        surface: Any = (
+            stored
+            or prior
+            or build_prior(
+                dataset.survey(),
+                PriorSettings(gaussians=gaussians, seed=mission.seed),
+                source=source,
+                on_stage=lambda stage: progress(f"prior: {stage}", 0, 1),
+            )
         )
         if folder is None:
             save_prior(unfinished / "prior", surface)
