@@ -18,6 +18,8 @@ from mgs.data.importers import import_source
 from mgs.data.sources import read_source
 from mgs.errors import InputError
 from mgs.images import write_png
+from mgs.prior.build import build_prior
+from mgs.prior.photographs import check_photographs
 
 WIDTH, HEIGHT = 320, 240
 
@@ -65,6 +67,21 @@ def test_poses_without_points_get_them(frames, tmp_path, capsys):
     points = read_cloud(tmp_path / "d/sparse.ply").points
     assert len(points) > 300
     assert np.median(distances(points)) < 0.005
+
+
+def test_a_survey_that_looks_at_no_one_place_starts_from_its_points(tmp_path):
+    K = np.array([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]])
+    down = np.diag([1.0, -1, -1, 1])
+    eyes = [[0.3 * k - 1.7, 0.7 * (k % 2), 1.5] for k in range(12)]
+    poses = [down @ np.block([[np.eye(3), -np.array([eye]).T], [0, 0, 0, 1]]) for eye in eyes]
+    frames = views(tmp_path / "s", [Camera(K, WIDTH, HEIGHT, pose) for pose in poses])
+    write_transforms(tmp_path / "s", frames)
+    command("import", tmp_path / "s", "--out", tmp_path / "d", "--up", "0,0,1")
+    with pytest.raises(InputError, match="do not overlap"):
+        check_photographs(load_dataset(tmp_path / "d").frames, of_object=True)
+    prior = build_prior(tmp_path / "d", source="random")
+    assert prior.numbers["triangulated"] > 200
+    assert np.median(distances(prior.points[: prior.numbers["triangulated"]])) < 0.01
 
 
 def test_wrong_poses_get_no_points(frames, tmp_path, capsys):
@@ -134,7 +151,7 @@ def test_photographs_alone_get_their_poses_in_metres(frames, placed):
 def test_poses_of_photographs_repeat(placed):
     for frame, shot in zip(placed[0].frames, placed[1].shots, strict=True):
         poses = frame.camera.world_to_camera, shot.camera.world_to_camera
-        assert np.allclose(*poses, atol=0.01)
+        assert np.allclose(*poses, atol=1e-9, rtol=0)
 
 
 def test_photographs_that_are_left_out_are_named_with_the_reason(placed):

@@ -1,8 +1,8 @@
 """Structure from motion by pycolmap: matches between pictures, points at known poses, and poses of
 photographs alone.
 
-Random numbers have fixed seeds. Threads work in any order, so poses of photographs repeat to their
-accuracy, not bit for bit.
+Random numbers have fixed seeds, and pictures enter the database in order, so results repeat. Bundle
+adjustments of more than 50,000 observations use several threads, which sum in any order.
 """
 
 from __future__ import annotations
@@ -111,7 +111,11 @@ class Matcher:
         groups = defaultdict[str, list[int]](list)
         numbers = dict[str, int]()
         with closing(pycolmap.Database.open(self.database)) as database:
-            known = {image.name for image in database.read_all_images()}
+            known = {
+                image.name
+                for image in database.read_all_images()
+                if database.exists_keypoints(image.image_id)
+            }
             for place in places:
                 if self.names[place] not in known:
                     groups[str(self.cameras[place].todict())].append(place)
@@ -125,10 +129,13 @@ class Matcher:
             for start in range(0, len(members), PICTURES_AT_ONCE):
                 report("features of pictures", done, total)
                 some = members[start : start + PICTURES_AT_ONCE]
+                files = self.database, self.folder
+                names = [self.names[place] for place in some]
+                # First in the database in order, because threads would enter them in any.
+                pycolmap.import_images(*files, image_names=names, options=reader)
                 pycolmap.extract_features(
-                    self.database,
-                    self.folder,
-                    image_names=[self.names[place] for place in some],
+                    *files,
+                    image_names=names,
                     reader_options=reader,
                     extraction_options=options,
                 )

@@ -23,6 +23,7 @@ from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh, distances_to_mesh, mesh_of, read_mesh
+from mgs.data.structure import CLOUD
 from mgs.data.visibility import in_mask, visible
 from mgs.data.world import UPRIGHT, World, unit_up
 from mgs.errors import InputError
@@ -141,7 +142,8 @@ def prior_and_cloud(
     """
     chosen = source_of(dataset, source, points)
     if chosen != "depth":
-        check_photographs(dataset.frames)
+        whole = chosen == "random" and (dataset.root / CLOUD).is_file()
+        check_photographs(dataset.frames, of_object=not whole)
         check_masks(dataset.frames)
     if chosen == "random":
         return _random_prior(dataset, settings), None

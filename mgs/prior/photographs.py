@@ -80,13 +80,16 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
     raise InputError(f"{dataset.root}: has {missing}; {', or '.join(cures)}")
 
 
-def check_photographs(frames: Sequence[Frame]) -> None:
-    """Raise InputError for under LEAST_PHOTOGRAPHS, or cameras that do not look at one thing."""
+def check_photographs(frames: Sequence[Frame], of_object: bool) -> None:
+    """Raise InputError for under LEAST_PHOTOGRAPHS. of_object: also for cameras that do not look at
+    one thing. Whole scenes, such as rooms and surveys from the air, have none."""
     if len(frames) < LEAST_PHOTOGRAPHS:
         raise InputError(
             f"prior: {len(frames)} photographs without depth are too few; "
             f"take at least {LEAST_PHOTOGRAPHS}, from all sides"
         )
+    if not of_object:
+        return
     point = focus(frames).point[None]
     seen = [bool(in_image(frame.camera, *frame.camera.project(point))[0]) for frame in frames]
     if np.mean(seen) < LEAST_OVERLAP:

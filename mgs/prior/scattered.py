@@ -80,6 +80,8 @@ def scattered(
         kept.append(points[(views > 0) & (share >= MASK_SHARE)])
         drawn += count
     points = np.concatenate(kept)[:count]
+    if len(points) < count and len(given) and not masked:
+        count = len(points)  # few places near what the cameras look at are in a picture
     if len(points) < count:
         raise InputError(
             f"{dataset.root}: only {len(points)} of {drawn} random points lie inside all masks; "
