@@ -97,7 +97,7 @@ class Prior:
         return replace(turned, numbers=self.numbers | {"up": list(new.up)})
 
     def moved(self, change: Callable[[np.ndarray], np.ndarray]) -> Prior:
-        """The prior after a rotation: `change` of points or directions [N,3]."""
+        """The prior with `change` applied to its vertices, points and normals [N,3]."""
         mesh = replace(self.mesh, vertices=change(self.mesh.vertices))
         points, normals = change(self.points), change(self.normals)
         return replace(self, mesh=mesh, points=points, normals=normals)
@@ -183,7 +183,12 @@ def prior_and_cloud(
             samples, spacing, mesh, truth, dataset, segmented, settings.seed
         )
     prior = Prior(mesh, samples, normals, spacing, tolerance, numbers, sampled["backed"])
-    return prior, segmented
+    return prior.moved(_as_in_files), segmented
+
+
+def _as_in_files(values: np.ndarray) -> np.ndarray:
+    """Values as `save_prior` writes them: a prior in memory is the one that is read back."""
+    return values.astype(np.float32).astype(np.float64)
 
 
 def _place(dataset: Dataset) -> dict[str, Any]:
@@ -196,7 +201,7 @@ def _random_prior(dataset: Dataset, settings: PriorSettings) -> Prior:
     mesh, points, normals, spacing, numbers = scattered(dataset, settings)
     about = {"from": "random", "frames": len(dataset.frames), **_place(dataset)}
     tolerance = float(numbers["depth_tolerance"])
-    return Prior(mesh, points, normals, spacing, tolerance, about | numbers)
+    return Prior(mesh, points, normals, spacing, tolerance, about | numbers).moved(_as_in_files)
 
 
 def _depth_surface(
@@ -303,7 +308,8 @@ def prior_from_mesh(
         **_place(dataset or Dataset(Path(), ())),
         "settings": used,
     }
-    return Prior(mesh, points, normals, spacing, spacing, numbers, sampled["backed"])
+    prior = Prior(mesh, points, normals, spacing, spacing, numbers, sampled["backed"])
+    return prior.moved(_as_in_files)
 
 
 def outline_error(mesh: Mesh, frames: Sequence[Frame]) -> float:
