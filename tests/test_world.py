@@ -10,6 +10,7 @@ import pytest
 import synthetic
 import tiny
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from program import command
 
 import mgs
@@ -62,7 +63,7 @@ def test_the_orbit_of_a_tilted_world_is_drawn_as_that_of_the_upright_one(runs, d
     for run, length in zip(runs, ("1 m", "1 unit"), strict=True):
         report(run, tmp_path / "report")
         axis = drawn["orbit.png"].axes[0]
-        assert length in [text.get_text() for text in axis.texts]
+        assert length in [text.get_text() for text in axis.findobj(Text)]
         shown.append([np.asarray(points.get_offsets()) for points in axis.collections])
         assert len(shown[-1]) == 4
     for level, tilted in zip(*shown, strict=True):
