@@ -39,12 +39,13 @@ def opened(
     scheme: str = "light",
     known: Callable[[Any], bool] = lambda message: False,
     scripts: bool = True,
+    serve: Callable[[Any], None] | None = None,
 ) -> Iterator[tuple[Any, list[str]]]:
     """Open an address in a window of this size; yields the page and a list of what went wrong on
     it: console errors, exceptions, and requests to other hosts.
 
     known: whether a ConsoleMessage of playwright is an error to pass over. scripts: whether the
-    browser runs them.
+    browser runs them. serve: answers each request (a Route of playwright) in place of a server.
     """
     context = browser.new_context(
         viewport={"width": width, "height": height},
@@ -66,6 +67,8 @@ def opened(
     page.on("console", on_console)
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.on("request", on_request)
+    if serve is not None:
+        page.route("**/*", serve)
     page.set_default_timeout(200_000)  # the machine may be busy
     page.goto(address)
     try:
