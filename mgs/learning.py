@@ -11,15 +11,19 @@ from dataclasses import replace
 import numpy as np
 
 from mgs.data.frames import Frame
+from mgs.errors import InputError
 from mgs.fit.evidence import Images
 from mgs.fit.fitting import Fit
-from mgs.fit.settings import TrainSettings
+from mgs.fit.objective import objective
+from mgs.fit.poses import ALIKE, ROUND_PASSES, ROUNDS, pose_steps, tau
+from mgs.fit.settings import PoseNoise, TrainSettings
 from mgs.fit.stopping import DivergedError, StopReason
 from mgs.gaussians import Gaussians
 from mgs.policy.poses import azimuths
 from mgs.prior.initial import warm_start
 from mgs.progress import Stage, report
 from mgs.scene import Choice, Scene, State
+from mgs.splat import as_drjit
 
 
 def captured(scene: Scene, frames: tuple[Frame, ...], views: Sequence[int]) -> tuple[Frame, ...]:
@@ -82,6 +86,33 @@ def learn(
     state = State(frames, taken, seeds, fit.gaussians, H, H, fit=fit, exposure=exposure)
     surface = surface_information(scene, state, new, before)
     return replace(state, surface=surface, choices=tuple(choices))
+
+
+def refine_poses(scene: Scene, noise: PoseNoise) -> tuple[Frame, ...]:
+    """All frames with refined poses: fits and Gauss-Newton steps of the poses (`mgs.fit.poses`)
+    take turns. Raises InputError if a fit diverges or a frame cannot be read."""
+    given = frames = scene.frames
+    settings = scene.settings
+    train = settings.train.model_copy(update={"passes": ROUND_PASSES, "tolerance": 0.0})
+    cameras = [frame.camera for frame in given]
+    lam = (ALIKE * settings.pixel_noise / tau(noise, cameras, scene.centre)) ** 2
+    model = old = scene.start(frames)
+    for k in range(ROUNDS):
+        start = scene.start(frames)
+        model = warm_start(model, old, start)
+        gains = scene.measured_exposure(frames) if settings.exposure else None
+        fit = scene.fitted(model, frames, gains, train)
+        if fit.stop_reason == StopReason.DIVERGED:
+            raise InputError("refine_poses: a fit diverged; lower `train.rates`, or leave it out")
+        report("refining poses", k, ROUNDS)
+        model, old = fit.gaussians, start
+        cameras = [frame.camera for frame in frames]
+        targets, weight = scene.targets(frames, gains), train.alpha_weight
+        goal = objective(model, cameras, targets, cache=scene.cache, alpha_weight=weight)
+        moved = pose_steps(goal, as_drjit(model), [frame.camera for frame in given], lam)
+        pairs = zip(frames, moved, strict=True)
+        frames = tuple(replace(frame, camera=camera) for frame, camera in pairs)
+    return frames
 
 
 def information(scene: Scene, model: Gaussians, frames: Sequence[Frame]) -> np.ndarray:

@@ -58,7 +58,7 @@ def packages():
 def run(tmp_path_factory):
     """A small run of a rock whose colours have SH degree 1, with its exports."""
     root = tmp_path_factory.mktemp("viewers")
-    orbit = "--size 160x120 --orbit hemisphere --frames 8 --test-views 1".split()
+    orbit = ["--size", "160x120", "--orbit", "hemisphere", "--frames", "8", "--test-views", "1"]
     command("synth-orbit", root / "data", *orbit)
     command("fit", root / "data", "--out", root / "run", "--gaussians", 5000, "--sh", 1)
     command("eval", root / "run")
@@ -92,7 +92,7 @@ def test_a_viewer_shows_what_was_measured(browser, packages, run, viewer, kind):
     camera, file = frame.camera, run.folder / f"export{FORMATS[kind]}"
     turn = np.eye(4)  # from the run's world to that of the file
     if kind == "glb":
-        turn[:3, :3] = to_y_up(run.up)
+        turn[:3, :3] = to_y_up(run.dataset.world.up)
     elif kind == "spz":
         turn = np.diag([1.0, -1, -1, 1])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,8 +11,11 @@ from mgs.cli.nbv import resume_and_print, start_and_print
 from mgs.cli.options import Settings, merged, not_none, parse_gaussians, parse_settings, with_keys
 from mgs.run.settings import NbvSettings
 
+if TYPE_CHECKING:
+    from mgs.run.folder import Run
 
-@with_keys(NbvSettings, "train", "sh", "exposure", "pixel_noise", "prior_std", "seed")
+
+@with_keys(NbvSettings, "train", "sh", "exposure", "pixel_noise", "prior_std", "seed", "pose_noise")
 def fit(
     dataset: Path,
     out: Annotated[Path, typer.Option()],
@@ -24,6 +27,7 @@ def fit(
     density: str | None = None,
     loss: str | None = None,
     exposure: bool | None = None,
+    refine_poses: bool | None = None,
     seed: int | None = None,
     settings: Settings = None,
     force: bool = False,
@@ -48,7 +52,7 @@ def fit(
 
     console = Terminal()
     train = not_none(passes=passes, means=means, density=density, loss=loss)
-    options = not_none(sh=sh, exposure=exposure, seed=seed) | {"train": train}
+    options = not_none(sh=sh, exposure=exposure, seed=seed, refine_poses=refine_poses)
     run = start_and_print(
         dataset,
         out,
@@ -57,9 +61,24 @@ def fit(
         prior=prior,
         gaussians=parse_gaussians(gaussians),
         force=force,
-        **merged(parse_settings(settings, fit), options),
+        **merged(parse_settings(settings, fit), options | {"train": train}),
     )
+    if run.poses_moved:
+        console.print(moved_poses(run))
     if prior is None and (seen := run.prior.numbers.get("triangulated")) is not None:
         others = run.prior.numbers["n"] - seen
         console.print(f"start: {seen:,} points of the cameras and {others:,} random ones")
     resume_and_print(run, console, run.settings.policy)
+
+
+def moved_poses(run: Run) -> str:
+    """How far poses were moved, in the mean and most."""
+    moves = run.poses_moved
+    name = max(moves, key=lambda one: moves[one]["degrees"])
+    degrees, length = (
+        sum(move[key] for move in moves.values()) / len(moves) for key in ("degrees", "length")
+    )
+    return (
+        f"poses moved {degrees:.2f} degrees and {length:.3g} {run.dataset.unit} in the mean, "
+        f"{name} most: {moves[name]['degrees']:.2f} and {moves[name]['length']:.3g}"
+    )

@@ -95,6 +95,17 @@ class TrainSettings(BaseModel):
     _every_kind = field_validator("rates", mode="before")(lambda given: complete(given, RATES))
 
 
+class PoseNoise(BaseModel):
+    """Standard deviation of the error of poses that are refined."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    degrees: Positive = 0.25
+    """Standard deviation of poses that are refined: of the turn about each axis, degrees."""
+    distance: Positive = 0.0025
+    """The same of the position along each axis, as a share of the distance to the object."""
+
+
 class ModelSettings(BaseModel):
     """How a model is fitted to the views taken, and how its information is measured."""
 

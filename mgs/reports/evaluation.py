@@ -63,6 +63,7 @@ def evaluate_run(
             return metrics
         metrics = {"policy": run.label, "of": subject, "pictures": pictures}
         metrics |= {"informed": _informed(run)}
+        metrics |= {"poses_moved": run.poses_moved} if run.poses_moved else {}
         metrics |= evaluate_model(
             as_drjit(run.gaussians),
             frames,

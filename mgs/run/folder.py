@@ -86,6 +86,10 @@ class Checkpoint:
     upright: bool = True
 
 
+POSES = "poses.json"
+"""File in that folder where poses were refined: how far each moved (`mgs.run.nbv`)."""
+
+
 class Run:
     """A run folder: its settings, and what its files hold, each read once at first use.
 
@@ -238,6 +242,19 @@ class Run:
     def metrics(self) -> dict[str, Any] | None:
         """Contents of metrics.json; None if the run was not evaluated."""
         return read_metrics(self.folder)
+
+    @cached_property
+    def poses_moved(self) -> dict[str, dict[str, float]]:
+        """How far each pose was moved by `refine_poses`, "degrees" and "length", by frame name."""
+        path = self.settings.dataset / POSES
+        if not self.settings.refine_poses:
+            return {}
+        with parsing(path, "record of poses", "start the run anew"):
+            moved: dict[str, dict[str, float]] = read_json(path)["moved"]
+            return {
+                name: {k: float(move[k]) for k in ("degrees", "length")}
+                for name, move in moved.items()
+            }
 
     @property
     def measured(self) -> dict[str, Any] | None:

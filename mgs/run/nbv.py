@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,13 +12,16 @@ from scipy.spatial import cKDTree
 
 from mgs import runtime
 from mgs.camera import extent_of
-from mgs.data.dataset import Dataset, load_dataset
+from mgs.data.dataset import FILES as PATHS
+from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, write_transforms
+from mgs.data.frames import Frame
 from mgs.data.visibility import has_masks
 from mgs.errors import InputError
-from mgs.files import THERE, Ours, atomic_folder, reading
+from mgs.files import THERE, Ours, atomic_folder, reading, write_json
+from mgs.fit.poses import motion_between
 from mgs.fit.settings import ModelSettings, as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE
-from mgs.learning import information
+from mgs.learning import information, refine_poses
 from mgs.memory import VIEW_BYTES
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.photographs import source_of as source_of_prior
@@ -30,6 +33,7 @@ from mgs.run.folder import (
     DATASET,
     FILES,
     POLICY_SOURCE,
+    POSES,
     Checkpoint,
     Run,
     holds_run,
@@ -159,10 +163,14 @@ def start_run(
         dataset = load_dataset(root, to_capture=live is not None, up=up)
     if live is not None and not dataset.on_demand:
         raise InputError(f"{root}: all its images exist; leave out live capture")
+    refine = bool(settings.get("refine_poses"))
+    if refine and dataset.on_demand:
+        raise InputError(f"{root}: has poses without images, which cannot be refined")
     automatic = settings.get("budget") == "auto"
     if automatic and live is not None:
         raise InputError("budget auto: needs the images of the seeds; give a number")
-    images, where = root if live is None else out / DATASET, folder or out / "prior"
+    images = root if live is None and not refine else out / DATASET
+    where = folder or out / "prior"
     policy = settings.get("policy", NbvSettings.model_fields["policy"].default)
     paths = {"dataset": images.resolve(), "prior": where.resolve()}
     mission = _settings(dataset, policy, settings | paths)
@@ -191,10 +199,14 @@ def start_run(
             mission = _automatic(Scene(dataset, surface, mission), mission, rule, progress)
         if live is not None:
             begin(unfinished / DATASET, dataset, surface)
+        if refine:
+            with listening(progress):
+                frames = refine_poses(Scene(dataset, surface, mission), mission.pose_noise)
+            write_refined(unfinished / DATASET, dataset, frames)
         start(unfinished, mission, dataset)
         if not isinstance(policy, str):
             (unfinished / POLICY_SOURCE).write_text(source_of(policy), encoding="utf-8")
-    return Run(out, mission, dataset if live is None else None, stored, policy)
+    return Run(out, mission, dataset if images == root else None, stored, policy)
 
 
 def start_fit(
@@ -235,6 +247,26 @@ def start_fit(
     every = {"seeds": len(data), "budget": 0, "train": train, "loose": loose}
     start: dict[str, Any] = {"prior": prior, "gaussians": gaussians, "source": whole}
     return start_run(root, out, progress=progress, **start, **settings | every)
+
+
+def write_refined(folder: Path, given: Dataset, frames: Sequence[Frame]) -> None:
+    """Write a dataset of frames with refined poses, of the same files as the given one, and
+    poses.json: how far each moved, degrees and length. Test views keep their poses."""
+
+    def elsewhere(frame: Frame) -> Frame:
+        paths = {key: path.resolve() for key in PATHS if (path := getattr(frame, key))}
+        return replace(frame, **paths)
+
+    moved = {}
+    for old, new in zip(given.frames, frames, strict=True):
+        motion = motion_between(old.camera, new.camera)
+        turn, shift = np.degrees(np.linalg.norm(motion[:3])), np.linalg.norm(motion[3:])
+        moved[old.name] = {"degrees": round(float(turn), 4), "length": float(shift)}
+    tests = given.test_views()
+    if tests is not None:
+        write_transforms(folder / TEST_FOLDER, [*map(elsewhere, tests.frames)], given.world)
+    write_json(folder / POSES, {"dataset": str(given.root.resolve()), "moved": moved})
+    write_transforms(folder, [*map(elsewhere, frames)], given.world)
 
 
 def _settings(dataset: Dataset, policy: Any, values: dict[str, Any]) -> NbvSettings:

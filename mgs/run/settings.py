@@ -19,6 +19,7 @@ from mgs.fit.settings import (
     ALPHA_WEIGHT,
     MEAN_RATE,
     ModelSettings,
+    PoseNoise,
     Positive,
     Scale,
     TrainSettings,
@@ -93,6 +94,11 @@ class NbvSettings(ModelSettings, Mission):
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR each time after this many views; 0: only at the end. Does not affect choices."""
 
+    refine_poses: bool = False
+    """Refine the poses of all views before the fit, by the images."""
+    pose_noise: PoseNoise = PoseNoise()
+    """How wrong poses that are refined may be."""
+
     @model_validator(mode="after")
     def _go_together(self) -> NbvSettings:
         means, density = self.train.means, self.train.density
@@ -107,6 +113,8 @@ class NbvSettings(ModelSettings, Mission):
                 f"train.density {density}: needs free means and all images at once; "
                 "give `mgs fit --means free`"
             )
+        if self.refine_poses and self.budget > 0:
+            raise ValueError("refine_poses: needs all images at once; give it to `mgs fit`")
         if self.flies and self.travel is not None:
             raise ValueError(
                 f"travel {self.travel:g}: a flight with a limit has its own travel cost; "
