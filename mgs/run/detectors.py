@@ -257,7 +257,7 @@ DETECTORS: dict[str, Detector] = {
     "residual": Detector(
         0.145,
         "the fit leaves {share:.0f} % of the images' variance inside the masks unexplained in the "
-        "median view (limit {most:.1f} %); check poses and masks, or give more Gaussians",
+        "median view (limit {most:.1f} %); check poses and masks",
     ),
     "exposure": Detector(
         0.22,
