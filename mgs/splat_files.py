@@ -95,8 +95,8 @@ def load_gaussians(path: str | Path) -> Gaussians:
         notice = f"{path}: {(~good).sum():,} Gaussians with NaN or infinite numbers are left out"
         warnings.warn(notice, Notice, stacklevel=2)
         g = g[good]
-    step, size = np.spacing(np.abs(g.means).max(initial=0)), np.exp(np.median(g.log_scales))
-    if step > size / 2:
+    step = np.spacing(np.abs(g.means).max(initial=0))
+    if len(g.means) and step > (size := np.exp(np.median(g.log_scales))) / 2:
         notice = (
             f"{path}: positions of float32 have steps of {step:.2g} so far from the origin, and "
             f"Gaussians are {size:.2g} large; export it with doubles, or nearer to the origin"

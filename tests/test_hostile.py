@@ -111,7 +111,7 @@ def test_a_full_disk_behind_the_standard_output():
 def test_a_terminal_of_ascii_and_no_home():
     script = (
         "import typer; from mgs.cli import app; from mgs import runtime\n"
-        "def show():\n    runtime.start(); import mitsuba as mi; mi.Float(1, 2) + 1\n"
+        "def show():\n    'Show.'\n    runtime.start(); import mitsuba as mi; mi.Float(1, 2) + 1\n"
         "    print('1 m²')\n"
         "app.show = show; app.COMMANDS['show'] = ('app.show', ''); app.main(['show'])"
     )

@@ -261,18 +261,34 @@ def sleep(root, out):
 
 
 def test_a_lost_scheduler_is_one_line(tmp_path, caplog):
-    options = {"n_workers": 1, "threads_per_worker": 1, "host": "127.0.0.1", "memory_limit": 0}
-    silence = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL + 1}
-    with LocalCluster(**options, **silence) as cluster:
+    place = tmp_path / "scheduler.json"
+    file, here = ["--scheduler-file", place], {"PYTHONPATH": os.pathsep.join(sys.path)}
+    of_scheduler = ["scheduler", *file, "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    of_worker = ["worker", *file, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
+    scheduler, worker = (
+        subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.dask_{name}", *arguments],
+            env=os.environ | here,
+            stderr=subprocess.DEVNULL,
+        )
+        for name, *arguments in (of_scheduler, of_worker)
+    )
 
-        def lose():
-            while not (tmp_path / "cells/sleep").exists():
-                time.sleep(0.05)
-            cluster.close()
+    def lose():
+        while not (tmp_path / "cells/sleep").exists():
+            time.sleep(0.05)
+        scheduler.kill()
 
-        thread = threading.Thread(target=lose)
+    thread = threading.Thread(target=lose, daemon=True)
+    try:
+        while not place.is_file():
+            time.sleep(0.05)
         thread.start()
+        address = json.loads(place.read_text())["address"]
         with pytest.raises(InputError, match="the connection to the Dask scheduler is lost"):
-            run_cells(tmp_path, [SLEEP], silent, scheduler=cluster.scheduler_address)
-        thread.join()
+            run_cells(tmp_path, [SLEEP], silent, scheduler=address)
+    finally:
+        for process in (scheduler, worker):
+            process.kill()
+            process.wait()
     assert [one.name for one in caplog.records if one.name == "distributed.client"] == []
