@@ -111,8 +111,9 @@ def test_a_setting_has_the_same_name_in_python_and_on_the_command_line(tmp_path,
         mgs.load_dataset("runs/--no-such-run/data")
 
 
-def test_no_command_has_many_options():
+def test_no_command_has_many_options_and_each_has_its_help():
     commands = typer.main.get_command(app).commands
     for name in COMMANDS:
         options = [p for p in commands[name].params if p.param_type_name == "option"]
         assert len(options) <= 15, name
+        assert all(parameter.help for parameter in commands[name].params), name

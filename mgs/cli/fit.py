@@ -15,7 +15,10 @@ if TYPE_CHECKING:
     from mgs.run.folder import Run
 
 
-@with_keys(NbvSettings, "train", "sh", "exposure", "pixel_noise", "prior_std", "seed", "pose_noise")
+@with_keys(
+    NbvSettings,
+    *("train", "sh", "exposure", "pixel_noise", "prior_std", "seed", "refine_poses", "pose_noise"),
+)
 def fit(
     dataset: Path,
     out: Annotated[Path, typer.Option()],
