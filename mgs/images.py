@@ -35,6 +35,9 @@ EXR_MAGIC = b"v/1\1"
 DECODED_BYTES = 16
 """Most bytes that a pixel takes while an image is decoded: RGBA of 16 bits, and its file."""
 
+UNKNOWN_DEPTH = 0xFFFF
+"""Value of 16 bits with which depth cameras, as the Kinect, mark that they measured nothing."""
+
 PNG_LEVEL = 1
 """zlib level, 1 to 9. Against Pillow's default of 6, a render of 0.56 Mpixel is as large and is
 written in 62 instead of 236 ms; a smooth photo of 3 Mpixel is 7 % larger."""
@@ -180,8 +183,8 @@ def read_values(path: str | Path) -> np.ndarray:
 
 def read_depth(path: str | Path, unit: float = 1e-3, float_unit: float = 1.0) -> np.ndarray:
     """Depth in metres, float32 [H,W], from EXR, or an image in steps of `unit` metres; of a TIFF of
-    floating-point numbers in steps of `float_unit`. Negative numbers and those beyond NO_RETURN
-    become 0.
+    floating-point numbers in steps of `float_unit`. Negative numbers, those beyond
+    NO_RETURN and UNKNOWN_DEPTH become 0.
 
     Raises InputError as `read_exr` and `read_values`, for 8 bits, if most numbers are negative, and
     where it is not plain which channel of an EXR is the depth: it is named Z or depth, in a layer
@@ -197,6 +200,8 @@ def read_depth(path: str | Path, unit: float = 1e-3, float_unit: float = 1.0) ->
                 f"{path}: a picture of 8 bits is no depth; give 16 bits, TIFF of float32, or EXR"
             )
         depth = values.astype(np.float32) * (unit if values.dtype.kind in "ui" else float_unit)
+        if values.dtype == np.uint16:
+            depth[values == UNKNOWN_DEPTH] = 0
     if (depth < 0).sum() > (depth > 0).sum():
         raise InputError(f"{path}: its depths are negative; give distances in front of the camera")
     return np.where((depth < 0) | (depth > NO_RETURN), np.float32(0), depth)

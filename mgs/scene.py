@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -99,6 +99,7 @@ class Scene:
       frames have a mask or a rock image.
     - capture(frame): returns the frame once its images exist, which it makes where they do not. Its
       camera is that of the picture; it is `given_up` where there is none to be had.
+    - on_pass(done, most, model): called after each pass of a fit.
     - keep: most bytes of the information of views about one model that are kept for several
       choices (`mgs.memory.VIEW_BYTES`).
 
@@ -111,6 +112,7 @@ class Scene:
     settings: ModelSettings = None  # type: ignore[assignment]
     capture: Callable[[Frame], Frame] = lambda frame: frame
     keep: int = 0
+    on_pass: Callable[[int, int, Gaussians], None] = lambda done, most, model: None
 
     def __post_init__(self) -> None:
         if self.settings is None:
@@ -240,7 +242,11 @@ class Scene:
         train = train or self.settings.train
         lam = self.settings.lam_by_kind(self.groups)
         cameras = [frame.camera for frame in frames]
-        on_pass = partial(report, Stage.FIT)
+
+        def on_pass(done: int, most: int, passing: Gaussians) -> None:
+            report(Stage.FIT, done, most)
+            self.on_pass(done, most, passing)
+
         targets, start = self.targets(frames, gains), self.start(tuple(frames))
         release(KEPT_BYTES)  # what scores took, and then what the fit took
         fit_ = fit_gaussians(model, cameras, targets, train, on_pass, self.cache, start, lam)

@@ -8,9 +8,11 @@ import pytest
 from hypothesis import settings
 
 from mgs import runtime
+from mgs.cli import progress
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # two workers share the processors
 runtime.start()
+progress.SECONDS_BETWEEN = float("inf")  # a busy machine would print lines of progress
 # No deadline: the machine may be busy, and a first call loads libraries.
 settings.register_profile("mgs", deadline=None)
 settings.load_profile("mgs")

@@ -1,15 +1,16 @@
 """The real operations together: dataset, prior, next best views, evaluation, diagnosis, report."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import synthetic
-from program import command, steps, study, timeless
+from program import command, said, steps, study, timeless
 
-from mgs.cli import app, demo
+from mgs.cli import app, demo, progress
 from mgs.cli.app import COMMANDS, main
 from mgs.data.dataset import load_dataset
 from mgs.evaluation import psnr_measure
@@ -35,8 +36,8 @@ fit, fits = scene.fit_gaussians, []
 def interrupted(gaussians, cameras, targets, settings, on_pass, *rest):
     fits.append(len(cameras))
 
-    def interrupt(done, most):
-        on_pass(done, most)
+    def interrupt(done, most, model):
+        on_pass(done, most, model)
         if len(fits) == 3:
             os.kill(os.getpid(), signal.SIGINT)
 
@@ -79,6 +80,18 @@ def test_the_run_is_whole_and_learns_from_more_images(dataset, run):
     untrained = psnr_measure(loaded, ListCache())(start, seeds)["psnr"]
     first, second, third = (line["psnr"] for line in lines if "psnr" in line)
     assert untrained < first < second < third
+
+
+def test_a_fit_shows_a_view_before_its_end(dataset, run, tmp_path, capsys, monkeypatch):
+    """Without a terminal, lines of progress are on the standard error."""
+    monkeypatch.setattr(progress, "SECONDS_BETWEEN", 0.0)
+    out = tmp_path / "fit"
+    command("fit", dataset, "--out", out, "--prior", run / "prior", "--passes", 5)
+    printed, lines = said(capsys)
+    decibels = [float(number) for number in re.findall(r"pass \d of 5: ([\d.]+) dB", printed)]
+    assert decibels[0] < decibels[1]
+    assert (out / f"renders/{load_dataset(dataset).frames[0].name}.png").is_file()
+    assert "fitting: 3 of 5" in lines
 
 
 def test_interrupted_in_the_middle_of_a_step_then_resumed(dataset, run, tmp_path):

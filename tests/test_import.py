@@ -25,8 +25,9 @@ from mgs.data.frames import Frame
 from mgs.data.importers import import_source
 from mgs.data.lens import Lens, undistorter
 from mgs.data.sources import read_source
+from mgs.errors import InputError
 from mgs.files import write_json
-from mgs.images import write_png
+from mgs.images import read_depth, write_png
 
 DISTORTION = np.array([-0.15, 0.04, 0.002, -0.003, 0.0])
 LENS = dict(zip(("k1", "k2", "p1", "p2"), DISTORTION.tolist(), strict=False))
@@ -288,6 +289,37 @@ def test_what_is_missing_is_skipped_and_said(dataset, tmp_path, capsys):
     assert f"{dataset.root}/sparse_pc.ply,donotexist" in err.replace(" ", "")
     assert "0 points" not in out
     assert not (tmp_path / "copy/sparse.ply").exists()
+
+
+def test_images_are_excluded_by_name(dataset, tmp_path, capsys):
+    names = [frame.name for frame in dataset.frames]
+    command(
+        "import", dataset.root, "--out", tmp_path / "copy", "--exclude", f"images/{names[2]}.png"
+    )
+    assert "left out 1 excluded" in said(capsys)[0]
+    left = [frame.name for frame in load_dataset(tmp_path / "copy").frames]
+    assert left == [*names[:2], *names[3:]]
+    with pytest.raises(InputError, match="exclude 'other'"):
+        read_source(dataset.root, exclude=["other"])
+
+
+def test_images_may_be_smaller_than_their_cameras(dataset, tmp_path):
+    for key in ("depth_file_path", "mask_path"):
+        synthetic.edit(dataset.root, lambda data, key=key: [one.pop(key) for one in data["frames"]])
+    for frame in dataset.frames:
+        with Image.open(frame.image_path) as image:
+            image.resize((image.width // 4, image.height // 4)).save(frame.image_path)
+    for one, other in zip(
+        dataset.frames, _import(dataset.root, tmp_path / "c").frames, strict=True
+    ):
+        point = one.camera.camera_to_world[:3] @ [0.1, 0.2, 1, 1]
+        pixels = [frame.camera.project(point[None])[0] for frame in (one, other)]
+        assert np.allclose(pixels[0], 4 * pixels[1])
+
+
+def test_a_pixel_of_all_ones_is_no_depth(tmp_path):
+    cv2.imwrite(str(tmp_path / "z.png"), np.array([[1500, 65535]], np.uint16))
+    assert read_depth(tmp_path / "z.png").tolist() == [pytest.approx([1.5, 0.0])]
 
 
 def test_images_are_set_apart_as_test_views(dataset, tmp_path, capsys):

@@ -49,6 +49,7 @@ def import_data(
     distance: str | None = None,
     test_every: Annotated[int | None, typer.Option(min=2)] = None,
     pose: str | None = None,
+    exclude: list[str] | None = None,
     split: str = "train",
     force: bool = False,
 ) -> None:
@@ -60,10 +61,11 @@ def import_data(
     kept in sparse.ply for `mgs prior`. The same command continues an interrupted import.
 
     - source: A transforms.json or a folder with one, a COLMAP model (sparse/0), ROS bag, Metashape
-      XML, a folder of TUM RGB-D, Open3D or RTAB-Map, or a folder of photographs alone.
+      XML, a folder of TUM RGB-D, Open3D or RTAB-Map, a folder of photographs alone, or a video.
     - out: Folder to write: new, empty, or left by an interrupted import.
     - images: Folder of the images (default: SOURCE/images), or topic of a bag.
-    - keyframes: Of a recording, import frames at least this time or distance apart: 0.5s or 0.2m.
+    - keyframes: Of a recording or video, import frames at least this time or distance apart: 0.5s
+      or 0.2m; of a video the sharpest.
     - masks: Folder of masks, named like the images; the rock is white.
     - mesh: Mesh of the rock, world coordinates; masks are its projections. GLB is converted from +Y
       up to +Z up.
@@ -73,6 +75,7 @@ def import_data(
     - distance A,B,METRES: Distance between the cameras of two images, which gives the scale.
     - test_every N: Make the first and every further Nth image, by name, a test view; 8 is usual.
     - pose TOPIC: Topic of a bag's poses of the camera, or of the body that carries it.
+    - exclude NAME: Leave this image out; repeat for more.
     - split: Split of NeRF-synthetic data to import: train, val or test.
     """
     from mgs.data.agreement import agreement
@@ -97,7 +100,15 @@ def import_data(
         progress_bar("reading", console) as progress,
         listening(progress),
     ):
-        shots = read_source(source, images, split, keyframes=keyframes, unpack=unpacked, pose=pose)
+        shots = read_source(
+            source,
+            images,
+            split,
+            keyframes=keyframes,
+            unpack=unpacked,
+            pose=pose,
+            exclude=exclude or [],
+        )
         shots = shots if unit is None else shots.in_metres(unit)
         shots = shots if distance is None else shots.with_distance(distance)
         axis = parse_up(up)

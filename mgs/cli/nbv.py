@@ -16,6 +16,7 @@ from mgs.run.settings import NbvSettings, Positive, settings_in, validated
 
 if TYPE_CHECKING:
     from mgs.cli.terminal import Terminal
+    from mgs.gaussians import Gaussians
     from mgs.run.folder import Checkpoint, Run
     from mgs.run.live import Live
 
@@ -115,6 +116,10 @@ def nbv(
     resume_and_print(run, console, run.settings.policy, live=live)
 
 
+PASSES_BETWEEN = 5
+"""Passes of a fit to all images between two pictures of a test view."""
+
+
 def live_capture(command: str | None, folder: Path | None, values: dict[str, Any]) -> Live | None:
     """`Live` of the options of a live capture, None without one. Raises InputError as `command`,
     and where options are wrong or do not go together."""
@@ -173,7 +178,7 @@ def resume_and_print(
 
     from mgs.cli.printing import print_run, step_lines
     from mgs.cli.progress import progress_bar
-    from mgs.reports.evaluation import evaluate_run
+    from mgs.reports.evaluation import drawn_test_view, evaluate_run
     from mgs.run.folder import open_run
     from mgs.run.nbv import resume_nbv
 
@@ -188,7 +193,12 @@ def resume_and_print(
             for line in [line for step in new for line in step_lines(step)]:
                 progress.print(line)
 
-        state = resume_nbv(run, on_step, progress, policy, live).state
+        def on_pass(done: int, most: int, model: Gaussians) -> None:
+            if run.settings.budget == 0 and (done == 1 or done % PASSES_BETWEEN == 0):
+                path, psnr = drawn_test_view(run, model)
+                progress.print(f"pass {done} of {most}: {psnr:.2f} dB, {path}")
+
+        state = resume_nbv(run, on_step, progress, policy, live, on_pass).state
         watched = partial(progress, "evaluating")
         metrics = evaluate_run(run.folder, pictures=False, progress=watched)
     print_run(run.folder, state, metrics, console)

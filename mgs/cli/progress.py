@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -15,13 +17,21 @@ from rich.progress import (
 )
 
 from mgs.cli.terminal import Terminal
+from mgs.errors import printable_lines
+
+SECONDS_BETWEEN = 10.0
+"""Least time between two lines of progress where there is no terminal."""
 
 
 class ProgressBar:
-    """Lines at the bottom of the terminal: the stage at work, and above it the whole."""
+    """Lines at the bottom of the terminal: the stage at work, and above it the whole.
+
+    Without a terminal, a line on the standard error every SECONDS_BETWEEN.
+    """
 
     def __init__(self, bar: Progress, stage: str) -> None:
         self._bar = bar
+        self._printed = time.monotonic()
         self._whole: TaskID | None = None
         self._name = stage
         self._stage = bar.add_task(stage, total=None)
@@ -32,6 +42,10 @@ class ProgressBar:
             self._bar.remove_task(self._stage)
             self._name, self._stage = stage, self._bar.add_task(stage, total=None)
         self._bar.update(self._stage, completed=done, total=total or None)
+        if self._bar.disable and time.monotonic() > self._printed + SECONDS_BETWEEN:
+            self._printed = time.monotonic()
+            of = f": {done} of {total}" if total > 1 else ""
+            print(printable_lines(f"{stage}{of}"), file=sys.stderr, flush=True)
 
     def whole(self, name: str, done: int, total: int) -> None:
         """Show how far the whole work is."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mgs.data.colmap import source_of
-from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, natural
+from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, frame_name, natural
 from mgs.data.structure import Matcher
 from mgs.data.world import PLUS_Z
 from mgs.errors import InputError
@@ -52,14 +52,22 @@ def photographs_in(source: Path) -> list[Path]:
     return sorted((path for path in paths if path.is_file()), key=natural)
 
 
-def read_photographs(source: Path, paths: Sequence[Path], folder: Path) -> Source:
+def read_photographs(
+    source: Path, paths: Sequence[Path], folder: Path, exclude: Sequence[str] = ()
+) -> Source:
     """Poses, lenses and points of photographs, of the largest part that hangs together.
 
-    folder: for matches, which a later call continues. With GPS in their EXIF that fits, the world
+    folder: for matches, which a later call continues. exclude: names of photographs to leave out;
+    they do not place others either. With GPS in their EXIF that fits, the world
     is in metres, +Y north and +Z up. Raises InputError if fewer than FEWEST can be placed.
     """
     import pycolmap
 
+    names = [frame_name(path.relative_to(source).as_posix()) for path in paths]
+    out = {frame_name(name) for name in exclude}
+    if unknown := out - set(names):
+        raise InputError(f"import: exclude {min(unknown)!r}: is no photograph of {source}")
+    paths = [path for name, path in zip(names, paths, strict=True) if name not in out]
     paths, dropped = _usable(paths)
     if len(paths) < FEWEST:
         raise InputError(

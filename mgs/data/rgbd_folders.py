@@ -16,7 +16,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.data.lens import Lens
 from mgs.data.shots import Shot, Source, natural
-from mgs.data.tracks import Spacing, Track, posed, rigid
+from mgs.data.tracks import ROUNDED, Spacing, Track, orthonormal, posed, rigid
 from mgs.errors import InputError
 from mgs.files import read_json, read_text
 from mgs.images import image_size
@@ -140,7 +140,8 @@ def read_open3d(folder: Path, spacing: Spacing) -> Source:
         raise InputError(
             f"{path}: needs three numbers and a 4x4 matrix for each image; record it again"
         )
-    matrices = np.array(values).reshape(-1, 19)[:, 3:].reshape(-1, 4, 4)
+    given = np.array(values).reshape(-1, 19)[:, 3:].reshape(-1, 4, 4)
+    matrices, mended = zip(*map(orthonormal, given), strict=True)
     images, depths = (
         sorted((path for path in (folder / name).glob("*") if path.is_file()), key=natural)
         for name in ("color", "depth")
@@ -161,7 +162,8 @@ def read_open3d(folder: Path, spacing: Spacing) -> Source:
     for k in spacing.choose(list(zip(times.tolist(), matrices, strict=True))):
         depth = depths[k] if depths else None
         shots.append(_shot(images[k].stem, K, lens, matrices[k], times[k], images[k], depth))
-    return Source("Open3D", shots, unit="m")
+    notes = (f"{sum(mended)} {ROUNDED}",) if any(mended) else ()
+    return Source("Open3D", shots, notes=notes, unit="m")
 
 
 def is_rtabmap(folder: Path) -> bool:

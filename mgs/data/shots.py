@@ -27,6 +27,13 @@ FAR = 1000.0
 """Distance of the cameras from the origin over their extent, beyond which float32 loses digits of
 the scene and the origin is moved."""
 
+HELD = {
+    3: [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
+    6: [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+    8: [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+}
+"""EXIF orientation -> axes of the camera of the turned picture, in those of the stored one."""
+
 
 @dataclass(frozen=True)
 class Shot:
@@ -113,6 +120,15 @@ class Source:
         sparse = self.sparse and replace(self.sparse, points=self.sparse.points - centre)
         return replace(self, shots=shots, sparse=sparse, origin=(x, y, z))
 
+    def without(self, names: Sequence[str]) -> Source:
+        """Source without the shots of these images. Raises InputError for an unknown name."""
+        out = {frame_name(name) for name in names}
+        if unknown := out - {shot.name for shot in self.shots}:
+            raise InputError(f"import: exclude {min(unknown)!r}: is no image of the source")
+        shots = [shot for shot in self.shots if shot.name not in out]
+        counted = self.left_out + Counter({"excluded": len(out)})
+        return replace(self, shots=shots, left_out=counted)
+
     def set_apart(self, every: int | None) -> tuple[Source, Source | None]:
         """Split into (training, test): the shots that the source sets apart, or every Nth by name,
         from the first. Raises InputError if no training shot is left."""
@@ -137,11 +153,22 @@ class Source:
             return self.up, "as the source says"
         if self.kind == "NeRF-synthetic":
             return PLUS_Z, "the rule of NeRF-synthetic data"
-        estimate = up_of_cameras([shot.camera for shot in self.shots])
+        estimate = up_of_cameras([_as_held(shot) for shot in self.shots])
         levelled = ("nerfstudio", "ROS bag", "TUM RGB-D", "RTAB-Map")
         if self.kind in levelled and degrees_between(estimate, PLUS_Z) < LEVELLED:
             return PLUS_Z, f"the cameras' common up vector is within {LEVELLED:.0f} degrees of it"
         return estimate, "the cameras' common up vector"
+
+
+def _as_held(shot: Shot) -> Camera:
+    """Camera of a shot in the axes of its picture as EXIF turns it, also where the file is taken as
+    it is stored."""
+    turn = HELD.get(1 if shot.turned else exif_orientation(shot.image))
+    if turn is None:
+        return shot.camera
+    pose = np.eye(4)
+    pose[:3, :3] = turn
+    return replace(shot.camera, world_to_camera=pose @ shot.camera.world_to_camera)
 
 
 def frame_name(path: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -17,6 +17,7 @@ from mgs.data.colmap import models_in, read_colmap
 from mgs.data.dataset import finite_number, posed_camera, read_records, timestamp_of, unit_of
 from mgs.data.lens import Lens
 from mgs.data.metashape import is_metashape, read_metashape
+from mgs.data.photographs import KIND as PHOTOGRAPHS
 from mgs.data.photographs import photographs_in, read_photographs
 from mgs.data.rgbd_folders import (
     is_open3d,
@@ -27,7 +28,8 @@ from mgs.data.rgbd_folders import (
     read_tum,
 )
 from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, checked, frame_name, turned_by_exif
-from mgs.data.tracks import Spacing
+from mgs.data.tracks import ROUNDED, Spacing, orthonormal
+from mgs.data.video import VIDEO_SUFFIXES, sharpest_frames
 from mgs.data.world import unit_up
 from mgs.errors import InputError
 from mgs.images import image_size
@@ -44,8 +46,8 @@ SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 """Keys of transforms.json that list the images of a split (nerfstudio)."""
 
-NEARLY_RIGID = 2e-3
-"""Largest error of an entry of a rotation that was rounded when it was written. It is mended."""
+SHRUNK = (2, 4, 8)
+"""Factors by which images may be smaller than transforms.json says; their cameras are scaled."""
 
 Reader = Callable[[Path, Path | None, Spacing, Path, str | None], Source]
 """(path, images, spacing of keyframes, folder to unpack into, topic of poses) -> source. images:
@@ -77,6 +79,7 @@ def read_source(
     keyframes: str = "0.5s",
     unpack: Path | None = None,
     pose: str | None = None,
+    exclude: Sequence[str] = (),
 ) -> Source:
     """Recognise the format of a source, and read its cameras and file names.
 
@@ -85,18 +88,22 @@ def read_source(
     photographs alone. images: the image folder, by default SOURCE/images, or that of the names in
     transforms.json; of a bag the topic. split: train, val or test. keyframes: `Spacing` of a
     recording. unpack: folder for the images of a bag and the matches of photographs, by default
-    SOURCE.unpacked. pose: topic of a bag's poses. Raises InputError if no format is recognised, no
-    image exists, a frame is listed twice, a camera model is not supported, or photographs cannot be
-    placed.
+    SOURCE.unpacked. pose: topic of a bag's poses. exclude: names of images to leave out. Raises
+    InputError if no format is recognised, no image exists, a frame is listed twice, a camera model
+    is not supported, or photographs cannot be placed.
     """
     source = Path(source)
     source.exists()  # an OSError of the source itself is not one of a file that it names
     try:
-        result = checked(source, _recognised(source, images, split, keyframes, unpack, pose))
+        result = checked(
+            source, _recognised(source, images, split, keyframes, unpack, pose, exclude)
+        )
     except OSError as error:
         raise InputError(
             f"{source}: a file of it cannot be read ({error.strerror or error}); correct its name"
         ) from None
+    if result.kind != PHOTOGRAPHS:
+        result = result.without(exclude)
     return turned_by_exif(result).near_origin()
 
 
@@ -107,6 +114,7 @@ def _recognised(
     keyframes: str,
     unpack: Path | None,
     pose: str | None,
+    exclude: Sequence[str],
 ) -> Source:
     """`read_source` without checks of the shots. Raises OSError for names that are too long."""
     if not source.exists():
@@ -123,12 +131,16 @@ def _recognised(
     if recording is not None:
         reader = RECORDINGS[recording][1]
         return reader(source, images, Spacing.parse(keyframes), folder, pose)
+    if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
+        frames = folder / "frames"
+        paths = sharpest_frames(source, frames, Spacing.parse(keyframes))
+        return read_photographs(frames, paths, folder / "matches", exclude)
     if path.is_file() or split_path.is_file():
         return _read_transforms(path if path.is_file() else split_path, images)
     if models := models_in(source):
         return read_colmap(source, models, images if images is not None else source / "images")
     if paths := photographs_in(images or source):
-        return read_photographs(images or source, paths, folder / "matches")
+        return read_photographs(images or source, paths, folder / "matches", exclude)
     raise InputError(
         f"{source}: holds no photographs (PNG, JPEG, TIFF, WebP), transforms.json, "
         f"transforms_{split}.json or COLMAP model (cameras, images and points3D, .bin or .txt, in "
@@ -162,7 +174,7 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
     scale = finite_number(str(path), key, data.get(key, 1e-3))
     of_floats = scale if key in data else 1.0
     tests, without = _splits(path, data, records)
-    left_out, shots, rounded = Counter[str](), [], 0
+    left_out, shots, rounded, smaller = Counter[str](), [], 0, 0
     for index, record in enumerate(records):
         image = _named(path.parent, images, record["file_path"])
         if record["file_path"] in without:
@@ -179,16 +191,18 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
             for key in keys
         )
         where = f"{path}: frame {index}"
-        camera, lens, mended = record_camera(where, {**data, **record}, image)
+        about = {**data, **record}
+        camera, lens, mended = record_camera(where, about, image)
         rounded += mended
+        smaller += camera.width != float(about.get("w") or camera.width)
         time, name = timestamp_of(where, index, record), frame_name(record["file_path"])
         files = image, depth, scale, mask, rock
         shots.append(Shot(name, camera, lens, time, *files, float_unit=of_floats))
     notes = []
     if rounded:
-        notes.append(
-            f"{rounded} rotations were rounded when they were written; they are made orthonormal"
-        )
+        notes.append(f"{rounded} {ROUNDED}")
+    if smaller:
+        notes.append(f"{smaller} images are smaller than w and h say; their cameras are scaled")
     listed = {frame_name(record["file_path"]) for record in records}
     if unknown := {frame_name(name) for name in tests} - listed:
         notes.append(f"{len(unknown)} test views are no frame, as {min(unknown)}")
@@ -231,16 +245,19 @@ def record_camera(
     """Camera and lens of a frame, and whether its rotation was NEARLY_RIGID. Missing intrinsics
     follow from the image."""
     record = {key: value for key, value in record.items() if value is not None}
-    model = record.get("camera_model", "OPENCV")
+    model, own = record.get("camera_model", "OPENCV"), image_size(image)
     try:
         if "w" in record and "h" in record:
             width, height = float(record["w"]), float(record["h"])
         else:
-            width, height = image_size(image)
+            width, height = own
         fl_x = _focal(record, "x", width)
         fl_y = _focal(record, "y", height) if {"fl_y", "camera_angle_y"} & set(record) else fl_x
         cx, cy = float(record.get("cx", width / 2)), float(record.get("cy", height / 2))
         K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]])
+        # Smaller copies of the images beside a transforms.json of the whole ones.
+        if (times := width / own[0]) in SHRUNK and times == height / own[1]:
+            K, width, height = K / [[times, 1, times], [1, times, times], [1, 1, 1]], *own
         values = {key: float(record[key]) for key in COEFFICIENTS if key in record}
         pose = np.array(record["transform_matrix"], np.float64)
     except (KeyError, TypeError, ValueError, ArithmeticError):
@@ -258,7 +275,7 @@ def record_camera(
         values["k1"] = values.pop("k")
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0, 0, 0, 1]])
-    pose, mended = _rigid(pose)
+    pose, mended = orthonormal(pose)
     lens = Lens.of(where, str(model), K, values)
     return posed_camera(where, K, width, height, pose), lens, mended
 
@@ -268,17 +285,3 @@ def _focal(record: dict[str, Any], axis: str, side: float) -> float:
     if f"fl_{axis}" in record:
         return float(record[f"fl_{axis}"])
     return side / 2 / math.tan(float(record[f"camera_angle_{axis}"]) / 2)
-
-
-def _rigid(pose: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Pose with the rotation nearest to its own, if that is NEARLY_RIGID, and whether it changed by
-    more than the rounding of float32."""
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        return pose, False
-    left, _, right = np.linalg.svd(pose[:3, :3])
-    error = np.abs(left @ right - pose[:3, :3]).max()
-    if not 1e-5 < error < NEARLY_RIGID:
-        return pose, False
-    mended = pose.copy()
-    mended[:3, :3] = left @ right
-    return mended, True

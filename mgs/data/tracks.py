@@ -20,6 +20,13 @@ LONG = 3.0
 STILL = 0.01
 """Change of a pose, metres and radians, below which it is interpolated over any time."""
 
+NEARLY_RIGID = 1e-2
+"""Largest error of an entry of a rotation that was rounded or fused when it was written. It is
+mended."""
+
+ROUNDED = "rotations are not quite rotations, as they were rounded; they are made orthonormal"
+"""Note about poses that are NEARLY_RIGID, after their number."""
+
 WITHOUT_POSE = "without a pose at its time"
 """Reason to leave an image out."""
 
@@ -33,6 +40,20 @@ def posed(
     found = [(time, pose) for time in times if (pose := pose_at(time)) is not None]
     left_out[WITHOUT_POSE] += len(times) - len(found)
     return found
+
+
+def orthonormal(pose: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Pose with the rotation nearest to its own, if that is NEARLY_RIGID, and whether it changed by
+    more than the rounding of float32."""
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        return pose, False
+    left, _, right = np.linalg.svd(pose[:3, :3])
+    error = np.abs(left @ right - pose[:3, :3]).max()
+    if not 1e-5 < error < NEARLY_RIGID:
+        return pose, False
+    mended = pose.copy()
+    mended[:3, :3] = left @ right
+    return mended, True
 
 
 def rigid(translation: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:

@@ -28,6 +28,10 @@ LEVEL = 0.1
 Below it the cameras look the same way, the direction across their axes is not unique, and the mean
 of their upward axes is taken."""
 
+ONE_WAY, CANCELLED = 0.9, 0.5
+"""Least length of the mean viewing direction, and largest of the mean upward axis, of cameras that
+survey from above in lines there and back."""
+
 
 @dataclass(frozen=True)
 class World:
@@ -78,10 +82,14 @@ def up_of_cameras(cameras: Sequence[Camera]) -> Vector:
 
     A level camera has a horizontal right-hand axis, however steeply it looks down. The result is
     the last right singular vector of the stacked axes, on the side of the cameras' upward axes.
-    Raises InputError if these cancel.
+    Cameras that look one way, but are held every way round, look down. Raises InputError if the
+    upward axes of others cancel.
     """
+    forward = np.stack([camera.world_to_camera[2, :3] for camera in cameras]).mean(0)
     right = np.stack([camera.world_to_camera[0, :3] for camera in cameras])
     upward = -np.stack([camera.world_to_camera[1, :3] for camera in cameras]).mean(0)
+    if np.linalg.norm(forward) > ONE_WAY and np.linalg.norm(upward) < CANCELLED:
+        return unit_up(-forward)
     values, axes = np.linalg.svd(right)[1:]
     common = axes[2] if len(cameras) > 2 and values[1] > LEVEL * np.sqrt(len(cameras)) else upward
     if np.linalg.norm(common) < 1e-6 or abs(common @ upward) < 1e-6:

@@ -126,7 +126,7 @@ def fit_gaussians(
     cameras: Sequence[Camera],
     targets: Sequence[np.ndarray],
     settings: TrainSettings | None = None,
-    on_pass: Callable[[int, int], None] | None = None,
+    on_pass: Callable[[int, int, Gaussians], None] | None = None,
     cache: ListCache | None = None,
     start: Gaussians | None = None,
     lam: Mapping[str, float | np.ndarray] | None = None,
@@ -140,7 +140,7 @@ def fit_gaussians(
         black; or [H,W,4] with a weight per pixel, 1 where its colour is known and 0 where not; or
         [H,W,5] with weight and alpha, required if `settings.alpha_weight` is not 0. They are
         compared in the space in which the Gaussians are blended (`Gaussians.linear`).
-    on_pass(done, most): called after each pass.
+    on_pass(done, most, model): called after each pass, with a model of TensorXf fields.
     start: mean of the prior; by default the given Gaussians.
     lam: the prior's information about each kind of parameter (`mgs.gaussians.learned`), (pixel
         value / unit of the parameter)^2: a number, or except for means an array that broadcasts to
@@ -204,7 +204,7 @@ def fit_gaussians(
             best = model
         losses.append(mean)
         if on_pass:
-            on_pass(done + 1, settings.passes)
+            on_pass(done + 1, settings.passes, model)
         tolerance = 0.0 if done < end else settings.tolerance
         stop = stop_reason(losses, tolerance, settings.passes)
     passes = len(losses) - 1

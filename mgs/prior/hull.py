@@ -6,6 +6,7 @@ of a pixel there. The least value is positive inside the hull; marching cubes fi
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +19,7 @@ from mgs.data.frames import Frame
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh
 from mgs.data.visibility import in_image, nearest_point
-from mgs.errors import InputError
+from mgs.errors import InputError, Notice
 from mgs.prior.surface import Surface
 
 COARSE, REFINEMENTS = 48, 2
@@ -46,6 +47,9 @@ LEAST_PIECE = 0.02
 """Least volume of a piece of the hull over that of the largest. Smaller ones are specks, of masks
 that are not exact."""
 
+ODD = 0.5
+"""Least share of what few frames cut away, for a mask that cuts it away to be left out."""
+
 FEW = 0.1
 """Share of the frames that see a point of the object and may carve it by mistake."""
 
@@ -56,9 +60,40 @@ def visual_hull(
     """Visual hull of the masks of frames, smoothed by at most half a cell; its numbers have the
     mean and least share of a mask that it fills.
 
-    Raises InputError if all masks are empty or full, if they share no point of space, or if the
-    hull fills too little of them, because poses and masks do not fit; the message names frames.
+    A few masks that cut away what no others do are left out, with a warning. Raises InputError if
+    all masks are empty or full, if they share no point of space, or if the hull fills too little of
+    them, because poses and masks do not fit; the message names frames.
     """
+    others = list(frames)
+    while True:
+        try:
+            return _carved(others, on_stage)
+        except _Contradiction as error:
+            if error.share < ODD or len(frames) - len(others) >= FEW * len(frames):
+                raise InputError(f"{error}") from None
+            name = others.pop(error.place).name
+            text = (
+                f"the mask of {name} cuts away {error.share:.0%} of what few others cut away; it "
+                f"shapes no hull, and `mgs import --exclude {name}` leaves its image out"
+            )
+            warnings.warn(Notice(text), stacklevel=2)
+
+
+class _Contradiction(InputError):
+    """Masks that do not fit, with the place of the frame that fits least and the share that it
+    alone cuts away."""
+
+    def __init__(self, what: str, frames: Sequence[Frame], odd: tuple[int, float, float]) -> None:
+        self.place, self.share, usual = odd
+        super().__init__(
+            f"prior: {what}; frame {frames[self.place].name} cuts away {self.share:.0%} of the "
+            f"space that few other frames cut away (the median frame {usual:.0%}); "
+            "correct its mask or pose, or remove its photograph"
+        )
+
+
+def _carved(frames: Sequence[Frame], on_stage: Callable[[str], None]) -> Surface:
+    """`visual_hull` of all frames. Raises _Contradiction where their masks do not fit."""
     from skimage.measure import marching_cubes
 
     on_stage("visual hull")
@@ -69,10 +104,8 @@ def visual_hull(
     points = lo + edge / cells * nodes.reshape(-1, 3)
     field = _inside(views, points, 2 * NEAR_SURFACE * edge / cells).reshape(nodes.shape[:3])
     if field.max() <= 0:
-        raise InputError(
-            f"prior: the masks share no point in space; {_odd_one(frames, views, points)}; "
-            "correct its mask or pose, or remove its photograph"
-        )
+        what = "the masks share no point in space"
+        raise _Contradiction(what, frames, _odd_one(views, points))
     for _ in range(REFINEMENTS):
         field, cells = _refined(field), 2 * cells
         near = np.argwhere(np.abs(field) < NEAR_SURFACE * edge / cells)
@@ -172,8 +205,9 @@ def _inside(views: Sequence[_View], points: np.ndarray, reach: float) -> np.ndar
     return np.where(outside, -reach, np.minimum(least, reach)).astype(np.float32)
 
 
-def _odd_one(frames: Sequence[Frame], views: Sequence[_View], points: np.ndarray) -> str:
-    """Part of a message: the frame that carves most of the points that few others carve (FEW).
+def _odd_one(views: Sequence[_View], points: np.ndarray) -> tuple[int, float, float]:
+    """Place of the frame that carves most of the points that few others carve (FEW), the share of
+    them that it carves, and that of the median frame.
 
     points: [N,3], of the coarse grid.
     """
@@ -182,10 +216,7 @@ def _odd_one(frames: Sequence[Frame], views: Sequence[_View], points: np.ndarray
     above = carved.sum(axis=0) - np.maximum(FEW * seen, 1)
     above[seen < min(LEAST_VIEWS, len(views))] = len(views)
     share = carved[:, above <= max(above.min(), 0)].mean(axis=1)
-    return (
-        f"frame {frames[int(share.argmax())].name} cuts away {share.max():.0%} of the space that "
-        f"few other frames cut away (the median frame {np.median(share):.0%})"
-    )
+    return int(share.argmax()), float(share.max()), float(np.median(share))
 
 
 def _refined(field: np.ndarray) -> np.ndarray:
@@ -224,10 +255,7 @@ def _checked_agreement(
         filled.append((depth(view.camera)[mask] > 0).mean() if mask.any() else np.nan)
     agreement = np.array(filled)
     if not np.nanmedian(agreement) >= AGREEMENT:
-        raise InputError(
-            "prior: the masks carve away most of the object (the hull fills "
-            f"{np.nanmedian(agreement):.0%} of the median mask); "
-            f"{_odd_one(frames, views, points)}; "
-            "correct its mask or pose, or remove its photograph"
-        )
+        filled_share = f"{np.nanmedian(agreement):.0%} of the median mask"
+        what = f"the masks carve away most of the object (the hull fills {filled_share})"
+        raise _Contradiction(what, frames, _odd_one(views, points))
     return agreement

@@ -78,6 +78,16 @@ def evaluate_run(
         return metrics
 
 
+def drawn_test_view(run: Run, model: Gaussians) -> tuple[Path, float]:
+    """Draw a model in the first test view of a run, or without one in the first view it took, into
+    RUN/renders beside the truth; returns the picture's path and the PSNR, dB."""
+    tests, folder = run.dataset.test_views(), run.folder / "renders"
+    frame = tests.frames[0] if tests else run.dataset.frames[0]
+    folder = folder / TEST_FOLDER if tests else folder
+    metrics = evaluate_model(model, [frame], [], pictures=folder)
+    return folder / f"{frame.name}.png", metrics["all"]["psnr"]
+
+
 def _informed(run: Run) -> dict[str, dict[str, int]]:
     """Number of parameters by kind ("of"), and number of those about which the views say more than
     the prior ("informed", H > lambda)."""

@@ -83,8 +83,9 @@ def refit_in_srgb(run: Run, progress: Callable[[int, int], None]) -> Gaussians:
     frames = run.taken
     gains = exposure_of(run.prior)(frames) if run.settings.exposure else np.ones((len(frames), 3))
     targets = Deferred(range(len(frames)), lambda i: without_gain(target_of(frames[i]), gains[i]))
-    cameras = [frame.camera for frame in frames]
-    return fit_gaussians(in_srgb(run.state.gaussians), cameras, targets, REFIT, progress).gaussians
+    cameras, model = [frame.camera for frame in frames], in_srgb(run.state.gaussians)
+    on_pass = lambda done, most, _: progress(done, most)  # noqa: E731
+    return fit_gaussians(model, cameras, targets, REFIT, on_pass).gaussians
 
 
 def to_y_up(up: Vector) -> np.ndarray:

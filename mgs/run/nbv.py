@@ -20,7 +20,7 @@ from mgs.errors import InputError
 from mgs.files import THERE, Ours, atomic_folder, reading, write_json
 from mgs.fit.poses import motion_between
 from mgs.fit.settings import ModelSettings, as_3dgs
-from mgs.gaussians import MAX_SH_DEGREE
+from mgs.gaussians import MAX_SH_DEGREE, Gaussians
 from mgs.learning import information, refine_poses
 from mgs.memory import VIEW_BYTES
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
@@ -70,6 +70,9 @@ FREE_SH = {"points": 1, "hull": 1, "random": 0}
 LOOSE = {"points": 4.0, "hull": 4.0, "random": 40.0}
 """Sources of a prior less sure than the images -> factor on its standard deviations in a fit
 of free means to all images. Chosen constants."""
+
+OnPass = Callable[[int, int, Gaussians], None]
+"""on_pass(done, most, model), called after each pass of a fit."""
 
 
 def run_nbv(
@@ -325,6 +328,7 @@ def resume_nbv(
     progress: Progress = no_progress,
     policy: str | Callable[..., Any] | None = None,
     live: Live | Transport | None = None,
+    on_pass: OnPass = lambda done, most, model: None,
 ) -> Run:
     """Continue a run from its last finished step to its end; return it, with its state.
 
@@ -334,6 +338,8 @@ def resume_nbv(
       taken from the folder. A Run that was started in this process knows its policy.
     - live: as in `start_run`; give it again if pictures are still to be captured. If no pose was
       left, those that were given up are asked for again.
+    - on_pass: called as on_pass(done, most, model) after each pass of a fit; the model has Dr.Jit
+      fields.
 
     A finished run is returned as it is. Raises InputError if the folder holds no run, its inputs
     are missing or changed, another process works on it, a fit diverged, or `policy` is not the
@@ -347,7 +353,7 @@ def resume_nbv(
     state = recording.run(
         run.folder,
         run.settings,
-        scene_of(run, live),
+        replace(scene_of(run, live), on_pass=on_pass),
         scores,
         on_step=on_step,
         progress=progress,
