@@ -30,6 +30,7 @@ from mgs.prior.initial import colours_of, initial_gaussians, pixel_on
 from mgs.progress import Stage, report
 from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups, render
+from mgs.survey.fusion import focus
 
 Value = TypeVar("Value")
 
@@ -132,7 +133,9 @@ class Scene:
 
     @cached_property
     def centre(self) -> np.ndarray:
-        """Middle of the object [3], metres."""
+        """Middle of the object [3], metres; with a random start, what the cameras look at."""
+        if self.prior.kind == "random":
+            return focus(self.frames).point
         return np.asarray(self.prior.points.mean(axis=0))
 
     @cached_property

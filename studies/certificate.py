@@ -125,7 +125,7 @@ def planned(
     rng = np.random.default_rng(seed)
 
     def start(scene: mgs.Scene) -> mgs.State:
-        return before_any_fit(scene, SETUP.seeds)
+        return before_any_fit(scene, scene.seeds(SETUP.seeds))
 
     scene, state, free, made, _ = _of_rock(root, dataset, prior, start)
 

@@ -145,7 +145,7 @@ def fly_and_judge(
     "psnr_mask" over the test views, dB, and "taken".
     """
     scene, tests, _ = shared_scene(root / dataset, root / prior, None)
-    state, mission = before_any_fit(scene, 1), mgs.Mission(seeds=1, budget=frames - 1)
+    state, mission = before_any_fit(scene, scene.seeds(1)), mgs.Mission(seeds=1, budget=frames - 1)
     anywhere = flight_of(scene, state, mission)
     everywhere = [*state.taken, *reachable(scene, state, mission)]
     whole = anywhere.metres(short_tour(anywhere.legs, everywhere))

@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 import mgs
+from mgs.colour import SH_C0
+from mgs.data.visibility import in_image
+from mgs.gaussians import sh_from_rgb
+from mgs.policy import criteria
 from mgs.policy.criteria import Array, observed
 from mgs.policy.poses import angles
-from mgs.run.policies import each
+from mgs.run.policies import Information, Paper, each
+from mgs.splat import fisher, groups, render
+from mgs.splat.reference import sh_basis
+
+LAMBDA = 1e-6
+"""Lambda of FisherRF's code for every parameter. POp-GS states none."""
+
+BINS = 128
+"""Directions of the sphere that nbv_gym counts views in."""
+
+UNSEEN_VARIANCE = 1 / 12
+"""Variance of a colour of which nothing is known: uniform from 0 to 1."""
 
 BLOCKS_AT_ONCE = 2048
 """Blocks whose determinants are computed together: 2 MB, which fit into a core's cache."""
@@ -42,7 +59,12 @@ def predicted_variance(F: Array, H: Array, lam: Array, weight: Array) -> float:
 
 
 def block_d(scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
-    """Eq. 7 for the exact 11x11 blocks, whatever the estimator of the run [C]."""
+    """Eq. 7 for the exact 11x11 blocks (14x14 with free means), whatever the estimator [C]."""
+    return _block_d(scene, state, views, scene.lam)
+
+
+def _block_d(scene: mgs.Scene, state: mgs.State, views: list[int], lam: Array) -> np.ndarray:
+    """`block_d` with another lambda [P]."""
 
     def F(view: int) -> Array:
         return scene.information(state, view, "block")
@@ -51,8 +73,8 @@ def block_d(scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
     H = np.array(F(first), np.float64)
     for view in others:
         H += F(view)
-    before = block_log_determinant(H, scene.lam)
-    return each(views, lambda i: block_log_determinant(H + F(i), scene.lam)) - before
+    before = block_log_determinant(H, lam)
+    return each(views, lambda i: block_log_determinant(H + F(i), lam)) - before
 
 
 def block_log_determinant(H: Array, lam: Array) -> float:
@@ -82,3 +104,113 @@ def completeness(seen: Array, surface_H: Array, surface_lam: Array) -> np.ndarra
     """Completeness after ActiveSplat (2024): squared blending weights of the surface's Gaussians
     that no view has observed, summed [C]. Zero once all are, as with `coverage`."""
     return np.asarray(seen[:, ~observed(surface_H, surface_lam)].sum(axis=1))
+
+
+# --- Published policies, as near as we get: see docs/results.md, The published protocol -----------
+
+
+def _with_lambda(name: str, criterion: criteria.Score) -> Information:
+    """Policy of a criterion with LAMBDA for all parameters, whatever the scene's lambda."""
+    return Information(name, lambda F, H, lam: criterion(F, H, np.full_like(lam, LAMBDA)))
+
+
+fisherrf_paper = _with_lambda("fisherrf (paper)", criteria.fisherrf)
+popgs_t = _with_lambda("popgs-t", criteria.t_optimal)
+popgs_d = _with_lambda("popgs-d", criteria.d_optimal)
+
+
+def popgs_block(scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
+    """POp-GS's D-optimality of blocks, with LAMBDA [C]."""
+    return _block_d(scene, state, views, np.full_like(scene.lam, LAMBDA))
+
+
+def fisherrf_code(scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
+    """FisherRF as its code computes it: sum F / (H + LAMBDA) [C], in front of white.
+
+    Its CUDA kernel squares the gradient of each pixel by colours, scales, opacity and means, after
+    it has summed the channels (for colours each alone). PyTorch then multiplies by the derivative
+    of scale and opacity by their stored values once, not twice. Quaternions are left out.
+    """
+    model, of = state.gaussians, groups(0, "free")
+    mean = model.sh[:, :1].mean(axis=2, keepdims=True)
+    grey = replace(model, sh=np.repeat(mean, 3, axis=2))
+    opacity = 1 / (1 + np.exp(-model.logit_opacities))
+    slope = np.ones((len(model), of["mean"].stop))
+    slope[:, of["scale"]] = np.exp(model.log_scales)
+    slope[:, of["opacity"]] = (opacity * (1 - opacity))[:, None]
+    factor = 3 / slope  # three equal channels: (3 g)^2 = 3 (3 g^2)
+    factor[:, of["colour"]], factor[:, of["rotation"]] = 1, 0
+
+    def F(view: int) -> Array:
+        camera = state.frames[view].camera
+        return factor * fisher(grey, camera, background=1.0, cache=scene.cache, means="free")
+
+    weight = 1 / (sum(map(F, state.taken)) + LAMBDA)
+    return each(views, lambda i: float((F(i) * weight).sum()))
+
+
+def paper_still(scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
+    """The policy `paper` without information about means, where they are free [C]."""
+    train = scene.settings.train.model_copy(update={"means": "frozen"})
+    settings = scene.settings.model_copy(update={"train": train})
+    return Paper()(scene.once("still", lambda: replace(scene, settings=settings)), state, views)
+
+
+def _drawn(scene: mgs.Scene, model: mgs.Gaussians, view: mgs.Camera, values: Array) -> np.ndarray:
+    """Sums over the Gaussians of w values, and of w, in each pixel [2,H,W]. values: [N], 0 to 1."""
+    grey = sh_from_rgb(np.repeat(values[:, None], 3, axis=1))
+    image = render(replace(model, sh=grey), view, cache=scene.cache)
+    return np.stack([np.asarray(image.rgb)[..., 0], np.asarray(image.alpha)])
+
+
+def _towards(model: mgs.Gaussians, camera: mgs.Camera) -> np.ndarray:
+    """Unit vectors from the camera to the means [N,3]."""
+    offset = model.means - camera.position
+    return np.asarray(offset / np.linalg.norm(offset, axis=1, keepdims=True))
+
+
+def cover_gym(scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
+    """COVER as nbv_gym computes it [C]: blending weights to the first power, BINS directions, every
+    Gaussian in the frustum counted as seen, hidden or not, and the mean over pixels that show
+    something. Its radius clip of 3 pixels is left out."""
+    model, i = state.gaussians, np.arange(BINS)
+    z, turn = 1 - (2 * i + 1) / BINS, np.pi * (np.sqrt(5) - 1) * i
+    flat = np.sqrt(1 - z**2)
+    bins = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], 1)
+    met = np.zeros((len(model), BINS), bool)
+    for camera in (state.frames[k].camera for k in state.taken):
+        seen = np.flatnonzero(in_image(camera, *camera.project(model.means)))
+        met[seen, (_towards(model, camera)[seen] @ bins.T).argmax(1)] = True
+
+    def novelty(view: int) -> float:
+        camera = state.frames[view].camera
+        covered = np.where(met, (1 + _towards(model, camera) @ bins.T) / 2, 0).max(1)
+        drawn, alpha = _drawn(scene, model, camera, covered)
+        return -float(drawn.sum() / max((alpha > 0).sum(), 1))
+
+    return each(views, novelty)
+
+
+def gavis_like(scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
+    """Expected information of a view by an anisotropic visibility field, after GAVIS (2026) [C].
+
+    The field of each Gaussian is the sum over the views that observe it of a spherical-harmonic
+    kernel (degree 3, 1 at its centre), clipped to [0, 1]. A pixel's variance is that of its noise,
+    and UNSEEN_VARIANCE times the sum of w (1 - field). The gain is the sum over pixels of
+    1/2 log(variance / noise). GAVIS's Bayesian network and its planner are not reproduced.
+    """
+    model, least = state.gaussians, scene.lam[0] / SH_C0**2
+    field = np.zeros((len(model), 16))
+    for k in state.taken:
+        camera = state.frames[k].camera
+        observing = scene.information(state, k)[:, :3].max(axis=1) / SH_C0**2 > least
+        field += observing[:, None] * sh_basis(_towards(model, camera), 3) * (4 * np.pi / 16)
+
+    def gain(view: int) -> float:
+        camera = state.frames[view].camera
+        visible = (field * sh_basis(_towards(model, camera), 3)).sum(1).clip(0, 1)
+        unseen, _ = _drawn(scene, model, camera, 1 - visible)
+        ratio = UNSEEN_VARIANCE / scene.settings.pixel_noise**2
+        return float(0.5 * np.log1p(ratio * unseen.clip(0)).sum())
+
+    return each(views, gain)

@@ -8,6 +8,7 @@ of every test, because rocks of one scene are not independent.
 
 from __future__ import annotations
 
+import time
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,6 +27,7 @@ from mgs.policy.poses import path_length
 from mgs.run import policy_file
 from mgs.run.inputs import policy_record
 from mgs.run.loop import finished
+from mgs.run.policies import Policy
 from studies.frame.case import FRESH, NAMESAKE, ROCKS, Case, Rock, Size, rocks_of, test_views_of
 from studies.frame.claim import Row, holm, interval, permutation_p
 from studies.frame.output import (
@@ -215,15 +217,8 @@ def choose_and_judge(
     mission = mgs.Mission(**{k: v for k, v in settings.items() if k not in ("policy", "seed")})
     policy = policy_file.policy_of(name) if name != ORACLE else _oracle(shared)
     start = _after_seeds if policy.needs_fit else before_any_fit
-    state = start(shared, mission.seeds)
-    if policy.needs_fit:
-        for item in mgs.select_views(scene, policy, mission, state):
-            state = item if isinstance(item, mgs.State) else state
-    else:
-        unused = np.zeros_like(state.H)  # information about a model that there is not
-        while not finished(scene, state, mission):
-            view, _ = mgs.choose(scene, state, policy, mission)
-            state = with_view(scene, state, view, unused)
+    state = start(shared, tuple(shared.seeds(mission.seeds)))
+    state, _ = choose_views(scene, policy, mission, state)
     train = scene.settings.train.model_copy(update={"passes": passes})
     taken = list(state.taken)
     model = fit_views(scene, scene.frames, taken, train=train)[0].gaussians
@@ -236,6 +231,24 @@ def choose_and_judge(
         "path": path_length(scene.positions([scene.frames[i] for i in taken])),
         "taken": taken,
     }
+
+
+def choose_views(
+    scene: mgs.Scene, policy: Policy, mission: mgs.Mission, state: mgs.State
+) -> tuple[mgs.State, list[float]]:
+    """Choose views one by one until the mission is over: the last state, and the CPU seconds of
+    each choice. Models are fitted only if the policy needs them."""
+    unused = np.zeros_like(state.H)  # information about a model that there is not
+    seconds = []
+    while not finished(scene, state, mission):
+        began = time.process_time()
+        view, _ = mgs.choose(scene, state, policy, mission)
+        seconds.append(time.process_time() - began)
+        if policy.needs_fit:
+            state = mgs.learn(scene, [*state.taken, view], state)
+        else:
+            state = with_view(scene, state, view, unused)
+    return state, seconds
 
 
 def _oracle(scene: mgs.Scene) -> Any:
@@ -271,14 +284,14 @@ def shared_scene(
 
 
 @lru_cache(maxsize=1)
-def _after_seeds(scene: mgs.Scene, seeds: int) -> mgs.State:
+def _after_seeds(scene: mgs.Scene, seeds: tuple[int, ...]) -> mgs.State:
     """State after the fit to the seeds, the same for every policy."""
-    return mgs.learn(scene, scene.seeds(seeds))
+    return mgs.learn(scene, seeds)
 
 
-def before_any_fit(scene: mgs.Scene, seeds: int) -> mgs.State:
-    """State after the seeds, with the Gaussians before training and no information about them."""
-    views, nothing = tuple(scene.seeds(seeds)), np.zeros(0)
+def before_any_fit(scene: mgs.Scene, views: Sequence[int]) -> mgs.State:
+    """State after these seeds, with the Gaussians before training and no information about them."""
+    views, nothing = tuple(views), np.zeros(0)
     start = scene.start(tuple(scene.frames[i] for i in views))
     state = mgs.State(scene.frames, views, len(views), start, nothing, nothing)
     surface = surface_information(scene, state, views)

@@ -1,5 +1,6 @@
 """Policies: laws of an information gain, and each policy against its formula."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,12 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from splat.scenes import make_camera, make_gaussians
 
+import mgs
 from mgs.colour import SH_C0
 from mgs.policy import criteria
 from mgs.policy import poses as pose_policies
 from mgs.run.policies import POLICIES
-from mgs.splat import groups
+from mgs.splat import groups, reference
 from mgs.synth.orbit import orbit_positions
 from mgs.synth.scene_file import Orbit
 from studies import policies as studied
@@ -156,6 +159,43 @@ def test_policies_use_their_own_estimator():
     lam = np.full(11, gradients[0].mean())  # of the one view taken
     paper = [criteria.d_optimal(F, gradients[0], lam) for F in gradients[1:]]
     assert POLICIES["paper"](scene, state, [1, 2, 3]) == pytest.approx(paper)
+
+
+def test_fisherrf_code_squares_the_gradient_of_each_pixel():
+    """Channels are summed first, and activations enter once (its CUDA kernel and PyTorch)."""
+    model = make_gaussians(5, 3, colour=0.4)
+    eyes = [(2.0, 0.4, 1.1), (0.2, 2.1, 0.8), (-1.9, 0.3, 1.0)]
+    cameras = [make_camera((24, 18), 30.0, eye) for eye in eyes]
+    state = mgs.State((), (0,), 1, model, np.zeros(0), np.zeros(0))
+    state = replace(state, frames=tuple(SimpleNamespace(camera=camera) for camera in cameras))
+    o = 1 / (1 + np.exp(-model.logit_opacities.astype(np.float64)))
+
+    def F(camera):
+        J = reference.jacobian(model, camera, (1.0, 1.0, 1.0), "free")
+        squares = (J.sum(1) ** 2).sum(0)
+        squares[:, :3] = (J[..., :3] ** 2).sum((0, 1))
+        squares[:, 3:6] /= np.exp(model.log_scales)
+        squares[:, 6:10] = 0
+        squares[:, 10] /= o * (1 - o)
+        return squares
+
+    scores = [(F(camera) / (F(cameras[0]) + 1e-6)).sum() for camera in cameras[1:]]
+    found = studied.fisherrf_code(SimpleNamespace(cache=None), state, [1, 2])
+    assert found == pytest.approx(scores, rel=1e-3)
+
+
+def test_visibility_baselines_prefer_the_other_side():
+    """One Gaussian, seen from +X: a pose beside it is worth less than one beyond it."""
+    model = replace(make_gaussians(1, 0), means=np.zeros((1, 3), np.float32))
+    model = replace(model, logit_opacities=np.full(1, 3, np.float32))
+    eyes = [(2.0, 0, 0.5), (1.9, 0.3, 0.5), (-2.0, 0, 0.5)]
+    frames = tuple(SimpleNamespace(camera=make_camera((24, 18), 30.0, eye)) for eye in eyes)
+    state = mgs.State(frames, (0,), 1, model, np.zeros(0), np.zeros(0))
+    scene = SimpleNamespace(cache=None, lam=LAM, settings=SimpleNamespace(pixel_noise=0.02))
+    scene.information = lambda state, view: np.full((1, 11), 1e3)
+    for policy in (studied.cover_gym, studied.gavis_like):
+        near, far = policy(scene, state, [1, 2])
+        assert far > near
 
 
 def test_cover_and_completeness_look_at_what_was_not_observed():

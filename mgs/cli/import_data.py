@@ -51,6 +51,7 @@ def import_data(
     pose: str | None = None,
     exclude: list[str] | None = None,
     split: str = "train",
+    test_split: str | None = None,
     force: bool = False,
 ) -> None:
     """Make a dataset from your own data: cameras and images, with depth and masks if there are any.
@@ -77,6 +78,7 @@ def import_data(
     - pose TOPIC: Topic of a bag's poses of the camera, or of the body that carries it.
     - exclude NAME: Leave this image out; repeat for more.
     - split: Split of NeRF-synthetic data to import: train, val or test.
+    - test_split: Split of NeRF-synthetic data that becomes the test views; publications take test.
     """
     from mgs.data.agreement import agreement
     from mgs.data.bags import is_bag
@@ -94,6 +96,8 @@ def import_data(
         )
     if unit is not None and distance is not None:
         raise InputError("import: --unit and --distance both give the scale; give one of them")
+    if test_split is not None and test_every is not None:
+        raise InputError("import: --test-split and --test-every both choose test views; give one")
     unpacked = out.with_name(f"{out.name}.unpacked")
     with (
         scratch_folder(unpacked, resumable=not is_bag(source)) as scratch,
@@ -108,6 +112,7 @@ def import_data(
             unpack=unpacked,
             pose=pose,
             exclude=exclude or [],
+            test_split=test_split,
         )
         shots = shots if unit is None else shots.in_metres(unit)
         shots = shots if distance is None else shots.with_distance(distance)

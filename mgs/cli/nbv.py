@@ -49,6 +49,7 @@ def nbv(
     out: Path | None = None,
     prior: Path | None = None,
     gaussians: str | None = None,
+    source: str | None = None,
     policy: Annotated[str | None, typer.Option(help=NAMES)] = None,
     budget: str | None = None,
     seeds: int | None = None,
@@ -70,6 +71,8 @@ def nbv(
 
     - dataset: Dataset folder (transforms.json). Not needed with --resume.
     - out: New folder for the run.
+    - source: Source of a prior built in the run, as of `mgs prior`; random: random points with free
+      means, and no mask is read but those of views taken.
     - budget N|auto: auto: as few as have the share `enough` of the gain of all candidates.
     - resume RUN: Continue this run with the settings of its config.json. Give --policy FILE.py and
       options of live capture again.
@@ -86,6 +89,7 @@ def nbv(
     live = live_capture(capture_command, capture_folder, values.pop("capture", {}))
     if resume is not None:
         others = not_none(dataset=dataset, out=out, prior=prior, gaussians=gaussians, budget=budget)
+        others |= not_none(source=source)
         others |= not_none(seeds=seeds, batch=batch, seed=seed, config=config, force=force or None)
         for name in others | values:
             where = f"--resume takes its settings from {resume / 'config.json'}; change it there"
@@ -99,7 +103,7 @@ def nbv(
         raise InputError(f"{config}: its policy is a program, {own}; to run it, add --policy {own}")
     values |= not_none(policy=policy, budget=budget, seeds=seeds, batch=batch, seed=seed)
     dataset = dataset or values.get("dataset")
-    if gaussians is None:
+    if gaussians is None and source is None:
         prior = prior or values.get("prior")
     if dataset is None or out is None:
         raise InputError("nbv: give a DATASET and --out RUN; or --resume RUN")
@@ -110,6 +114,7 @@ def nbv(
         live=live,
         prior=prior,
         gaussians=parse_gaussians(gaussians),
+        source=source,
         force=force,
         **{key: value for key, value in values.items() if key not in ("dataset", "prior")},
     )

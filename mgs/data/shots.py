@@ -129,6 +129,16 @@ class Source:
         counted = self.left_out + Counter({"excluded": len(out)})
         return replace(self, shots=shots, left_out=counted)
 
+    def with_tests(self, other: Source) -> Source:
+        """Source with the shots of another of the same world, which become its test views."""
+        return replace(
+            self,
+            shots=[*self.shots, *other.shots],
+            left_out=self.left_out + other.left_out,
+            notes=(*self.notes, *other.notes),
+            tests=frozenset(shot.name for shot in other.shots),
+        )
+
     def set_apart(self, every: int | None) -> tuple[Source, Source | None]:
         """Split into (training, test): the shots that the source sets apart, or every Nth by name,
         from the first. Raises InputError if no training shot is left."""

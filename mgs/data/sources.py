@@ -80,17 +80,19 @@ def read_source(
     unpack: Path | None = None,
     pose: str | None = None,
     exclude: Sequence[str] = (),
+    test_split: str | None = None,
 ) -> Source:
     """Recognise the format of a source, and read its cameras and file names.
 
     source: a transforms.json or its folder; a folder with NeRF-synthetic's transforms_SPLIT.json;
     a folder with a COLMAP model in itself, sparse/ or sparse/N/; one of RECORDINGS; or a folder of
     photographs alone. images: the image folder, by default SOURCE/images, or that of the names in
-    transforms.json; of a bag the topic. split: train, val or test. keyframes: `Spacing` of a
-    recording. unpack: folder for the images of a bag and the matches of photographs, by default
-    SOURCE.unpacked. pose: topic of a bag's poses. exclude: names of images to leave out. Raises
-    InputError if no format is recognised, no image exists, a frame is listed twice, a camera model
-    is not supported, or photographs cannot be placed.
+    transforms.json; of a bag the topic. split: train, val or test. test_split: the split that is
+    set apart as test views. keyframes: `Spacing` of a recording. unpack: folder for the images of a
+    bag and the matches of photographs, by default SOURCE.unpacked. pose: topic of a bag's poses.
+    exclude: names of images to leave out. Raises InputError if no format is recognised, no image
+    exists, a frame is listed twice, a camera model is not supported, photographs cannot be placed,
+    or there is no such test split.
     """
     source = Path(source)
     source.exists()  # an OSError of the source itself is not one of a file that it names
@@ -98,6 +100,9 @@ def read_source(
         result = checked(
             source, _recognised(source, images, split, keyframes, unpack, pose, exclude)
         )
+        if test_split is not None:
+            tests = checked(source, _split_apart(source, images, split, test_split))
+            result = result.with_tests(tests)
     except OSError as error:
         raise InputError(
             f"{source}: a file of it cannot be read ({error.strerror or error}); correct its name"
@@ -146,6 +151,16 @@ def _recognised(
         f"transforms_{split}.json or COLMAP model (cameras, images and points3D, .bin or .txt, in "
         f"sparse/0, sparse or the folder itself), and is no {', '.join(RECORDINGS)}"
     )
+
+
+def _split_apart(source: Path, images: Path | None, split: str, test_split: str) -> Source:
+    """The split of NeRF-synthetic data that becomes test views. Raises InputError where it is the
+    training split, or does not exist."""
+    path = source / f"transforms_{test_split}.json"
+    if test_split == split or not path.is_file():
+        fault = "is the training split" if test_split == split else f"there is no {path}"
+        raise InputError(f"--test-split {test_split}: {fault}; give another, or --test-every N")
+    return _read_transforms(path, images)
 
 
 def find_image(folder: Path, name: str) -> Path | None:

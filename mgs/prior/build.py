@@ -110,6 +110,7 @@ def build_prior(
     *,
     source: str | None = None,
     points: Path | None = None,
+    shown: Sequence[Frame] | None = None,
     **given: Any,
 ) -> Prior:
     """Build the prior of a dataset, as in `build_prior("demo/dataset", gaussians=2000)`.
@@ -118,11 +119,14 @@ def build_prior(
     - on_stage: called with the name of each stage.
     - source: "depth", "points", "hull" (of the masks) or "random"; by default the first that the
       dataset has. points: PLY file in place of the dataset's points.
+    - shown: frames whose masks a "random" prior may read, by default all.
 
     Raises InputError if the dataset lacks the source, or no surface is found that a frame sees.
     """
     dataset = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     asked = replace(settings or PriorSettings(), **given)
+    if source == "random" and shown is not None:
+        return _random_prior(dataset, asked, shown)
     return prior_and_cloud(dataset, asked, on_stage, source=source, points=points)[0]
 
 
@@ -141,12 +145,11 @@ def prior_and_cloud(
     mesh; NoSurface, which holds the cloud, if points give no surface.
     """
     chosen = source_of(dataset, source, points)
-    if chosen != "depth":
-        whole = chosen == "random" and (dataset.root / CLOUD).is_file()
-        check_photographs(dataset.frames, of_object=not whole)
-        check_masks(dataset.frames)
     if chosen == "random":
-        return _random_prior(dataset, settings), None
+        return _random_prior(dataset, settings, dataset.frames), None
+    if chosen != "depth":
+        check_photographs(dataset.frames, of_object=True)
+        check_masks(dataset.frames)
     if chosen == "depth":
         surface = _depth_surface(dataset, settings, on_stage)
     else:
@@ -196,9 +199,12 @@ def _place(dataset: Dataset) -> dict[str, Any]:
     return {"up": list(dataset.world.up), "unit": dataset.unit}
 
 
-def _random_prior(dataset: Dataset, settings: PriorSettings) -> Prior:
-    """The prior of the source "random". Raises InputError as `scattered`."""
-    mesh, points, normals, spacing, numbers = scattered(dataset, settings)
+def _random_prior(dataset: Dataset, settings: PriorSettings, shown: Sequence[Frame]) -> Prior:
+    """The prior of the source "random". shown: frames whose masks are read. Raises InputError as
+    `check_photographs`, `check_masks` and `scattered`."""
+    check_photographs(dataset.frames, of_object=not (dataset.root / CLOUD).is_file())
+    check_masks(shown)
+    mesh, points, normals, spacing, numbers = scattered(dataset, settings, shown)
     about = {"from": "random", "frames": len(dataset.frames), **_place(dataset)}
     tolerance = float(numbers["depth_tolerance"])
     return Prior(mesh, points, normals, spacing, tolerance, about | numbers).moved(_as_in_files)

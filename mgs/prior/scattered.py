@@ -5,6 +5,7 @@ Points that came with the cameras, if there are any, take the place of as many r
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -13,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from mgs.data.clouds import read_cloud, views_of
 from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame
 from mgs.data.meshes import Mesh
 from mgs.data.structure import CLOUD
 from mgs.data.visibility import has_masks, mask_share
@@ -41,24 +43,25 @@ DRAWS = 64
 
 
 def scattered(
-    dataset: Dataset, settings: PriorSettings
+    dataset: Dataset, settings: PriorSettings, shown: Sequence[Frame]
 ) -> tuple[Mesh, np.ndarray, np.ndarray, float, dict[str, Any]]:
     """Mesh, points [N,3], unit normals [N,3], spacing and items of prior.json of a random start.
 
-    Points fill the ball that all cameras see, about the point they look at, inside the masks if all
-    frames have them. Otherwise half of them lie outside, evenly in the logarithm of their distance,
-    as background. Well triangulated points of the dataset's cloud, in the masks, come first. The
-    mesh is the ball; normals point outwards, those of the cloud to its cameras. Raises InputError
-    if the settings shape a surface, or the masks share no point of the ball.
+    shown: the frames whose masks are read. Points fill the ball that all cameras see, about the
+    point they look at, inside these masks if each has one. Otherwise half of them lie outside,
+    evenly in the logarithm of their distance, as background. Well triangulated points of the
+    dataset's cloud, in the masks, come first. The mesh is the ball; normals point outwards, those
+    of the cloud to its cameras. Raises InputError if the settings shape a surface, or the masks
+    share no point of the ball.
     """
     import trimesh  # here, because it takes 0.2 s and no other prior needs it
 
     settings.refuse_shaping("a random start has no surface")
     asked, rng = settings.gaussians, generator(settings.seed, "prior/random")
-    pixels = sum(int(frame.mask().sum()) for frame in dataset.frames)
+    pixels = sum(int(frame.mask().sum()) for frame in shown)
     count = min(max(pixels // PIXELS, GAUSSIANS), MOST_GAUSSIANS)
     count = asked if isinstance(asked, int) else count
-    given, views_of_given = _triangulated(dataset, count, rng)
+    given, views_of_given = _triangulated(dataset, shown, count, rng)
     if len(given) and not isinstance(asked, int):
         count = min(count, max(round((1 + MOST_RANDOM) * len(given)), GAUSSIANS))
     middle = focus(dataset.frames).point
@@ -67,7 +70,7 @@ def scattered(
         * np.sin(np.arctan(min(frame.camera.width, frame.camera.height) / 2 / frame.camera.K[0, 0]))
         for frame in dataset.frames
     ]
-    radius, masked = float(np.median(reach)), has_masks(dataset.frames)
+    radius, masked = float(np.median(reach)), has_masks(shown)
     kept, drawn = [given], 0
     while sum(map(len, kept)) < count and drawn < DRAWS * count:
         directions = rng.normal(size=(count, 3))
@@ -76,7 +79,7 @@ def scattered(
         if not masked:
             distance = np.where(rng.random(count) < 0.5, distance, FAR ** rng.random(count))
         points = middle + radius * distance[:, None] * directions
-        share, views = mask_share(points, dataset.frames)
+        share, views = mask_share(points, shown)
         kept.append(points[(views > 0) & (share >= MASK_SHARE)])
         drawn += count
     points = np.concatenate(kept)[:count]
@@ -104,14 +107,15 @@ def scattered(
 
 
 def _triangulated(
-    dataset: Dataset, most: int, rng: np.random.Generator
+    dataset: Dataset, shown: Sequence[Frame], most: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Reliable points [N,3] of the dataset's cloud that lie in some image and in all masks, at most
-    `most`, and unit directions to their cameras [N,3]; none where it has no cloud."""
+    """Reliable points [N,3] of the dataset's cloud, at most `most`, that lie in some of the frames
+    shown and in all their masks, and unit directions to their cameras [N,3]; none without a cloud.
+    """
     if not (dataset.root / CLOUD).is_file():
         return np.zeros((0, 3)), np.zeros((0, 3))
     cloud = read_cloud(dataset.root / CLOUD).upright(dataset.world)
-    share, count = mask_share(cloud.points, dataset.frames)
+    share, count = mask_share(cloud.points, shown)
     kept = np.flatnonzero(reliable(cloud) & (count > 0) & (share >= MASK_SHARE))
     kept = np.sort(rng.permutation(kept)[:most])
     views = views_of(cloud, [frame.camera for frame in dataset.frames])

@@ -23,6 +23,7 @@ from mgs.fit.settings import ModelSettings, as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE, Gaussians
 from mgs.learning import information, refine_poses
 from mgs.memory import VIEW_BYTES
+from mgs.policy.poses import seed_views
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.photographs import source_of as source_of_prior
 from mgs.prior.settings import PriorSettings
@@ -56,6 +57,7 @@ from mgs.run.transports import Transport
 from mgs.run.worth import enough_views
 from mgs.scene import Scene, State
 from mgs.splat.constants import NEAR
+from mgs.survey.fusion import focus
 
 FREE_PASSES = 30
 """Passes of a fit of free means to all images. A chosen constant."""
@@ -140,6 +142,7 @@ def start_run(
     - prior: a folder, or a Prior, which is copied into the run. Default: DATASET/prior if it
       exists, else a prior of `gaussians` built in the run (default: as many as cameras resolve).
     - source: what a prior built in the run is made from (`mgs.prior.photographs.source_of`).
+      "random" reads no mask but those of the seeds; means are then free and the prior loose.
     - loose: as `NbvSettings.with_spacing`.
     - force: replace an existing run.
     - settings: fields of `NbvSettings`. `policy` may also be a function (docs/howto/policy.md),
@@ -174,6 +177,9 @@ def start_run(
         raise InputError("budget auto: needs the images of the seeds; give a number")
     images = root if live is None and not refine else out / DATASET
     where = folder or out / "prior"
+    if source == "random":
+        settings["train"] = {"means": "free"} | dict(settings.get("train", {}))
+        loose = LOOSE["random"]
     policy = settings.get("policy", NbvSettings.model_fields["policy"].default)
     paths = {"dataset": images.resolve(), "prior": where.resolve()}
     mission = _settings(dataset, policy, settings | paths)
@@ -189,6 +195,7 @@ def start_run(
                 dataset.survey(),
                 PriorSettings(gaussians=gaussians, seed=mission.seed),
                 source=source,
+                shown=_seed_frames(dataset, mission) if source == "random" else None,
                 on_stage=lambda stage: progress(f"prior: {stage}", 0, 1),
             )
         )
@@ -210,6 +217,18 @@ def start_run(
         if not isinstance(policy, str):
             (unfinished / POLICY_SOURCE).write_text(source_of(policy), encoding="utf-8")
     return Run(out, mission, dataset if images == root else None, stored, policy)
+
+
+def _seed_frames(dataset: Dataset, mission: NbvSettings) -> list[Frame]:
+    """Frames of the seeds of a run from random points, the only ones whose masks exist by then.
+    Raises InputError for limits of a flight, which need a surface."""
+    if mission.flies or mission.flight.no_fly or mission.flight.clearance is not None:
+        raise InputError("nbv: limits of a flight need a surface, which a random start lacks")
+    positions = np.stack([camera.position for camera in dataset.cameras])
+    if mission.seeds == len(dataset):
+        return list(dataset.frames)
+    seeds = seed_views(positions, focus(dataset.frames).point, mission.seeds)
+    return [dataset.frames[i] for i in seeds]
 
 
 def start_fit(
