@@ -13,6 +13,7 @@ from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ ALPHA_WEIGHT = 1.0
 ONCE = ("popgs-block",)
 """Policies that are run with the first draw alone, since they take minutes."""
 
-OURS = ("directional-i", "directional-d", "d-optimal", "cover", "uniform", "farthest", RANDOM)
+OURS = (RANDOM, "farthest", "directional-i", "directional-d", "cover", "uniform", "d-optimal")
 """Policies of mgs by their names."""
 
 COMPARED: dict[str, Any] = {
@@ -87,25 +88,24 @@ choice on an RTX A2000."""
 class BlenderSize:
     """Sizes of images and models, and numbers of runs.
 
-    downscale: of the 800x800 images. gaussians: of the models by which views are chosen. judged,
-    passes: Gaussians and passes of the fit that is judged. views: numbers of views at the start and
-    at the end. draws: seeds of the random start. scenes: folders with transforms_train.json and
-    transforms_test.json, set by the options.
+    downscale: of the 800x800 images. gaussians: of every model. views: numbers of views at the
+    start and at the end. passes: of the fit that is judged, twice the default. draws: seeds of the
+    random start. scenes: folders with transforms_train.json and transforms_test.json, set by the
+    options.
     """
 
     downscale: int = 4
     gaussians: int = 10_000
-    judged: int = 20_000
     views: tuple[tuple[int, int], ...] = ((2, 10),)
-    passes: int = 30
-    draws: int = 5
+    passes: int = 20
+    draws: int = 3
     policies: tuple[str, ...] = (*OURS, *COMPARED)
     scenes: tuple[Path, ...] = ()
 
 
 SIZES = {
     "quick": BlenderSize(),
-    "full": BlenderSize(1, 100_000, 200_000, ((2, 10), (4, 20)), draws=10),
+    "full": BlenderSize(1, 100_000, ((2, 10), (4, 20)), draws=10),
 }
 
 
@@ -123,8 +123,8 @@ def sized(size: BlenderSize, options: Namespace) -> BlenderSize:
         if policy not in size.policies:
             known = "; ".join(size.policies)
             raise mgs.InputError(f"--policy {policy}: is not compared; choose of {known}")
-    changes = {key: getattr(options, key) for key in ("downscale", "gaussians", "judged")}
-    changes |= {"draws": options.draws, "policies": tuple(options.policy or ())}
+    changes = {key: getattr(options, key) for key in ("downscale", "gaussians", "draws")}
+    changes |= {"policies": tuple(options.policy or ())}
     given = {key: value for key, value in changes.items() if value}
     return replace(size, scenes=tuple(sorted(scenes)), **given)
 
@@ -141,18 +141,14 @@ def cells_of(size: BlenderSize) -> list[Cell]:
     }
     cells = list(data.values())
     for draw in range(size.draws):
-        for scene, (first, last), policy in (
-            (scene, views, policy)
-            for scene in size.scenes
-            for views in size.views
-            for policy in size.policies
-            if draw == 0 or policy not in ONCE
-        ):
+        for (first, last), policy, scene in product(size.views, size.policies, size.scenes):
+            if draw > 0 and policy in ONCE:
+                continue
             how = {"first": first, "last": last, "policy": policy, "seed": draw}
-            how |= {key: getattr(size, key) for key in ("gaussians", "judged", "passes")}
+            how |= {key: getattr(size, key) for key in ("gaussians", "passes")}
             made = data[scene]
             label = policy.replace(", ", "-").replace(" ", "-")
-            where = f"{scene.name}-{size.downscale}/{size.gaussians}-{size.judged}/{first}-{last}"
+            where = f"{scene.name}-{size.downscale}/{size.gaussians}/{first}-{last}"
             cells.append(
                 Cell(
                     f"run/{where}/{label}-{draw}",
@@ -183,7 +179,6 @@ def choose_and_judge(
     policy: str,
     seed: int,
     gaussians: int,
-    judged: int,
     passes: int,
 ) -> dict[str, Any]:
     """Task: choose views until there are `last`, fit all of them from the start, and judge.
@@ -194,9 +189,9 @@ def choose_and_judge(
     """
     data, tests = loaded(root / dataset)
 
-    def start_from(views: Sequence[int], count: int) -> mgs.Scene:
+    def start_from(views: Sequence[int]) -> mgs.Scene:
         shown = [data.frames[i] for i in views]
-        prior = mgs.build_prior(data, gaussians=count, seed=seed, source="random", shown=shown)
+        prior = mgs.build_prior(data, gaussians=gaussians, seed=seed, source="random", shown=shown)
         train = {"means": "free", "alpha_weight": ALPHA_WEIGHT}
         about = {"dataset": data.root, "prior": data.root, "seed": seed, "train": train}
         settings = validated(NbvSettings, about).with_spacing(prior.spacing, LOOSE["random"])
@@ -204,7 +199,7 @@ def choose_and_judge(
 
     positions = np.array([camera.position for camera in data.cameras])
     seeds = [0, *(1 + k for k in spread(positions[1:], positions[:1], np.zeros(3))[: first - 1])]
-    scene, rule = start_from(seeds, gaussians), policy_of(COMPARED.get(policy, policy))
+    scene, rule = start_from(seeds), policy_of(COMPARED.get(policy, policy))
     mission = mgs.Mission(seeds=first, budget=last - first)
     clock = time.process_time
     start = clock()
@@ -212,7 +207,7 @@ def choose_and_judge(
     state, choices = choose_views(scene, rule, mission, state)
     fits = clock() - start - sum(choices)
     start, taken = clock(), list(state.taken)
-    scene = start_from(taken, judged)
+    scene = start_from(taken)
     train = scene.settings.train.model_copy(update={"passes": passes})
     model = fit_views(scene, scene.frames, taken, train=train)[0].gaussians
     seconds = {"choice": float(np.mean(choices)), "fits": fits, "fit": clock() - start}
@@ -223,7 +218,7 @@ def choose_and_judge(
     return {"psnr": float(np.mean(errors)), "taken": taken, **seconds}
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)
 def loaded(dataset: Path) -> tuple[mgs.Dataset, list[tuple[mgs.Frame, np.ndarray]]]:
     """Dataset, and its test views with their pictures in front of white, uint8 sRGB [H,W,3]."""
     data = mgs.load_dataset(dataset)
@@ -325,12 +320,8 @@ STUDY = Study(
             "help": "Folder with NeRF-synthetic scenes, as lego and mic.",
         },
         "--downscale": {"type": at_least(1), "help": "Divisor of 800x800. Default: 4, or full 1."},
-        "--gaussians": {"type": at_least(2), "help": "For choices. Default: 10,000, or 100,000."},
-        "--judged": {
-            "type": at_least(2),
-            "help": "Gaussians of the fit that is judged: twice that.",
-        },
-        "--draws": {"type": at_least(1), "help": "Random starts. Default: 5, or full 10."},
+        "--gaussians": {"type": at_least(2), "help": "Default: 10,000, or full 100,000."},
+        "--draws": {"type": at_least(1), "help": "Random starts. Default: 3, or full 10."},
         "--policy": {"action": "append", "help": "A policy to run; repeatable. Default: all."},
     },
     sized,

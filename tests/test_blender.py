@@ -1,0 +1,74 @@
+"""Policies on a NeRF-synthetic scene of a few pixels, from its split to the tables."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+from program import study
+
+import mgs
+from mgs.camera import opengl_from_opencv
+from mgs.data.sources import read_source
+from mgs.images import write_png
+from studies import blender
+
+FEW = replace(blender.SIZES["quick"], downscale=1, gaussians=60, views=((2, 4),), passes=1, draws=1)
+
+
+@pytest.fixture
+def scenes(tmp_path):
+    """A folder with the scene `ball`: 12 training and 3 test views of a sphere, with alpha."""
+    data = mgs.load_dataset(tiny.write_dataset(tmp_path / "data"))
+    root = tmp_path / "scenes/ball"
+    for split, frames in (("train", data.frames), ("test", data.frames[1::4])):
+        records = []
+        for i, frame in enumerate(frames):
+            alpha = np.where(frame.mask(), 255, 0)
+            colour = np.full((*alpha.shape, 3), 40 + 10 * i)
+            write_png(root / f"{split}/r_{i}.png", np.dstack([colour, alpha]).astype(np.uint8))
+            pose = opengl_from_opencv(frame.camera.world_to_camera).tolist()
+            records.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose})
+        angle = 2 * np.arctan(tiny.WIDTH / 2 / frame.camera.K[0, 0])
+        text = json.dumps({"camera_angle_x": float(angle), "frames": records})
+        (root / f"transforms_{split}.json").write_text(text)
+    return root.parent
+
+
+def test_every_policy_runs_and_no_candidate_is_read(scenes, tmp_path, capsys, monkeypatch):
+    read = []
+    monkeypatch.setattr(mgs.Frame, "target", _noted(mgs.Frame.target, read))
+    monkeypatch.setattr(mgs.Frame, "mask", _noted(mgs.Frame.mask, read))
+    out = tmp_path / "out"
+    study("blender", out, "--dir", scenes, sizes={"quick": FEW})
+    with open(out / "blender.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["policy"] for row in rows} == {*blender.OURS, *blender.COMPARED}
+    taken = [json.loads(row["taken"]) for row in rows]
+    assert all(len(set(views)) == 4 and views[0] == 0 for views in taken)
+    assert len({views[1] for views in taken}) == 1, "all policies have the same seeds"
+    training = {name for name in read if name.startswith("train")}
+    names = [f"train_r_{i}" for i in range(12)]
+    assert training == {names[i] for views in taken for i in views}
+    assert "POp-GS D" in (out / "blender.md").read_text()
+    assert (out / "blender.png").is_file()
+
+
+def _noted(method, names):
+    def call(frame):
+        names.append(frame.name)
+        return method(frame)
+
+    return call
+
+
+def test_a_split_becomes_test_views(scenes):
+    source = read_source(scenes / "ball", test_split="test")
+    train, tests = source.set_apart(None)
+    assert (len(train.shots), len(tests.shots)) == (12, 3)
+    assert {shot.name for shot in tests.shots} == {f"test_r_{i}" for i in range(3)}
+    for split, fault in (("train", "training split"), ("val", "transforms_val.json")):
+        with pytest.raises(mgs.InputError, match=fault):
+            read_source(scenes / "ball", test_split=split)
