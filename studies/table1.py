@@ -267,7 +267,7 @@ def _fit(dataset: Path, prior: Path, settings: dict[str, Any]) -> dict[str, Any]
     data, seed = mgs.load_dataset(dataset), settings["seed"]
     frames, points = list(data.frames), mgs.load_prior(prior).points
     if settings.get("random"):
-        points = scattered(data, mgs.PriorSettings(gaussians=len(points), seed=seed), frames)[1]
+        points = scattered(data, mgs.PriorSettings(gaussians=len(points), seed=seed))[1]
     began = time.perf_counter()
     cameras = [frame.camera for frame in frames]
     passes = settings.get("times", 1) * settings["passes"]

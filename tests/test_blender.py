@@ -11,6 +11,7 @@ from program import study
 
 import mgs
 from mgs.camera import opengl_from_opencv
+from mgs.data.importers import import_source
 from mgs.data.sources import read_source
 from mgs.images import write_png
 from studies import blender
@@ -54,6 +55,22 @@ def test_every_policy_runs_and_no_candidate_is_read(scenes, tmp_path, capsys, mo
     assert training == {names[i] for views in taken for i in views}
     assert "POp-GS D" in (out / "blender.md").read_text()
     assert (out / "blender.png").is_file()
+
+
+def test_a_run_from_random_points_reads_no_candidate(scenes, tmp_path, monkeypatch):
+    shots, tests = read_source(scenes / "ball", test_split="test").set_apart(None)
+    data = import_source(shots, tmp_path / "ball", tests=tests)
+    read = []
+    for name in ("target", "mask"):
+        monkeypatch.setattr(mgs.Frame, name, _noted(getattr(mgs.Frame, name), read))
+    how = {"source": "random", "gaussians": 60, "seeds": 2, "budget": 2, "train": {"passes": 1}}
+    run = mgs.run_nbv(data.root, tmp_path / "run", policy="farthest", **how)
+    assert run.settings.train.means == "free"
+    assert set(read) == {data.frames[i].name for i in run.state.taken}
+    with pytest.raises(mgs.InputError, match="need a surface"):
+        mgs.run_nbv(data.root, tmp_path / "other", flight={"length": 9}, **how)
+    with pytest.raises(mgs.InputError, match="leave out `prior`"):
+        mgs.run_nbv(data.root, tmp_path / "other", prior=tmp_path / "run/prior", source="random")
 
 
 def _noted(method, names):

@@ -43,19 +43,20 @@ DRAWS = 64
 
 
 def scattered(
-    dataset: Dataset, settings: PriorSettings, shown: Sequence[Frame]
+    dataset: Dataset, settings: PriorSettings, shown: Sequence[Frame] | None = None
 ) -> tuple[Mesh, np.ndarray, np.ndarray, float, dict[str, Any]]:
     """Mesh, points [N,3], unit normals [N,3], spacing and items of prior.json of a random start.
 
-    shown: the frames whose masks are read. Points fill the ball that all cameras see, about the
-    point they look at, inside these masks if each has one. Otherwise half of them lie outside,
-    evenly in the logarithm of their distance, as background. Well triangulated points of the
-    dataset's cloud, in the masks, come first. The mesh is the ball; normals point outwards, those
-    of the cloud to its cameras. Raises InputError if the settings shape a surface, or the masks
-    share no point of the ball.
+    shown: the frames whose masks are read, by default all. Points fill the ball that all cameras
+    see, about the point they look at, inside these masks if each has one. Otherwise half of them
+    lie outside, evenly in the logarithm of their distance, as background. Well triangulated points
+    of the dataset's cloud, in the masks, come first. The mesh is the ball; normals point outwards,
+    those of the cloud to its cameras. Raises InputError if the settings shape a surface, or the
+    masks share no point of the ball.
     """
     import trimesh  # here, because it takes 0.2 s and no other prior needs it
 
+    shown = dataset.frames if shown is None else shown
     settings.refuse_shaping("a random start has no surface")
     asked, rng = settings.gaussians, generator(settings.seed, "prior/random")
     pixels = sum(int(frame.mask().sum()) for frame in shown)

@@ -159,8 +159,9 @@ def start_run(
     if holds_run(out) and not force:
         raise InputError(f"{out}: a run {THERE}; `mgs nbv --resume {out}` continues it")
     root = dataset.root if isinstance(dataset, Dataset) else Path(dataset)
-    if prior is not None and gaussians is not None:
-        raise InputError("nbv: `gaussians` builds a prior; leave it out, or leave out `prior`")
+    if prior is not None and (gaussians is not None or source is not None):
+        name = "source" if gaussians is None else "gaussians"
+        raise InputError(f"nbv: `{name}` builds a prior; leave it out, or leave out `prior`")
     if (prior, gaussians, source) == (None,) * 3 and (root / "prior/prior.json").is_file():
         prior = root / "prior"
     folder = Path(prior) if isinstance(prior, str | Path) else None
