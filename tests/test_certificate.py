@@ -10,11 +10,12 @@ from scipy.optimize import minimize
 
 from mgs.errors import InputError
 from mgs.policy import certificate, criteria, directional, relaxation
-from mgs.policy.certificate import best_set, upper_bound
+from mgs.policy.certificate import added_bound, best_set, least_bound, upper_bound
 from mgs.policy.directional import Views
 
 LAM, POSES, POINTS = 0.02**2, 9, 40
 KINDS = ["d", "i", "eq7"]
+EVERY = [*KINDS, "coverage"]
 
 
 def case(kind, seed=0, order=None):
@@ -49,12 +50,14 @@ def case(kind, seed=0, order=None):
     )
     H = rng.choice([0.0, 1.0, 2.0], (POINTS, 4))
     if kind == "coverage":
-        return (F, H, lam), lambda some: criteria.coverage_greedy(F[list(some)].sum(0), H, lam)
+        F, H, lam = F[..., :3], H[:, :3], lam[:3]
+        made = relaxation.Coverage(F, H, lam)
+        return made, lambda some: criteria.coverage_greedy(F[list(some)].sum(0), H, lam)
     made = relaxation.d_optimal(F, H, lam)
     return made, lambda some: criteria.d_optimal(F[list(some)].sum(0), H, lam)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", EVERY)
 @pytest.mark.parametrize("k", [1, 2, 4, POSES])
 def test_every_set_is_below_the_bound_and_branch_and_bound_finds_the_best(kind, k):
     made, gain = case(kind, k)
@@ -100,17 +103,30 @@ def test_gradient_and_curvature_are_those_of_differences(kind):
     )
 
 
-@pytest.mark.parametrize("k", [1, 2, 4, POSES])
-def test_no_set_observes_more_than_the_bound_of_coverage(k):
-    information, gain = case("coverage", k)
-    best = certificate.best_coverage(*information, k, gap=0)
+@pytest.mark.parametrize("k", [1, 3])
+@pytest.mark.parametrize("kind", ["d", "eq7"])
+def test_gains_after_any_views_bound_every_set_where_the_criterion_is_submodular(kind, k):
+    made, gain = case(kind, k)
     largest = max(gain(some) for some in combinations(range(POSES), k))
-    assert best.gain == gain(best.views) <= largest <= best.bound * (1 + 1e-9)
-    assert largest <= 1.1 * best.gain
+    for views in ([], [0], [2, 5, 7]):
+        assert added_bound(made, views, k) >= largest * (1 - 1e-9)
+    holding = max(gain([*some, 0]) for some in combinations(range(1, 5), k))
+    assert added_bound(made, [0], k, np.arange(1, 5)) >= holding * (1 - 1e-9)
+
+
+def test_the_smaller_bound_counts():
+    """The best single view has the largest gain, which the relaxation does not reach."""
+    for kind in KINDS:
+        made, gain = case(kind)
+        largest = max(gain([v]) for v in range(POSES))
+        assert least_bound(made, 1) == pytest.approx(largest, rel=1e-6)
+        assert upper_bound(made, 1).value > 1.01 * largest
+        assert least_bound(made, POSES - 1) == upper_bound(made, POSES - 1).value
+    assert added_bound(case("i")[0], [], 2) == np.inf
 
 
 @settings(max_examples=15)
-@given(st.sampled_from(KINDS), st.integers(0, 10_000), st.randoms(use_true_random=False))
+@given(st.sampled_from(EVERY), st.integers(0, 10_000), st.randoms(use_true_random=False))
 def test_a_bound_grows_with_k_and_does_not_depend_on_the_order(kind, seed, random):
     made, _ = case(kind, seed)
     values = [upper_bound(made, k).value for k in range(1, POSES + 1)]
@@ -121,13 +137,29 @@ def test_a_bound_grows_with_k_and_does_not_depend_on_the_order(kind, seed, rando
     assert moved.value == pytest.approx(values[3], rel=2e-3)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", EVERY)
 def test_duplicates_have_equal_prices_and_reruns_equal_bits(kind):
     order = [0, 1, 2, 3, 3, 5, 6, 7, 8]
     bounds = [upper_bound(case(kind, 5, order)[0], 3) for _ in range(2)]
     assert bounds[0].prices[3] == pytest.approx(bounds[0].prices[4], rel=1e-12)
     for one, other in zip(*bounds, strict=True):
         assert np.array_equal(one, other)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_second_picture_from_a_pose_adds_less_but_something(kind):
+    made, _ = case(kind, 5, [0, 1, 2, 3, 3, 5, 6, 7, 8])
+    first, second = made.added([])[3], made.added([4])[3]
+    assert 0 < second < first
+    assert 0 < made.tangent(np.eye(POSES)[4])[1][3] < made.tangent(np.zeros(POSES))[1][3]
+
+
+def test_a_duplicate_of_a_view_that_observes_what_it_sees_has_no_price_under_coverage():
+    F, lam = np.random.default_rng(1).choice([0.0, 2.0], (POSES, POINTS, 3)), np.ones(3)
+    F[4] = F[3]
+    before, after = (relaxation.Coverage(F, H, lam) for H in (0 * F[3], F[3]))
+    assert upper_bound(after, 3).prices[3] == after.added([])[3] == 0
+    assert before.added([])[3] > before.added([4])[3] == 0
 
 
 def test_a_coarse_start_and_few_steps_change_the_gap_and_never_the_truth(monkeypatch):
@@ -137,7 +169,7 @@ def test_a_coarse_start_and_few_steps_change_the_gap_and_never_the_truth(monkeyp
     coarse, _ = case("i", 2)
     assert len(coarse.coarse.base) < len(coarse.base) / 2
     assert upper_bound(coarse, 3).value == pytest.approx(upper_bound(made, 3).value, rel=2e-3)
-    monkeypatch.setattr(certificate, "STEPS", 1)
+    monkeypatch.setattr(relaxation, "STEPS", 1)
     for kept in (made, case("i", 2)[0]):
         assert upper_bound(kept, 3).value >= largest
     assert upper_bound(made, 3, tolerance=0).stopped == "steps"

@@ -15,7 +15,7 @@ from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
-from mgs.run.settings import ENOUGH, FlightLimits, Positive, validated
+from mgs.run.settings import ENOUGH, FlightLimits, Positive, SearchLimits, validated
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -54,6 +54,8 @@ class Candidates(BaseModel):
     grid, else 0."""
     flight: FlightLimits = FlightLimits()
     """Limits of the flight and of its poses."""
+    certificate: SearchLimits = SearchLimits()
+    """Limits of the search for a better set than the plan."""
     enough: Annotated[float, Field(gt=0, le=1)] = ENOUGH
     """With --views auto: share of the criterion's gain of all candidates that is enough."""
 
@@ -113,7 +115,8 @@ def suggest(
         )
     values = parse_settings(settings, suggest)
     asked = validated(Candidates, values)
-    changes = not_none(flight=values.get("flight"), policy=policy, enough=values.get("enough"))
+    own = ("flight", "enough", "certificate")
+    changes = {key: values[key] for key in own if key in values} | not_none(policy=policy)
     count = parse_gaussians(views, "views") or 1
     ours = Ours(FILES, [path for path in (source, poses, prior) if path]) if force else None
     if out is not None:

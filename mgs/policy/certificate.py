@@ -19,15 +19,11 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse
-from scipy.optimize import LinearConstraint, brentq, milp
+from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from mgs.errors import InputError
-from mgs.policy.criteria import Array, coverage_greedy
-from mgs.policy.relaxation import Floats, Relaxation, checked
-
-TOLERANCE = 1e-3
-"""Gap at which `upper_bound` stops, as a share of the bound."""
+from mgs.policy.relaxation import TOLERANCE, Bound, Criterion, Floats
 
 CLOSE = 1e-2
 """Gap at which `best_set` stops, as a share of the bound."""
@@ -38,35 +34,15 @@ CURVE = (1, 2, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
 NODES = 1000
 """Most nodes of `best_set`. A chosen constant."""
 
-SECONDS = 60.0
-"""Time limit of a bound, by which its gap may depend on the machine. A chosen constant."""
-
-STEPS, EXCHANGES = 30, 3000
-"""Most Newton steps of a bound, and exchanges of weight in each. Chosen constants."""
-
-SUFFICIENT = 1e-3
-"""Least share of the predicted ascent that a step of the line search must reach."""
-
-
-class Bound(NamedTuple):
-    """No set of k candidates has a gain above `value`.
-
-    weights: [C], sum k. prices: derivative of the gain by each weight [C].
-    gap: (value - gain of the best weights) / value. stopped: "gap" if that is small enough, else
-    "time" or "steps".
-    """
-
-    value: float
-    weights: Floats
-    prices: Floats
-    gap: float
-    stopped: str
+Free = slice | NDArray[np.intp]
+"""Indices of candidates."""
 
 
 class Best(NamedTuple):
     """A set of candidates, its gain, and the `bound` that no set of as many exceeds.
 
-    nodes: number of relaxations solved. prices: those of the relaxation without integers [C].
+    nodes: number of relaxations solved after the first. prices: of the first one [C]. stopped:
+    "gap" if that is small enough, else "nodes" or "time".
     """
 
     views: list[int]
@@ -74,33 +50,50 @@ class Best(NamedTuple):
     bound: float
     nodes: int
     prices: Floats
+    stopped: str
 
 
 def upper_bound(
-    relaxation: Relaxation, k: int, tolerance: float = TOLERANCE, seconds: float = SECONDS
+    criterion: Criterion, k: int, tolerance: float = TOLERANCE, seconds: float = np.inf
 ) -> Bound:
-    """Upper bound for the gain of every set of k candidates.
+    """Upper bound for the gain of every set of k candidates, by their criterion.
 
     It stops at a gap of `tolerance` or after `seconds`. Raises InputError for k < 1 and for fewer
     candidates than k.
     """
-    count = relaxation.candidates
-    _check_size(k, count)
-    box = np.zeros(count), np.ones(count)
-    return _bound(relaxation, np.full(count, k / count), box, tolerance, seconds + time.monotonic())
-
-
-def _check_size(k: int, count: int) -> None:
+    count = criterion.candidates
     if not 1 <= k <= count:
         raise InputError(f"certificate: {k} of {count} candidates; ask for 1 to {count}")
+    box = np.zeros(count), np.ones(count)
+    return criterion.bound(np.full(count, k / count), box, tolerance, seconds + time.monotonic())
+
+
+def least_bound(criterion: Criterion, k: int, tolerance: float = TOLERANCE) -> float:
+    """The smaller one of `upper_bound` and `added_bound` for every set of k candidates."""
+    return min(upper_bound(criterion, k, tolerance).value, added_bound(criterion, (), k))
+
+
+def added_bound(
+    criterion: Criterion, views: Iterable[int], room: int, free: Free = slice(None)
+) -> float:
+    """Gain of `views`, and the `room` largest gains after them of the candidates `free`, by default
+    all. Infinite where the criterion is not submodular, unless `room` is 1.
+
+    No set of `views` and so many of `free` has more (Nemhauser, Wolsey and Fisher 1978), nor has a
+    set of so many candidates without `views`.
+    """
+    if room > 1 and not criterion.submodular:
+        return np.inf
+    gains = np.sort(criterion.added(views)[free])[::-1]
+    return criterion.gain(views) + float(gains[:room].sum())
 
 
 def best_set(
-    relaxation: Relaxation,
+    criterion: Criterion,
     plan: Sequence[int],
     gap: float = CLOSE,
     most: int = NODES,
-    seconds: float = SECONDS,
+    seconds: float = np.inf,
 ) -> Best:
     """Improve a plan by branch and bound, and bound all sets of as many candidates.
 
@@ -108,29 +101,33 @@ def best_set(
     node fixes some views as taken and some as left out. The node with the largest bound is next,
     and branches on the view whose weight is nearest to 1/2. Raises InputError as `upper_bound`.
     """
-    k, until = len(plan), time.monotonic() + seconds
-    root = upper_bound(relaxation, k, seconds=seconds)
-    gains = {tuple(sorted(plan)): relaxation.gain(plan)}
-    heap = [(-root.value, 0, np.zeros(len(root.weights)), np.ones(len(root.weights)), root.weights)]
+    k, until, stopped = len(plan), time.monotonic() + seconds, "gap"
+    root = upper_bound(criterion, k, seconds=seconds)
+    gains = {tuple(sorted(plan)): criterion.gain(plan)}
+    lo, hi = np.zeros(len(root.weights)), np.ones(len(root.weights))
+    above = min(root.value, *(added_bound(criterion, some, k) for some in ((), plan)))
+    heap = [(-above, 0, lo, hi, root.weights)]
     closed, pushed, nodes = 0.0, 0, 0
     while heap and -heap[0][0] > (enough := max(gains.values()) / (1 - gap)):
         if nodes == most or time.monotonic() > until:
+            stopped = "nodes" if nodes == most else "time"
             break
         parent, _, lo, hi, x = heapq.heappop(heap)
         nodes += 1
-        if len(views := _last_view(relaxation, lo, hi, k)):
-            closed = max(closed, _noted(gains, relaxation, views))
+        if len(views := _last_view(criterion, lo, hi, k)):
+            closed = max(closed, _noted(gains, criterion, views))
             continue
-        bound = _bound(relaxation, x, (lo, hi), CLOSE / 4, until, enough)
-        bound = bound._replace(value=min(bound.value, -parent))
-        _noted(gains, relaxation, np.argsort(-bound.weights, kind="stable")[:k])
-        if bound.value <= (enough := max(gains.values()) / (1 - gap)):
-            closed = max(closed, bound.value)
+        bound = criterion.bound(x, (lo, hi), CLOSE / 4, until, enough)
+        taken, free = np.flatnonzero(lo), np.flatnonzero(hi > lo)
+        above = min(bound.value, -parent, added_bound(criterion, taken, k - len(taken), free))
+        _noted(gains, criterion, np.argsort(-bound.weights, kind="stable")[:k])
+        if above <= (enough := max(gains.values()) / (1 - gap)):
+            closed = max(closed, above)
             continue
         lo, hi, lost = _fixed(bound, lo, hi, k, enough)
         closed, free = max(closed, lost), np.flatnonzero(hi > lo)
         if not len(free):
-            closed = max(closed, _noted(gains, relaxation, np.flatnonzero(lo)))
+            closed = max(closed, _noted(gains, criterion, np.flatnonzero(lo)))
             continue
         x = bound.weights
         split = free[(x * (1 - x))[free].argmax()]
@@ -140,64 +137,30 @@ def best_set(
             if low.sum() <= k <= high.sum():
                 pushed += 1
                 start = _moved(x, low, high, k)
-                heapq.heappush(heap, (-bound.value, pushed, low, high, start))
+                heapq.heappush(heap, (-above, pushed, low, high, start))
     best = max(gains, key=lambda views: gains[views])
     bound_of_all = max([gains[best], closed, *(-node[0] for node in heap)])
-    return Best(list(best), gains[best], bound_of_all, nodes, root.prices)
-
-
-def best_coverage(
-    F: Array, H: Array, lam: Array, k: int, gap: float = CLOSE, seconds: float = SECONDS
-) -> Best:
-    """`best_set` for `mgs.policy.criteria.coverage_greedy`, in Gaussians. F: [C,N,P].
-
-    A set observes a Gaussian if its information exceeds what is missing. So the number is at most
-    the sum of min(1, s), with s the sum of the views' shares of what is missing: a mixed-integer
-    linear programme, solved by HiGHS. Raises InputError as `upper_bound`.
-    """
-    checked(F)
-    _check_size(k, len(F))
-    missing = np.asarray((lam - H)[:, :3], np.float64)
-    some = (missing >= 0).all(axis=1)
-    share = (F[:, some, :3] / np.maximum(missing[some], 1e-300)).max(axis=2)
-    rows, counts = np.unique(np.minimum(share.T, 1), axis=0, return_counts=True)
-    x, t = np.zeros(len(F)), np.ones(len(rows))
-    observes = LinearConstraint(
-        sparse.hstack([-sparse.csr_array(rows), sparse.eye_array(len(rows))]), ub=0
-    )
-    size = LinearConstraint(np.concatenate([x + 1, 0 * t])[None], k, k)
-    found = milp(
-        np.concatenate([x, -counts]),
-        integrality=np.concatenate([x + 1, 0 * t]),
-        bounds=(0, 1),
-        constraints=[observes, size],
-        options={"time_limit": seconds, "mip_rel_gap": gap},
-    )
-    bound = counts.sum() if found.mip_dual_bound is None else -found.mip_dual_bound
-    weights = x if found.x is None else found.x[: len(F)]
-    views = sorted(int(v) for v in np.argsort(-weights, kind="stable")[:k])
-    gain = coverage_greedy(F[views].sum(axis=0), H, lam)
-    return Best(views, gain, max(gain, float(bound)), found.mip_node_count or 0, x)
+    return Best(list(best), gains[best], bound_of_all, nodes, root.prices, stopped)
 
 
 def _noted(
-    gains: dict[tuple[int, ...], float], relaxation: Relaxation, views: Iterable[int]
+    gains: dict[tuple[int, ...], float], criterion: Criterion, views: Iterable[int]
 ) -> float:
     """Gain of a set, computed once."""
     key = tuple(sorted(int(v) for v in views))
     if key not in gains:
-        gains[key] = relaxation.gain(key)
+        gains[key] = criterion.gain(key)
     return gains[key]
 
 
-def _last_view(relaxation: Relaxation, lo: Floats, hi: Floats, k: int) -> list[int]:
+def _last_view(criterion: Criterion, lo: Floats, hi: Floats, k: int) -> list[int]:
     """Best set of a node that lacks at most one view; empty where it lacks more."""
     taken = [int(v) for v in np.flatnonzero(lo)]
     if len(taken) == k or (hi == lo).all():
         return taken
     if len(taken) < k - 1:
         return []
-    return [*taken, int(np.where(hi > lo, relaxation.added(taken), -np.inf).argmax())]
+    return [*taken, int(np.where(hi > lo, criterion.added(taken), -np.inf).argmax())]
 
 
 def _moved(x: Floats, lo: Floats, hi: Floats, k: int) -> Floats:
@@ -223,92 +186,26 @@ def _fixed(
     return lo, hi, lost
 
 
-def _bound(
-    relaxation: Relaxation,
-    x: Floats,
-    box: tuple[Floats, Floats],
-    tolerance: float,
-    until: float,
-    enough: float = -np.inf,
-) -> Bound:
-    """Least upper bound from tangents, for sets between the 0 and 1 of `box` whose size is sum x.
-
-    First for the coarse relaxation, then from there: Newton steps with the coarse curvature. Stops
-    once the bound is at most `enough`, too.
-    """
-    if len(relaxation.base) > 2 * len(relaxation.coarse.base):
-        x = _bound(relaxation.coarse, x, box, tolerance, until).weights
-    k, best, lower = round(float(x.sum())), None, -np.inf
-    (value, slope), stopped = relaxation.tangent(x), "steps"
-    for _ in range(STEPS):
-        above = value + float(slope @ (_largest(slope, *box, k) - x))
-        if best is None or above < best.value:
-            best = Bound(above, x, slope, 0.0, stopped)
-        lower = max(lower, value)
-        if best.value - lower <= tolerance * best.value or best.value <= enough:
-            stopped = "gap"
-            break
-        if time.monotonic() > until:
-            stopped = "time"
-            break
-        d = _newton_step(relaxation.coarse.curvature(x), slope, x, *box)
-        t, ascent = 1.0, float(slope @ d)
-        new, after = relaxation.tangent(x + d)
-        while new < value + SUFFICIENT * t * ascent and t > SUFFICIENT:
-            t /= 2
-            new, after = relaxation.tangent(x + t * d)
-        x, value, slope = x + t * d, new, after
-    assert best is not None
-    return best._replace(gap=(best.value - lower) / max(best.value, 1e-300), stopped=stopped)
-
-
-def _largest(prices: Floats, lo: Floats, hi: Floats, k: int) -> Floats:
-    """Weights 0 or 1 in the box, with the sum k, that maximise prices^T x."""
-    free = np.flatnonzero(hi > lo)
-    order = free[np.argsort(-prices[free], kind="stable")]
-    x = np.array(lo, np.float64)
-    x[order[: k - int(lo.sum())]] = 1
-    return x
-
-
-def _newton_step(H: Floats, slope: Floats, x: Floats, lo: Floats, hi: Floats) -> Floats:
-    """Maximise slope^T d - d^T H d / 2 for x + d in the box and sum d = 0.
-
-    Exchanges weight between the pair of views that gains most, again and again, as solvers of
-    support vector machines do. H: [C,C].
-    """
-    y, g, diagonal = np.array(x), np.array(slope), np.diagonal(H)
-    small = 1e-9 * float(np.abs(slope).max())
-    least = 1e-9 * float(diagonal.max()) + small  # a flat direction is followed to the box
-    for _ in range(EXCHANGES):
-        i = int(np.where(y < hi, g, -np.inf).argmax())
-        ascent = np.where(y > lo, g[i] - g, 0.0)
-        curve = np.maximum(diagonal[i] + diagonal - 2 * H[i], least)
-        j = int((ascent * np.abs(ascent) / curve).argmax())
-        if ascent[j] <= small:
-            break
-        t = min(ascent[j] / curve[j], hi[i] - y[i], y[j] - lo[j])
-        y[i], y[j] = min(y[i] + t, hi[i]), max(y[j] - t, lo[j])
-        g -= t * (H[i] - H[j])
-    return np.asarray(y - x)
-
-
 @dataclass(frozen=True)
 class Certificate:
     """Worth of a plan of k of C candidates by a criterion; it says nothing about PSNR.
 
     criterion: name of the policy. views, candidates: k and C.
-    share: gain of the plan over the bound of any k. fewer: bound of any k - 1 over that gain; None
-    for one view. of_all: gain of the plan over that of all candidates. prices: of the bound of any
-    k [C] (`Bound`), over its value. curve: see `curve`.
+    share, best: gain of the plan, and of the best set that the search met, over the bound of any k.
+    fewer: bound of any k - 1 over the plan's gain; None for one view. of_all: gain of the plan over
+    that of all candidates. nodes, stopped: of the search (`Best`). prices: of the bound of any k
+    [C] (`Bound`), over its value. curve: see `curve`.
     """
 
     criterion: str
     views: int
     candidates: int
     share: float
+    best: float
     fewer: float | None
     of_all: float
+    nodes: int
+    stopped: str
     prices: list[float]
     curve: list[dict[str, float]] = field(default_factory=list)
 
@@ -322,42 +219,49 @@ class Certificate:
         text = f"These {k} views have" if k > 1 else "This view has"
         text += f" {100 * self.of_all:.1f} % of the gain of all {self.candidates} candidates"
         less = f"; no {k - 1} can have more than {fewer:.1f} % of theirs" if fewer < 100 else ""
-        return f"{text}, {largest}{less} (by {self.criterion}, which is not PSNR)."
+        search = {
+            "gap": f"the search closed the gap to {100 * CLOSE:g} %",
+            "nodes": f"the search ended at its limit of {self.nodes} nodes",
+            "time": f"the search ended at its time limit, after {self.nodes} nodes",
+        }[self.stopped]
+        if self.best > self.share + 5e-4:
+            search += f", and met a set with {100 * self.best:.1f} %"
+        return f"{text}, {largest}{less} (by {self.criterion}, which is not PSNR; {search})."
 
 
 def certify(
-    relaxation: Relaxation, plan: Sequence[int], criterion: str, most: int = NODES
+    criterion: Criterion,
+    plan: Sequence[int],
+    name: str,
+    most: int = NODES,
+    seconds: float = np.inf,
 ) -> Certificate:
-    """Certificate of a plan: `best_set` for as many views, and `upper_bound` for one less.
-
-    most: nodes of `best_set`. Raises InputError as `upper_bound`.
-    """
-    k, gain, count = len(plan), relaxation.gain(plan), relaxation.candidates
-    best = best_set(relaxation, plan, most=most)
-    fewer = upper_bound(relaxation, k - 1).value / gain if k > 1 else None
-    of_all = gain / relaxation.gain(range(count))
-    prices = (best.prices / best.bound).tolist()
-    return Certificate(criterion, k, count, gain / best.bound, fewer, of_all, prices)
+    """Certificate of a plan by the policy `name`: `best_set` for as many views, with its limits,
+    and `least_bound` for one less. Raises InputError as `upper_bound`."""
+    k, gain, count = len(plan), criterion.gain(plan), criterion.candidates
+    best = best_set(criterion, plan, most=most, seconds=seconds)
+    fewer = least_bound(criterion, k - 1) / gain if k > 1 else None
+    of_all, prices = gain / criterion.gain(range(count)), (best.prices / best.bound).tolist()
+    shares = gain / best.bound, best.gain / best.bound, fewer, of_all
+    return Certificate(name, k, count, *shares, best.nodes, best.stopped, prices)
 
 
-def curve(
-    relaxation: Relaxation, plan: Sequence[int], even: Sequence[int]
-) -> list[dict[str, float]]:
+def curve(criterion: Criterion, plan: Sequence[int], even: Sequence[int]) -> list[dict[str, float]]:
     """Rows with "views", and shares of the gain of all candidates: "bound" of any set of as many,
     "plan" (for other sizes greedy), "even" and "random".
 
     even: candidates in the order in which even spacing takes them. The last two shares are those of
-    `Relaxation.coarse`.
+    `criterion.coarse`.
     """
-    count, coarse, rng = relaxation.candidates, relaxation.coarse, np.random.default_rng(0)
-    every, about = (one.gain(range(count)) for one in (relaxation, coarse))
+    count, coarse, rng = criterion.candidates, criterion.coarse, np.random.default_rng(0)
+    every, about = (one.gain(range(count)) for one in (criterion, coarse))
     order, draws = greedy(coarse, 1.0), [rng.permutation(count) for _ in range(5)]
     rows = []
     for k in sorted(k for k in {*CURVE, len(plan)} if k < count):
         taken = plan if k == len(plan) else order[:k]
         shares = {
-            "bound": min(upper_bound(relaxation, k, CLOSE / 4).value / every, 1.0),
-            "plan": relaxation.gain(taken) / every,
+            "bound": min(least_bound(criterion, k, CLOSE / 4) / every, 1.0),
+            "plan": criterion.gain(taken) / every,
             "even": coarse.gain(even[:k]) / about,
             "random": float(np.mean([coarse.gain(some[:k]) for some in draws])) / about,
         }
@@ -365,16 +269,16 @@ def curve(
     return rows
 
 
-def greedy(relaxation: Relaxation, share: float, most: int | None = None) -> list[int]:
+def greedy(criterion: Criterion, share: float, most: int | None = None) -> list[int]:
     """Candidates by greedy choice, until they have `share` of the gain of all of them together.
 
     most: number of views after which it stops anyway.
     """
-    views, enough = list[int](), share * relaxation.gain(range(relaxation.candidates))
-    while len(views) < (most or relaxation.candidates):
-        gains = relaxation.added(views)
+    views, enough = list[int](), share * criterion.gain(range(criterion.candidates))
+    while len(views) < (most or criterion.candidates):
+        gains = criterion.added(views)
         gains[views] = -1
         views.append(int(gains.argmax()))
-        if relaxation.gain(views) >= enough:
+        if criterion.gain(views) >= enough:
             break
     return views

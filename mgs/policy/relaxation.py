@@ -1,31 +1,60 @@
-"""Criteria as concave functions of weights of views. Pure NumPy, float64.
+"""Criteria as concave functions of weights of views, and their upper bounds. Float64.
 
-Each is a sum over Gaussians j of a concave function of their information,
+A `Relaxation` is a sum over Gaussians j of a concave function of their information,
 
     f(x) = sum_j phi(A_j(x)) - phi(A_j(0)),   A_j(x) = A_j(0) + sum_v x_v z_jv z_jv^T,
 
 with the weight x_v = 1 for a candidate that is taken, and 0 otherwise. A(0) holds the prior and the
-views taken before. `mgs.policy.certificate` bounds f over all sets of k candidates.
+views taken before. `Coverage` counts Gaussians instead. `mgs.policy.certificate` bounds both over
+all sets of k candidates.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linprog
 
 from mgs.errors import InputError
 from mgs.memory import VIEW_BYTES
-from mgs.policy.criteria import Array
+from mgs.policy.criteria import Array, coverage_greedy, observed
 from mgs.policy.directional import Views, in_parts, information, of_points, precision
 
 Floats = NDArray[np.float64]
 
 COARSE = 1024
 """About the number of Gaussians of `Relaxation.coarse`. A chosen constant."""
+
+TOLERANCE = 1e-3
+"""Gap at which `upper_bound` stops, as a share of the bound."""
+
+STEPS, EXCHANGES, CUTS = 30, 3000, 300
+"""Most Newton steps of a bound, exchanges of weight in each, and cutting planes. Chosen
+constants."""
+
+SUFFICIENT = 1e-3
+"""Least share of the predicted ascent that a step of the line search must reach."""
+
+
+class Bound(NamedTuple):
+    """No set of k candidates has a gain above `value`.
+
+    weights: [C], sum k. prices: derivative of the gain by each weight [C].
+    gap: (value - gain of the best weights) / value. stopped: "gap" if that is small enough, else
+    "time" or "steps".
+    """
+
+    value: float
+    weights: Floats
+    prices: Floats
+    gap: float
+    stopped: str
 
 
 @dataclass(frozen=True)
@@ -47,6 +76,11 @@ class Relaxation:
     def submodular(self) -> bool:
         """Whether gains only fall as views are added, so that greedy choice has a guarantee."""
         return self.over is None
+
+    @property
+    def pairs(self) -> int:
+        """Pairs of a candidate and a Gaussian, by which the time of a bound grows."""
+        return self.candidates * len(self.base)
 
     @cached_property
     def coarse(self) -> Relaxation:
@@ -116,6 +150,44 @@ class Relaxation:
 
         return np.where(x > 0, 0.0, sum(in_parts(len(self.base), part)))
 
+    def bound(
+        self,
+        x: Floats,
+        box: tuple[Floats, Floats],
+        tolerance: float,
+        until: float,
+        enough: float = -np.inf,
+    ) -> Bound:
+        """Least upper bound from tangents, for sets in the box of 0 and 1 whose size is sum x.
+
+        First for the coarse relaxation, then from there: Newton steps with the coarse curvature.
+        Stops at a gap of `tolerance`, at the time `until`, or once it is at most `enough`.
+        """
+        if len(self.base) > 2 * len(self.coarse.base):
+            x = self.coarse.bound(x, box, tolerance, until).weights
+        k, best, lower = round(float(x.sum())), None, -np.inf
+        (value, slope), stopped = self.tangent(x), "steps"
+        for _ in range(STEPS):
+            above = value + float(slope @ (_largest(slope, *box, k) - x))
+            if best is None or above < best.value:
+                best = Bound(above, x, slope, 0.0, stopped)
+            lower = max(lower, value)
+            if best.value - lower <= tolerance * best.value or best.value <= enough:
+                stopped = "gap"
+                break
+            if time.monotonic() > until:
+                stopped = "time"
+                break
+            d = _newton_step(self.coarse.curvature(x), slope, x, *box)
+            t, ascent = 1.0, float(slope @ d)
+            new, after = self.tangent(x + d)
+            while new < value + SUFFICIENT * t * ascent and t > SUFFICIENT:
+                t /= 2
+                new, after = self.tangent(x + t * d)
+            x, value, slope = x + t * d, new, after
+        assert best is not None
+        return best._replace(gap=(best.value - lower) / max(best.value, 1e-300), stopped=stopped)
+
     def _taken(self, views: Iterable[int]) -> Floats:
         x = np.zeros(self.candidates)
         x[list(views)] = 1
@@ -136,6 +208,37 @@ class Relaxation:
         M = self.over[some]
         slope, value = self.scale * (S @ M @ S), -self.scale * np.einsum("nkl,nkl->n", S, M)
         return value, slope, (S, 2 * slope)
+
+
+def _largest(prices: Floats, lo: Floats, hi: Floats, k: int) -> Floats:
+    """Weights 0 or 1 in the box, with the sum k, that maximise prices^T x."""
+    free = np.flatnonzero(hi > lo)
+    order = free[np.argsort(-prices[free], kind="stable")]
+    x = np.array(lo, np.float64)
+    x[order[: k - int(lo.sum())]] = 1
+    return x
+
+
+def _newton_step(H: Floats, slope: Floats, x: Floats, lo: Floats, hi: Floats) -> Floats:
+    """Maximise slope^T d - d^T H d / 2 for x + d in the box and sum d = 0.
+
+    Exchanges weight between the pair of views that gains most, again and again, as solvers of
+    support vector machines do. H: [C,C].
+    """
+    y, g, diagonal = np.array(x), np.array(slope), np.diagonal(H)
+    small = 1e-9 * float(np.abs(slope).max())
+    least = 1e-9 * float(diagonal.max()) + small  # a flat direction is followed to the box
+    for _ in range(EXCHANGES):
+        i = int(np.where(y < hi, g, -np.inf).argmax())
+        ascent = np.where(y > lo, g[i] - g, 0.0)
+        curve = np.maximum(diagonal[i] + diagonal - 2 * H[i], least)
+        j = int((ascent * np.abs(ascent) / curve).argmax())
+        if ascent[j] <= small:
+            break
+        t = min(ascent[j] / curve[j], hi[i] - y[i], y[j] - lo[j])
+        y[i], y[j] = min(y[i] + t, hi[i]), max(y[j] - t, lo[j])
+        g -= t * (H[i] - H[j])
+    return np.asarray(y - x)
 
 
 def directional(
@@ -193,8 +296,117 @@ def d_optimal(F: Array, H: Array, lam: Array) -> Relaxation:
 
 def checked(seen: Array) -> None:
     """Raise InputError where candidates have no number, or none of them sees anything."""
+    check_finite(seen)
+    if not len(seen) or not np.any(seen):
+        raise InputError(f"certificate: none of the {len(seen)} candidates sees the object")
+
+
+def check_finite(seen: Array) -> None:
+    """Raise InputError where a candidate's information is not finite."""
     bad = [v for v, of_view in enumerate(seen) if not np.isfinite(of_view).all()]
     if bad:
         raise InputError(f"certificate: candidate {bad[0]} has information that is not finite")
-    if not len(seen) or not np.any(seen):
-        raise InputError(f"certificate: none of the {len(seen)} candidates sees the object")
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Number of Gaussians that candidates newly observe (`mgs.policy.criteria.coverage_greedy`).
+
+    A set observes a Gaussian only if its views' shares s of the information that is missing add up
+    to 1. So the number is at most the sum of min(1, s^T x), which is concave in the weights.
+
+    F: information of the candidates about colours [C,N,3]. H: of the views taken [N,3]. lam: [3].
+    Raises InputError where F has a number that is not finite.
+    """
+
+    F: Array
+    H: Array
+    lam: Array
+    submodular: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        check_finite(self.F)
+
+    @property
+    def candidates(self) -> int:
+        return len(self.F)
+
+    @property
+    def pairs(self) -> int:
+        """Pairs of a candidate and a Gaussian."""
+        return len(self.F) * len(self.H)
+
+    @property
+    def coarse(self) -> Coverage:
+        """The same."""
+        return self
+
+    @cached_property
+    def shares(self) -> tuple[Floats, Floats]:
+        """Different shares of what is missing, at most 1 [n,C], and their numbers of Gaussians."""
+        missing = np.asarray(self.lam - self.H, np.float64)
+        some = (missing >= 0).all(axis=1) & observed(self.H + self.F.sum(axis=0), self.lam)
+        share = (self.F[:, some] / np.maximum(missing[some], 1e-300)).max(axis=2)
+        rows, counts = np.unique(np.minimum(share.T, 1), axis=0, return_counts=True)
+        return rows, counts.astype(np.float64)
+
+    def gain(self, views: Iterable[int]) -> float:
+        """Number of Gaussians that a set of candidates newly observes."""
+        return coverage_greedy(self.F[list(views)].sum(axis=0), self.H, self.lam)
+
+    def added(self, views: Iterable[int]) -> Floats:
+        """Number of Gaussians that each candidate observes after these views [C]; 0 for them."""
+        taken = list(views)
+        H = self.H + self.F[taken].sum(axis=0)
+        gains = np.array([coverage_greedy(F, H, self.lam) for F in self.F])
+        gains[taken] = 0
+        return gains
+
+    def bound(
+        self,
+        x: Floats,
+        box: tuple[Floats, Floats],
+        tolerance: float,
+        until: float,
+        enough: float = -np.inf,
+    ) -> Bound:
+        """Upper bound by the linear programme. Arguments: `Relaxation.bound`.
+
+        Cutting planes: every x tried gives a tangent, and HiGHS finds the next x, where the least
+        tangent is largest. Any mean of tangents is a bound; the prices are its slope.
+        """
+        rows, counts = self.shares
+        size = round(float(x.sum()))
+        most = np.sort(rows * box[1], axis=1)[:, -size:].sum(axis=1)
+        rows, counts = rows[most >= 1 - 1e-6], counts[most >= 1 - 1e-6]
+        slopes, heights, best, lower, stopped = [], [], None, 0.0, "steps"
+        for _ in range(CUTS):
+            share = rows @ x
+            lower = max(lower, value := float(counts @ np.minimum(share, 1)))
+            slopes.append((counts * (share < 1)) @ rows)
+            heights.append(value - slopes[-1] @ x)
+            solved = linprog(
+                [*np.zeros(len(x)), -1],
+                A_ub=np.column_stack([-np.array(slopes), np.ones(len(slopes))]),
+                b_ub=heights,
+                A_eq=[[*np.ones(len(x)), 0]],
+                b_eq=[size],
+                bounds=[*zip(*box, strict=True), (None, None)],
+            )
+            mean = np.maximum(-solved.ineqlin.marginals, 0)
+            mean /= mean.sum()
+            prices, x = mean @ slopes, solved.x[:-1]
+            above = float(mean @ heights + prices @ _largest(prices, *box, size))
+            if best is None or above < best.value:
+                best = Bound(above, x, prices, 0.0, stopped)
+            if best.value - lower <= tolerance * best.value or best.value <= enough:
+                stopped = "gap"
+                break
+            if time.monotonic() > until:
+                stopped = "time"
+                break
+        assert best is not None
+        return best._replace(gap=(best.value - lower) / max(best.value, 1e-300), stopped=stopped)
+
+
+Criterion = Relaxation | Coverage

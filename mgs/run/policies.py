@@ -14,7 +14,7 @@ and may have
 - plan(scene, state, views, count, nearest): the views to choose from, those of a plan of at most
   `count` of `views`; with `nearest`, each among so many nearest to the one before.
 - tour_gains(scene, state): gains by which a flight is planned (`PoolGains`), if any.
-- relaxation(scene, state, views): concave criterion that bounds plans (`Relaxation`), if any.
+- relaxation(scene, state, views): criterion with upper bounds of plans, if any.
 
 To add one, write a class and a row of POLICIES, or a file of your own (docs/howto/policy.md).
 """
@@ -131,6 +131,13 @@ class Coverage:
     def __call__(self, scene: Scene, state: State, views: list[int]) -> np.ndarray:
         F, H, lam = scene.surface(state).information, state.surface, scene.surface_lam
         return each(views, lambda i: criteria.coverage_greedy(F(i), H, lam))
+
+    def relaxation(self, scene: Scene, state: State, views: Sequence[int]) -> relaxed.Coverage:
+        """Number of Gaussians that these views newly observe together."""
+        surface, lam = scene.surface(state), scene.surface_lam
+        left = ~criteria.observed(state.surface, lam)
+        F = np.stack([surface.information(i)[left, :3] for i in views])
+        return relaxed.Coverage(F, state.surface[left, :3], lam[:3])
 
 
 @dataclass(frozen=True)

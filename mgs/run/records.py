@@ -47,8 +47,11 @@ class _Certificate(_Strict):
     views: int
     candidates: int
     share: float
+    best: float
     fewer: float | None
     of_all: float
+    nodes: int
+    stopped: str
     prices: dict[str, float]
     curve: list[dict[str, float]] = []
 

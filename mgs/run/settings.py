@@ -50,6 +50,17 @@ class FlightLimits(BaseModel):
     """Lowest height of a pose above the object's lowest point, metres."""
 
 
+class SearchLimits(BaseModel):
+    """Limits of the search for a better set than the plan, which proves how good the plan is."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    nodes: Annotated[int, Field(ge=0)] | None = None
+    """Most nodes of branch and bound. Default: about ten seconds of them on a laptop."""
+    seconds: Positive | None = None
+    """Most seconds; results then depend on the machine. Default: no limit."""
+
+
 class Mission(BaseModel):
     """Limits of a run: how many views it takes, where the camera may go, and when it ends."""
 
@@ -61,6 +72,8 @@ class Mission(BaseModel):
     """Most views to choose beyond the seed views. Default: 50, or all candidates if fewer."""
     enough: Annotated[float, Field(gt=0, le=1)] = ENOUGH
     """With an automatic number of views: share of the criterion's gain of all candidates."""
+    certificate: SearchLimits = SearchLimits()
+    """Limits of the search for a better set than the plan."""
     batch: Annotated[int, Field(ge=1)] = 1
     """Views to choose before the next fit; the last batch may be smaller."""
     nearest: Annotated[int, Field(ge=1)] | None = None

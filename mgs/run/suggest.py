@@ -150,7 +150,7 @@ def suggest(
         ranking = [describe(appraised(scene, state, view, score)[0]) for view, score in rated_views]
         plan, way = _plan(scene, state, rule, mission, describe)
         order = [view for view, _ in rated_views]
-        worth = certificate(scene, state, rule, way[1:-1], order)
+        worth = certificate(scene, state, rule, mission, way[1:-1], order)
     radius, axis = mission.flight.no_fly or 0.0, scene.centre[:2]
     ends = scene.positions(state.frames)[way]
     corners = [tour.leg_corners(a, b, axis, radius) for a, b in pairwise(ends)]

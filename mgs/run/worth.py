@@ -5,73 +5,101 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from mgs.errors import InputError
 from mgs.policy.certificate import Certificate, certify, curve, greedy
 from mgs.policy.poses import spread
+from mgs.policy.relaxation import Criterion
 from mgs.progress import Stage, report
-from mgs.run.choosing import planned_flight
+from mgs.run.choosing import plan_flight, planned_flight
 from mgs.run.flight import free, views_left
+from mgs.run.loop import choose_batch
 from mgs.run.policies import Policy
 from mgs.run.settings import Mission
 from mgs.scene import Scene, State
 
-CERTIFY_NODES, CERTIFY_PAIRS = 10, 10_000_000
-"""Most nodes of the branch and bound of a certificate, and most nodes times pairs of a candidate
-and a Gaussian: seconds of work. Chosen constants."""
+SEARCH_PAIRS = 30_000_000
+"""Most nodes of a search times pairs of a candidate and a Gaussian: about ten seconds on a laptop.
+A chosen constant."""
 
 CURVE_PAIRS = 3_000_000
 """Most pairs of a candidate and a Gaussian with which the curve of a certificate is computed."""
 
 
 def certificate(
-    scene: Scene, state: State, policy: Policy, plan: Sequence[int], views: Sequence[int]
+    scene: Scene,
+    state: State,
+    policy: Policy,
+    mission: Mission,
+    plan: Sequence[int],
+    views: Sequence[int],
 ) -> Certificate | None:
     """Certify a plan of some of `views` by the policy's criterion.
 
-    Returns None where the policy has no `relaxation`, or the plan has no view or all of them.
+    Returns None where the policy has no `relaxation`, the plan has no view or all of them, or no
+    view adds anything.
     """
-    relaxation = getattr(policy, "relaxation", None)
-    if relaxation is None or not 0 < len(plan) < len(views):
-        return None
-    report(Stage.SCORE, 0, 1)
-    made = relaxation(scene, state, views)
+    made = _criterion(scene, state, policy, views) if 0 < len(plan) < len(views) else None
     if made is None:
         return None
-    pairs, chosen = len(views) * len(made.base), [views.index(i) for i in plan]
-    worth = certify(made, chosen, policy.name, min(CERTIFY_NODES, CERTIFY_PAIRS // pairs))
-    if pairs > CURVE_PAIRS:
+    chosen, limits = [views.index(i) for i in plan], mission.certificate
+    nodes = SEARCH_PAIRS // made.pairs if limits.nodes is None else limits.nodes
+    worth = certify(made, chosen, policy.name, nodes, limits.seconds or np.inf)
+    if made.pairs > CURVE_PAIRS:
         return worth
     positions = scene.positions(state.frames)
     even = spread(positions[list(views)], positions[list(state.taken)], scene.centre)
     return replace(worth, curve=curve(made, chosen, even))
 
 
+def _criterion(
+    scene: Scene, state: State, policy: Policy, views: Sequence[int]
+) -> Criterion | None:
+    """The policy's `relaxation`; None where it has none, or no view adds anything."""
+    relaxation = getattr(policy, "relaxation", None)
+    if relaxation is None or not views:
+        return None
+    report(Stage.SCORE, 0, 1)
+    made: Criterion | None = relaxation(scene, state, views)
+    return made if made and made.gain(range(len(views))) > 0 else None
+
+
 def planned_certificate(
     scene: Scene, state: State, policy: Policy, mission: Mission
 ) -> Certificate | None:
-    """`certificate` of all views that a run plans to take, also as a tour; None where it plans no
-    set of views."""
-    plan, left = getattr(policy, "plan", None), views_left(state, mission)
-    if plan is None or mission.travel is not None or mission.nearest is not None or left <= 0:
+    """`certificate` of all views that a run will take, also as a tour.
+
+    Returns None where that depends on fits to come, or on the way from view to view.
+    """
+    left = views_left(state, mission)
+    on_its_way = mission.travel is not None or mission.nearest is not None
+    if policy.needs_fit or not hasattr(policy, "relaxation") or on_its_way or left <= 0:
         return None
     views = free(scene, state, mission)
     if mission.flies:
         planned = planned_flight(scene, state, policy, mission)
-    else:
+        planned = planned or [view for view, _ in plan_flight(scene, state, policy, mission)]
+    elif plan := getattr(policy, "plan", None):
         planned = plan(scene, state, views, left, None)
-    return certificate(scene, state, policy, planned, views)
+    else:
+        every = mission.model_copy(update={"batch": left})
+        planned = [choice.view for choice in choose_batch(scene, state, policy, every)[1]]
+    return certificate(scene, state, policy, mission, planned, views)
 
 
 def enough_views(scene: Scene, state: State, policy: Policy, mission: Mission) -> int:
     """Fewest views of a greedy plan that have the share `enough` of the gain of all candidates.
 
-    Raises InputError where the policy has no `relaxation`.
+    Raises InputError where the policy has no `relaxation`, or no candidate adds anything.
     """
-    relaxation, views = getattr(policy, "relaxation", None), free(scene, state, mission)
-    made = relaxation(scene, state, views) if relaxation and views else None
-    if made is None:
-        raise InputError(
-            f"policy {policy.name}: has no bound by which a number of views could be enough; give "
-            "the number, or use directional-i, directional-d or d-optimal"
+    made = _criterion(scene, state, policy, free(scene, state, mission))
+    if made is not None:
+        return len(greedy(made, mission.enough))
+    why = "no candidate adds anything; give the number"
+    if not hasattr(policy, "relaxation"):
+        why = (
+            "has no bound by which a number of views could be enough; give the number, or use "
+            "directional-i, directional-d, d-optimal or coverage"
         )
-    return len(greedy(made, mission.enough))
+    raise InputError(f"policy {policy.name}: {why}")
