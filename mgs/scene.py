@@ -116,6 +116,11 @@ class Scene:
     on_pass: Callable[[int, int, Gaussians], None] = lambda done, most, model: None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.dataset, Dataset) or not isinstance(self.prior, Prior):
+            raise TypeError(
+                "Scene: needs a dataset and a prior that are loaded: "
+                "mgs.Scene(mgs.load_dataset(FOLDER), mgs.load_prior(FOLDER))"
+            )
         if self.settings is None:
             weight = ALPHA_WEIGHT if self.dataset.outlined else 0.0
             settings = ModelSettings(train=TrainSettings(alpha_weight=weight))

@@ -202,7 +202,7 @@ def compared(
 ) -> Row:
     """Gains of a plan and of other sets of as many views, and their bounds."""
     k = len(plan)
-    best = certificate.best_set(made, plan, most=NODES, seconds=np.inf)
+    best = certificate.best_set(made, plan, most=NODES)
     gains = [made.gain(some) for some in random]
     return {
         "views": k,
@@ -321,13 +321,7 @@ def write(work: Work) -> list[Path]:
 
 
 STUDY = Study(
-    "certificate",
-    __doc__,
-    write,
-    SIZES,
-    lambda work: cells_of(work.size),
-    ROCKS | WORKERS,
-    sized,
+    "certificate", __doc__, write, SIZES, lambda work: cells_of(work.size), ROCKS | WORKERS, sized
 )
 
 if __name__ == "__main__":

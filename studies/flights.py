@@ -234,13 +234,7 @@ def write(work: Work) -> list[Path]:
 
 
 STUDY = Study(
-    "flights",
-    __doc__,
-    write,
-    SIZES,
-    lambda work: cells_of(work.size),
-    ROCKS | WORKERS,
-    sized,
+    "flights", __doc__, write, SIZES, lambda work: cells_of(work.size), ROCKS | WORKERS, sized
 )
 
 if __name__ == "__main__":

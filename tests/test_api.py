@@ -30,6 +30,12 @@ def test_importing_loads_nothing_and_leaves_the_variant_alone():
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 
 
+def test_a_scene_needs_what_is_loaded(dataset, prior):
+    for given in ((dataset, prior), (mgs.load_dataset(dataset), prior)):
+        with pytest.raises(TypeError, match="load_prior"):
+            mgs.Scene(*given)
+
+
 def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
     """Nothing is printed, callbacks are called, and the state is what the folder holds."""
     steps, stages = [], set()

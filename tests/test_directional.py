@@ -370,7 +370,7 @@ def test_a_run_takes_the_views_of_its_plan(loaded, tmp_path, policy):
     assert len(planned([other])) == 3
 
 
-@pytest.mark.parametrize("policy", ["directional-d", "directional-i"])
+@pytest.mark.parametrize("policy", ["directional-d", "directional-i", "coverage"])
 def test_a_run_records_what_its_plan_is_worth(loaded, tmp_path, policy):
     """Scores of the steps add up to the gain of the plan, which has at least the share of the best
     set that is recorded."""

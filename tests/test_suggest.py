@@ -74,10 +74,14 @@ def test_as_few_views_are_planned_as_have_a_share_of_what_all_would_give(run, si
     assert few.certificate.of_all >= 0.5
     assert len(few.certificate.prices) == len(few.ranking)
     assert suggest(opened, ring, 3, policy="random").certificate is None
-    assert suggest(opened, ring, 3, policy="d-optimal").certificate.share >= 0.9
+    for policy in ("d-optimal", "coverage"):
+        assert suggest(opened, ring, 3, policy=policy).certificate.share >= 0.9
+    limits = {"certificate": {"nodes": 0}}
+    assert suggest(opened, ring, 3, **limits).certificate.nodes == 0
     data = opened.dataset.root
     run = mgs.start_run(data, run.parent / "auto", seeds=2, budget="auto", enough=0.7)
     assert 1 <= run.settings.budget < 6
+    assert run.settings.enough == 0.7
     later = mgs.start_run(data, run.folder.parent / "more", seeds=2, budget="auto", enough=1.0)
     assert later.settings.budget == 6
 

@@ -15,7 +15,7 @@ from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
-from mgs.run.settings import ENOUGH, FlightLimits, Positive, SearchLimits, validated
+from mgs.run.settings import FlightLimits, Positive, SearchLimits, validated
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -56,8 +56,8 @@ class Candidates(BaseModel):
     """Limits of the flight and of its poses."""
     certificate: SearchLimits = SearchLimits()
     """Limits of the search for a better set than the plan."""
-    enough: Annotated[float, Field(gt=0, le=1)] = ENOUGH
-    """With --views auto: share of the criterion's gain of all candidates that is enough."""
+    enough: Annotated[float, Field(gt=0, le=1)] | None = None
+    """With --views auto: share of the criterion's gain of all candidates. Default: 0.95."""
 
     @field_validator("elevations")
     @classmethod
@@ -134,7 +134,7 @@ def suggest(
         candidates, safe, band = _candidates(run, poses, dome, asked)
         from mgs.run.suggest import suggest as suggested
 
-        found = suggested(
+        result = suggested(
             run,
             candidates,
             count,
@@ -143,7 +143,7 @@ def suggest(
             progress=progress,
             **changes,
         )
-        crossed = _crossed(run, found)
+        crossed = _crossed(run, result)
         if crossed and plan:
             raise InputError(
                 f"suggest: {crossed}, so no flight plan is written; give flight.no_fly"
@@ -152,10 +152,10 @@ def suggest(
             from mgs.reports.suggestion import write_suggestion
 
             with atomic_folder(out, ours) as unfinished:
-                write_suggestion(unfinished, run, found)
+                write_suggestion(unfinished, run, result)
         for path in plan or ():
-            _write_plan(path, run, found, place, asked.flight)
-    _print(console, found, run, crossed)
+            _write_plan(path, run, result, place, asked.flight)
+    _print(console, result, run, crossed)
     for written in [*([out] if out else []), *(plan or ())]:
         console.print(f"wrote {written}", soft_wrap=True)
 
@@ -209,7 +209,7 @@ def _candidates(
     return place_poses(kind, count, asked.radius or far, band, site), safe, band
 
 
-def _crossed(run: Run, found: Suggestion) -> str:
+def _crossed(run: Run, result: Suggestion) -> str:
     """Say which leg crosses the object, if one does."""
     import numpy as np
 
@@ -217,9 +217,9 @@ def _crossed(run: Run, found: Suggestion) -> str:
     from mgs.run.suggest import taken_in_order
 
     home = taken_in_order(run)[0].camera.position
-    ends = [*(view.camera.position for view in found.plan), home]
-    names = [*(view.name for view in found.plan), "the first image"]
-    for here, corners, end, name in zip([home, *ends], found.corners, ends, names, strict=False):
+    ends = [*(view.camera.position for view in result.plan), home]
+    names = [*(view.name for view in result.plan), "the first image"]
+    for here, corners, end, name in zip([home, *ends], result.corners, ends, names, strict=False):
         way = np.array([here, *corners, end])
         steps = np.linspace(0, 1, 50)[:, None, None]
         points = (way[:-1] + steps * np.diff(way, axis=0)).reshape(-1, 3)
@@ -228,7 +228,7 @@ def _crossed(run: Run, found: Suggestion) -> str:
     return ""
 
 
-def _write_plan(path: Path, run: Run, found: Suggestion, place: Any, limits: FlightLimits) -> None:
+def _write_plan(path: Path, run: Run, result: Suggestion, place: Any, limits: FlightLimits) -> None:
     """Write a flight plan; home is on the ground under the first image."""
     import numpy as np
 
@@ -238,20 +238,20 @@ def _write_plan(path: Path, run: Run, found: Suggestion, place: Any, limits: Fli
     home = taken_in_order(run)[0].camera.position
     ground = float(run.prior.mesh.vertices[:, 2].min())
     stops = [Stop(np.array([*home[:2], ground]))]
-    for corners, view in zip(found.corners, [*found.plan, None], strict=True):
+    for corners, view in zip(result.corners, [*result.plan, None], strict=True):
         stops += [Stop(corner) for corner in corners]
         if view is not None:
             stops.append(Stop(view.camera.position, view.name, view.camera))
     write_flight_plan(path, stops, place, limits.hover, limits.speed)
 
 
-def _print(console: Terminal, found: Suggestion, run: Run, crossed: str) -> None:
+def _print(console: Terminal, result: Suggestion, run: Run, crossed: str) -> None:
     """Print what was dropped, the views as a table, and the flight."""
     from mgs.policy.criteria import GAIN_UNIT
 
-    for reason, count in found.dropped.items():
+    for reason, count in result.dropped.items():
         console.print(f"candidates left out: {count} {reason}")
-    rows = found.plan if len(found.plan) > 1 else found.ranking[:SHOWN]
+    rows = result.plan if len(result.plan) > 1 else result.ranking[:SHOWN]
     table = Table(box=None)
     numbers = ("score", "gain", "distance", "azimuth", "elevation", "unseen", "unknown")
     for heading in ("", "pose", *numbers):
@@ -260,14 +260,14 @@ def _print(console: Terminal, found: Suggestion, run: Run, crossed: str) -> None
         table.add_row(str(number), view.name, *_cells(view, run.dataset.unit))
     console.print(table)
     unit = run.dataset.unit
-    plan = f"{len(found.plan)} view{'s' if len(found.plan) > 1 else ''}"
+    plan = f"{len(result.plan)} view{'s' if len(result.plan) > 1 else ''}"
     console.print(
         f"gain: Eq. 7, {GAIN_UNIT}; unseen, unknown: shares of what the picture shows\n"
-        f"flight: {found.metres:.1f} {unit} and {found.seconds:.0f} s from the first image through "
-        f"{plan} and back"
+        f"flight: {result.metres:.1f} {unit} and {result.seconds:.0f} s from the first image "
+        f"through {plan} and back"
     )
-    if found.certificate:
-        console.print(found.certificate.sentence(), soft_wrap=True)
+    if result.certificate:
+        console.print(result.certificate.sentence(), soft_wrap=True)
     if crossed:
         console.print(f"{crossed}; give flight.no_fly to plan around it")
 

@@ -218,7 +218,8 @@ class Certificate:
             largest = f"at least {share:.1f} % of {largest}"
         text = f"These {k} views have" if k > 1 else "This view has"
         text += f" {100 * self.of_all:.1f} % of the gain of all {self.candidates} candidates"
-        less = f"; no {k - 1} can have more than {fewer:.1f} % of theirs" if fewer < 100 else ""
+        few = f"no {k - 1}" if k > 2 else "no single one"
+        less = f"; {few} can have more than {fewer:.1f} % of theirs" if fewer < 100 else ""
         search = {
             "gap": f"the search closed the gap to {100 * CLOSE:g} %",
             "nodes": f"the search ended at its limit of {self.nodes} nodes",

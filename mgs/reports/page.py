@@ -228,8 +228,9 @@ def _plots(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
         plots.append((title, step_curves(runs, key), axis, zero))
     drawn = [line_plot(title, curves, axis, zero) for title, curves, axis, zero in plots if curves]
     for label, run in runs.items():
-        if curve := run.steps[0].get("certificate", {}).get("curve"):
-            drawn.append(curve_plot(label, curve))
+        certificate = run.steps[0].get("certificate", {})
+        if certificate.get("curve"):
+            drawn.append(curve_plot(label, certificate))
     views = {label: measured_views(run) for label, run in runs.items() if run.measured}
     if views:
         masked = all(any(one.get("psnr_mask") is not None for one in of) for of in views.values())

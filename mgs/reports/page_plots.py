@@ -136,24 +136,29 @@ def views_plot(metric: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> 
 
 
 CURVES = {
-    "bound": "upper bound of any views",
-    "plan": "planned views",
-    "even": "evenly spaced",
-    "random": "random",
+    "bound": ("bound: no set has more", "#888888"),
+    "plan": ("planned views", "#d1495b"),
+    "even": ("evenly spaced", "#0072B2"),
+    "random": ("random", "#E69F00"),
 }
-"""Keys of `mgs.policy.certificate.curve` -> names."""
+"""Keys of `mgs.policy.certificate.curve` -> names and colours."""
 
 
-def curve_plot(label: str, curve: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """Share of the gain of all candidates against the number of views, after the seeds."""
+def curve_plot(label: str, certificate: Mapping[str, Any]) -> dict[str, Any]:
+    """Share of the gain of all candidates against the number of views, after the seeds. Markers of
+    the number that is planned are large."""
+    numbers = [row["views"] for row in certificate["curve"]]
+    sizes = [13 if k == certificate["views"] else 6 for k in numbers]
     traces = [
         {
             "name": name,
-            "x": [row["views"] for row in curve],
-            "y": [100 * row[key] for row in curve],
+            "x": numbers,
+            "y": [100 * row[key] for row in certificate["curve"]],
             "mode": "lines+markers",
+            "line": {"color": colour, "dash": "dash" if key == "bound" else "solid"},
+            "marker": {"color": colour, "size": sizes},
         }
-        for key, name in CURVES.items()
+        for key, (name, colour) in CURVES.items()
     ]
     title = f"Gain that a number of views can have, {label}"
     alt = f"{title}: the upper bound of all sets, the plan, evenly spaced and random views."
@@ -184,7 +189,12 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     circle: dict[str, Any] = {"size": 3, "color": "#9a9a9a", "symbol": "circle-open"}
     others = "candidates"
     if candidates and all(names[i] in prices for i in candidates):
-        bar = {"title": {"text": "price"}, "thickness": 12, "len": 0.6, "x": -0.1}
+        bar = {
+            "title": {"text": "price: a<br>picture adds"},
+            "thickness": 12,
+            "len": 0.6,
+            "x": -0.1,
+        }
         colours = {"color": [prices[names[i]] for i in candidates], "colorscale": "Cividis"}
         circle = {"size": 5, **colours, "showscale": True, "colorbar": bar}
         others = "candidates, by price"

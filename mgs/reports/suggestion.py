@@ -97,7 +97,7 @@ def draw_suggestion(path: str | Path, run: Run, suggestion: Suggestion) -> None:
     with drawing(path, 0.4 + sum(widths), 4.2, NO_GRID, dpi=120) as figure:
         grid = figure.add_gridspec(2, len(widths), width_ratios=widths)
         if curve:
-            _curve(figure.add_subplot(grid[:, -1]), curve)
+            _curve(figure.add_subplot(grid[:, -1]), curve, len(suggestion.plan))
         site = figure.add_subplot(grid[:, 0])
         _from_above(site, run, suggestion)
         for k, view in enumerate(views, 1):
@@ -117,12 +117,16 @@ def draw_suggestion(path: str | Path, run: Run, suggestion: Suggestion) -> None:
         figure.legend(*legend, loc="outside lower left", ncols=3)
 
 
-def _curve(axis: Any, curve: Sequence[Mapping[str, float]]) -> None:
-    """Draw `mgs.policy.certificate.curve`."""
-    for key, name in CURVES.items():
+def _curve(axis: Any, curve: Sequence[Mapping[str, float]], planned: int) -> None:
+    """Draw `mgs.policy.certificate.curve`, and a line at the number of views planned."""
+    axis.axvline(planned, color="#dddddd", linewidth=5)
+    for key, (name, colour) in CURVES.items():
         shares = [100 * row[key] for row in curve]
-        axis.plot([row["views"] for row in curve], shares, marker="o", markersize=3, label=name)
-    axis.set(xlabel="views", title="gain of all candidates (%)", ylim=(0, 102))
+        style = {"linestyle": "--"} if key == "bound" else {}
+        numbers = [row["views"] for row in curve]
+        axis.plot(numbers, shares, marker="o", markersize=3, label=name, color=colour, **style)
+    title = f"gain of so many views,\n% of that of all candidates (planned: {planned})"
+    axis.set(xlabel="views", title=title, ylim=(0, 102))
     axis.legend(fontsize=7, handlelength=1, labelspacing=0.3)
 
 
@@ -136,7 +140,8 @@ def _from_above(axis: Any, run: Run, suggestion: Suggestion) -> None:
     ranked = level([view.camera.position for view in suggestion.ranking])
     gains, label = [view.information_gain for view in suggestion.ranking], f"gain ({GAIN_UNIT})"
     if suggestion.certificate:
-        gains, label = suggestion.certificate.prices, "price: share of the largest gain"
+        gains = [100 * price for price in suggestion.certificate.prices]
+        label = "what a picture there adds (% of the bound)"
     axis.scatter(*level(run.prior.points[::7]).T, s=0.5, color="#b0a898", rasterized=True)
     axis.scatter(*images.T, marker="^", s=26, color="black", label="images so far")
     dots = axis.scatter(*ranked.T, c=gains, s=18, cmap="viridis", label="candidates")

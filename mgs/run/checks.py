@@ -107,7 +107,8 @@ class Checks:
         assert state.fit is not None
         start, coverage = self.scene.untrained(state), steps[-1]["coverage"]
         scores = list[float]()
-        if not getattr(self.policy, "geometric", False):
+        automatic = self.settings.enough is not None  # the last views then add little by design
+        if not automatic and not getattr(self.policy, "geometric", False):
             gains = [step["information_gain"] for step in steps]
             scores = [gain for gain in gains if gain is not None]
         drift = 0.0  # changed Gaussians are not those of the start

@@ -21,7 +21,7 @@ from mgs.files import THERE, Ours, atomic_folder, reading, write_json
 from mgs.fit.poses import motion_between
 from mgs.fit.settings import ModelSettings, as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE, Gaussians
-from mgs.learning import information, refine_poses
+from mgs.learning import information, refine_poses, surface_information
 from mgs.memory import VIEW_BYTES
 from mgs.policy.poses import seed_views
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
@@ -48,6 +48,7 @@ from mgs.run.policies import Policy
 from mgs.run.policy_file import in_file, is_function, label, name_of, policy_of, source_of
 from mgs.run.settings import (
     ALPHA_WEIGHT,
+    ENOUGH,
     NbvSettings,
     check_settings,
     validated,
@@ -318,7 +319,9 @@ def _automatic(
         model = scene.start(shown)
         H = information(scene, model, shown)
         state = State(frames, tuple(seeds), len(seeds), model, H, H)
-        return settings.model_copy(update={"budget": enough_views(scene, state, policy, settings)})
+        state = replace(state, surface=surface_information(scene, state, seeds))
+        budget = enough_views(scene, state, policy, settings)
+        return settings.model_copy(update={"budget": budget, "enough": settings.enough or ENOUGH})
 
 
 def _check_surface(prior: Prior, dataset: Dataset, settings: NbvSettings, where: Path) -> None:

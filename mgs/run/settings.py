@@ -28,7 +28,7 @@ from mgs.policy.criteria import MEAN_STD, PRIOR_STD
 from mgs.run.policy_file import check_policy
 
 ENOUGH = 0.95
-"""Default of `Mission.enough` (docs/certificate.md)."""
+"""Share of the gain that is enough by default (docs/certificate.md)."""
 
 
 class FlightLimits(BaseModel):
@@ -70,8 +70,9 @@ class Mission(BaseModel):
     """Number of seed views for the first fit, spread evenly over the directions of the poses."""
     budget: Annotated[int, Field(ge=0)] = 50
     """Most views to choose beyond the seed views. Default: 50, or all candidates if fewer."""
-    enough: Annotated[float, Field(gt=0, le=1)] = ENOUGH
-    """With an automatic number of views: share of the criterion's gain of all candidates."""
+    enough: Annotated[float, Field(gt=0, le=1)] | None = None
+    """With an automatic number of views: share of the criterion's gain of all candidates. Default:
+    0.95."""
     certificate: SearchLimits = SearchLimits()
     """Limits of the search for a better set than the plan."""
     batch: Annotated[int, Field(ge=1)] = 1

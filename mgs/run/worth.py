@@ -16,7 +16,7 @@ from mgs.run.choosing import plan_flight, planned_flight
 from mgs.run.flight import free, views_left
 from mgs.run.loop import choose_batch
 from mgs.run.policies import Policy
-from mgs.run.settings import Mission
+from mgs.run.settings import ENOUGH, Mission
 from mgs.scene import Scene, State
 
 SEARCH_PAIRS = 30_000_000
@@ -95,7 +95,7 @@ def enough_views(scene: Scene, state: State, policy: Policy, mission: Mission) -
     """
     made = _criterion(scene, state, policy, free(scene, state, mission))
     if made is not None:
-        return len(greedy(made, mission.enough))
+        return len(greedy(made, mission.enough or ENOUGH))
     why = "no candidate adds anything; give the number"
     if not hasattr(policy, "relaxation"):
         why = (
