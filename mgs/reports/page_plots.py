@@ -145,8 +145,8 @@ CURVES = {
 
 
 def curve_plot(label: str, certificate: Mapping[str, Any]) -> dict[str, Any]:
-    """Share of the gain of all candidates against the number of views, after the seeds. Markers of
-    the number that is planned are large."""
+    """Share of the gain of all candidates against the number of views, after the seeds. The
+    marker of the number that is planned is large."""
     numbers = [row["views"] for row in certificate["curve"]]
     sizes = [13 if k == certificate["views"] else 6 for k in numbers]
     traces = [
@@ -156,7 +156,7 @@ def curve_plot(label: str, certificate: Mapping[str, Any]) -> dict[str, Any]:
             "y": [100 * row[key] for row in certificate["curve"]],
             "mode": "lines+markers",
             "line": {"color": colour, "dash": "dash" if key == "bound" else "solid"},
-            "marker": {"color": colour, "size": sizes},
+            "marker": {"color": colour, "size": sizes if key == "plan" else 6},
         }
         for key, (name, colour) in CURVES.items()
     ]
