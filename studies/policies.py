@@ -13,6 +13,7 @@ from mgs.gaussians import sh_from_rgb
 from mgs.policy import criteria
 from mgs.policy.criteria import Array, observed
 from mgs.policy.poses import angles
+from mgs.run.directional import Directional
 from mgs.run.policies import Information, Paper, each
 from mgs.splat import fisher, groups, render
 from mgs.splat.reference import sh_basis
@@ -98,6 +99,63 @@ def block_log_determinant(H: Array, lam: Array) -> float:
 def angle(candidates: Array, taken: Array, centre: Array) -> Array:
     """Angle at `centre` to the nearest camera already taken, radians [C]."""
     return np.round(angles(candidates, taken, centre).min(axis=1), 9)
+
+
+def near_angle(candidates: Array, taken: Array, centre: Array) -> Array:
+    """`angle` among the nearest third of all poses; among the others once these are taken [C]."""
+    distance = np.linalg.norm(np.concatenate([candidates, taken]) - centre, axis=1)
+    near = distance[: len(candidates)] <= np.quantile(distance, 1 / 3) * (1 + 1e-6)
+    return angle(candidates, taken, centre) + 2 * np.pi * near
+
+
+class Medoids:
+    """Views whose directions represent those of all poses, planned together.
+
+    k-medoids: one view at a time is exchanged as long as that lowers the sum over the pool of the
+    squared angle to the nearest view. Scores are those of `angle`.
+    """
+
+    name, needs_fit, geometric = "medoids", False, True
+
+    def __call__(self, scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
+        positions = scene.positions(state.frames)
+        return angle(positions[views], positions[list(state.taken)], scene.centre)
+
+    def plan(
+        self, scene: mgs.Scene, state: mgs.State, views: list[int], count: int, nearest: int | None
+    ) -> list[int]:
+        """k-medoids after the views taken; all views if each must be near the one before."""
+        if nearest is not None:
+            return views
+        positions = scene.positions(state.frames)
+        squared = np.round(angles(positions, positions, scene.centre) ** 2, 9)
+        first = squared[list(state.taken)].min(axis=0)
+        plan: list[int] = []
+        before = None
+        while plan != before:
+            before = list(plan)
+            for k in range(min(count, len(views))):
+                others = plan[:k] + plan[k + 1 :]
+                nearest_other = np.minimum(first, squared[others].min(axis=0, initial=np.inf))
+                cost = np.minimum(nearest_other, squared[views]).sum(axis=1)
+                cost[[views.index(view) for view in others]] = np.inf
+                plan[k : k + 1] = [views[int(np.argmin(cost))]]
+        return plan
+
+
+medoids = Medoids()
+
+
+class Greedy:
+    """`directional-i` without its plan: the view of largest gain at each step."""
+
+    name, needs_fit = "greedy", False
+
+    def __call__(self, scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
+        return Directional()(scene, state, views)
+
+
+greedy = Greedy()
 
 
 def completeness(seen: Array, surface_H: Array, surface_lam: Array) -> np.ndarray:

@@ -45,9 +45,15 @@ from studies.frame.sweep import Cell, results_so_far
 Results = Mapping[str, Mapping[str, Any]]
 """Results of cells by name."""
 
+BASELINES = tuple(
+    f"{Path(__file__).with_name('policies.py')}:{name}"
+    for name in ("greedy", "angle", "near_angle", "medoids")
+)
+"""Rules that could embarrass the default, from `studies.policies`."""
+
 POLICIES = (
     "directional-i", "directional-d", "cover", "coverage", "farthest", "uniform", "random",
-    "d-optimal", "paper",
+    "d-optimal", "paper", *BASELINES,
 )  # fmt: skip
 
 LEADER = "directional-i"
@@ -58,9 +64,13 @@ RANDOM, ORACLE = "random", "oracle"
 MEAN = "mean"
 """Name of the mean over the set-ups, beside their names."""
 
+ENDS = {"worst": 0.0, "median": 0.5, "best": 1.0}
+"""Quantiles of the leads over every rock in every set-up."""
+
 MEASURES = {
     "test": "test views",
     "test_mask": "inside the rock",
+    "spiral": "views of a spiral, 1.25 and 2 times as far",
     "pool": "views of the pool not taken",
 }
 """Mean PSNR of each cell, dB, by what it is over."""
@@ -87,6 +97,9 @@ RING = {"kind": "circle", "distances": [1]}
 """Orbit of the paper."""
 
 DOME = {"kind": "hemisphere", "distances": [1]}
+
+SPIRAL = {"kind": "spiral", "distances": [1.25, 2]}
+"""Orbit of further test views, at other distances than the dome of the dataset's own."""
 
 SETUPS = {
     "ring": Setup(RING, 48),
@@ -147,7 +160,7 @@ def sized(size: SetupSize, options: Namespace) -> SetupSize:
     own = getattr(options, "policy", [])
     labels = list(POLICIES)
     for policy in own:
-        if policy in POLICIES:
+        if policy_file.absolute(policy) in POLICIES:
             raise mgs.InputError(f"--policy {policy}: is compared anyway; leave it out")
         if policy_file.label(policy) in labels:
             raise mgs.InputError(f"--policy {policy}: {NAMESAKE}")
@@ -164,6 +177,12 @@ def case_of(rock: Rock, setup: Setup, size: SetupSize) -> Case:
     return Case(rock, images, number | {"seed": 0}).on_orbit(setup.orbit)
 
 
+def shown_as(policy: str) -> str:
+    """Name of a policy in tables."""
+    label = policy_file.label(policy)
+    return label.partition(":")[2] if policy in BASELINES else label
+
+
 def cells_of(
     size: SetupSize,
     policies: Sequence[str] | None = None,
@@ -176,9 +195,11 @@ def cells_of(
     for rock, (name, setup) in pairs:
         case = case_of(rock, setup, size)
         case, data = case.surveyed(rock.index) if setup.survey else (case, case.cells())
+        spiral = Case(rock, Size(size.width, size.height, size.tests, 0, size.spp)).on_orbit(SPIRAL)
+        data = [*data, spiral.cells()[0]]
         common = {"seeds": setup.seeds, "budget": size.images - setup.seeds, **setup.settings}
         for policy in size.policies if policies is None else policies:
-            shown = policy_file.label(policy)
+            shown = shown_as(policy)
             version = "".join(f"-{digest[:8]}" for digest in policy_record(policy).values())
             where = f"{rock.name}/{name.replace(' ', '-')}-{size.width}x{size.height}"
             about = {"rock": rock.name, "scene": rock.scene, "setup": name, "policy": shown}
@@ -187,6 +208,7 @@ def cells_of(
                 *_, last = case.with_task(
                     f"setup/{where}/{shown}{version}-{draw}",
                     f"{__name__}:choose_and_judge",
+                    spiral=spiral.dataset,
                     every=setup.every,
                     passes=size.passes,
                     settings=settings,
@@ -202,6 +224,7 @@ def choose_and_judge(
     out: Path,
     dataset: str,
     prior: str,
+    spiral: str,
     every: int | None,
     settings: dict[str, Any],
     passes: int = SetupSize.passes,
@@ -213,6 +236,7 @@ def choose_and_judge(
     """
     name, seed = settings["policy"], settings["seed"]
     shared, tests, pool = shared_scene(root / dataset, root / prior, every)
+    further = _views_of(root / spiral)
     scene = shared.with_seed(seed)
     mission = mgs.Mission(**{k: v for k, v in settings.items() if k not in ("policy", "seed")})
     policy = policy_file.policy_of(name) if name != ORACLE else _oracle(shared)
@@ -227,6 +251,7 @@ def choose_and_judge(
     return {
         "test": float(on_tests["psnr"].mean()),
         "test_mask": float(on_tests["psnr_mask"].mean()),
+        "spiral": float(further(model)["psnr"].mean()),
         "pool": float(on_pool["psnr"].mean()),
         "path": path_length(scene.positions([scene.frames[i] for i in taken])),
         "taken": taken,
@@ -268,19 +293,25 @@ def shared_scene(
     """Scene of a set-up on one rock, and PSNR over test views and candidates.
 
     All policies share them, with the visibility of the surface."""
-    data, cache = mgs.load_dataset(dataset), mgs.ListCache()
+    data = mgs.load_dataset(dataset)
     if every is not None:
         half = len(data) // 2
         some = (f for i, f in enumerate(data.frames) if i < half or (i - half) % every == 0)
         data = replace(data, frames=tuple(some))
     _after_seeds.cache_clear()
-
-    def over(frames: Sequence[mgs.Frame]) -> Measure:
-        of = psnr_over(frames, cache)
-        return lambda model, some=range(len(frames)): of(model, some)
-
-    tests, pool = over(test_views_of(data).frames), over(data.frames)
+    tests, pool = _measure(test_views_of(data).frames), _measure(data.frames)
     return mgs.Scene(data, mgs.load_prior(prior)), tests, pool
+
+
+def _measure(frames: Sequence[mgs.Frame]) -> Measure:
+    of = psnr_over(frames, mgs.ListCache())
+    return lambda model, some=range(len(frames)): of(model, some)
+
+
+@lru_cache(maxsize=1)
+def _views_of(dataset: Path) -> Measure:
+    """PSNR over all frames of a dataset."""
+    return _measure(mgs.load_dataset(dataset).frames)
 
 
 @lru_cache(maxsize=1)
@@ -372,11 +403,18 @@ def text_of(rows: Sequence[Row], leads: Sequence[Row]) -> str:
     setups, policies = _setups(rows), _policies(rows)
     rocks = {row["rock"] for row in rows if row["policy"] == ORACLE}
     tried = [row for row in rows if row["rock"] in rocks]
+    groups = grouped(rows, "rock", "setup")
+    cells = [{row["policy"]: row["test"] for row in group["of"]} for group in groups]
     known = {(lead["setup"], lead["policy"]): lead for lead in leads if lead["measure"] == "test"}
 
-    def matrix(title: str, cell: Callable[[str, str], str], policies: Sequence[str]) -> str:
-        columns = {title: "policy"} | {setup: setup for setup in setups}
-        lines = [{"policy": p} | {setup: cell(setup, p) for setup in setups} for p in policies]
+    def matrix(
+        title: str,
+        cell: Callable[[str, str], str],
+        policies: Sequence[str],
+        across: Sequence[str] = tuple(setups),
+    ) -> str:
+        columns = {title: "policy"} | {name: name for name in across}
+        lines = [{"policy": p} | {name: cell(name, p) for name in across} for p in policies]
         return table(columns, lines)
 
     def gain(key: str) -> Callable[[str, str], str]:
@@ -390,6 +428,10 @@ def text_of(rows: Sequence[Row], leads: Sequence[Row]) -> str:
         lead = known.get((setup, policy), {})
         return with_interval(lead, "lead") + (" *" if (lead.get("p_holm") or 1) < 0.05 else "")
 
+    def extremes(end: str, policy: str) -> str:
+        apart = [value[LEADER] - value[policy] for value in cells if {LEADER, policy} <= set(value)]
+        return format(np.quantile(apart, ENDS[end]), "+.2f") if apart else "–"
+
     def share(setup: str, policy: str) -> str:
         of, won = (by_scene(tried, setup, p, "test_gain") for p in (policy, ORACLE))
         total = sum(won.values())
@@ -400,6 +442,8 @@ def text_of(rows: Sequence[Row], leads: Sequence[Row]) -> str:
     ]
     others = [p for p in policies if p not in (LEADER, ORACLE)]
     tables.append(matrix(f"{LEADER} over it (dB)", ahead, others))
+    ends = f"{LEADER} over it, over rocks and set-ups (dB)"
+    tables.append(matrix(ends, extremes, others, tuple(ENDS)))
     if ORACLE in policies:
         shown = [p for p in policies if p != RANDOM]
         tables.append(matrix("share of the oracle's gain", share, shown))

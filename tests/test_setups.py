@@ -60,7 +60,7 @@ def test_setups_are_made_once_and_compare_a_policy_of_ones_own(tmp_path, capsys,
     assert {row["command"] for row in rows} == {f"python -m studies.setups {out} --rocks 2"}
     assert len(rows) == 2 * 2 * 2
     orbits = {path.name for path in out.glob("cells/dataset/boulder-11/*")}
-    assert orbits == {"circle-1", "hemisphere-1"}
+    assert orbits == {"circle-1", "hemisphere-1", "spiral-1.25-2"}
     assert [float(row["test_gain"]) for row in rows if row["policy"] == "random"] == [0] * 4
     cells = [json.loads(path.read_text()) for path in out.glob("cells/setup/**/result.json")]
     assert len(cells) >= 8
