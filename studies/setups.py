@@ -177,6 +177,11 @@ def case_of(rock: Rock, setup: Setup, size: SetupSize) -> Case:
     return Case(rock, images, number | {"seed": 0}).on_orbit(setup.orbit)
 
 
+def spiral_of(rock: Rock, size: SetupSize) -> Case:
+    """Dataset of the test views on SPIRAL."""
+    return Case(rock, Size(size.width, size.height, size.tests, 0, size.spp)).on_orbit(SPIRAL)
+
+
 def shown_as(policy: str) -> str:
     """Name of a policy in tables."""
     label = policy_file.label(policy)
@@ -195,7 +200,7 @@ def cells_of(
     for rock, (name, setup) in pairs:
         case = case_of(rock, setup, size)
         case, data = case.surveyed(rock.index) if setup.survey else (case, case.cells())
-        spiral = Case(rock, Size(size.width, size.height, size.tests, 0, size.spp)).on_orbit(SPIRAL)
+        spiral = spiral_of(rock, size)
         data = [*data, spiral.cells()[0]]
         common = {"seeds": setup.seeds, "budget": size.images - setup.seeds, **setup.settings}
         for policy in size.policies if policies is None else policies:
@@ -236,7 +241,7 @@ def choose_and_judge(
     """
     name, seed = settings["policy"], settings["seed"]
     shared, tests, pool = shared_scene(root / dataset, root / prior, every)
-    further = _views_of(root / spiral)
+    further = views_of(root / spiral)
     scene = shared.with_seed(seed)
     mission = mgs.Mission(**{k: v for k, v in settings.items() if k not in ("policy", "seed")})
     policy = policy_file.policy_of(name) if name != ORACLE else _oracle(shared)
@@ -309,7 +314,7 @@ def _measure(frames: Sequence[mgs.Frame]) -> Measure:
 
 
 @lru_cache(maxsize=1)
-def _views_of(dataset: Path) -> Measure:
+def views_of(dataset: Path) -> Measure:
     """PSNR over all frames of a dataset."""
     return _measure(mgs.load_dataset(dataset).frames)
 

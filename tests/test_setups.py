@@ -18,7 +18,7 @@ from mgs.files import write_json
 from mgs.run.folder import read_checkpoint
 from mgs.survey import flight
 from mgs.survey.flight import SurveySettings, fly
-from studies import certificate, flights, setups, table1
+from studies import certificate, fits, flights, setups, table1
 from studies.frame import case
 from studies.frame.case import Case, Rock, Size
 from studies.frame.sweep import cell_folder, run_cells
@@ -114,6 +114,20 @@ def test_flights_keep_their_length_and_are_compared_with_even_spacing(tmp_path, 
         assert row["metres"] <= (row["length"] or 1) * found["whole"] * 1.000001
         assert len(set(row["taken"])) == row["images"]
     assert "| dome | 20% | planned tour |" in (out / "flights.md").read_text()
+
+
+def test_a_fit_with_changed_settings_is_compared_with_the_default(tmp_path, capsys):
+    variants = ("default", "means=free", "--sh 1", "poses wrong", "poses wrong, refined")
+    chosen = {name: fits.VARIANTS[name] for name in variants}
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(fits, "VARIANTS", chosen)
+        patched.setattr(fits, "POOLS", {"hemisphere": (4,)})
+        done(capsys, "fits", tmp_path, "--rocks", 1, sizes={"quick": replace(FEW, tests=4)})
+    rows = {row["variant"]: row for row in rows_of(tmp_path / "fits.csv")}
+    assert tuple(rows) == variants
+    assert float(rows["default"]["test_change"]) == 0
+    assert all(float(rows[name]["test_change"]) != 0 for name in variants[1:])
+    assert float(rows["poses wrong"]["test"]) < float(rows["default"]["test"])
 
 
 def test_metres_are_compared_at_the_same_psnr():
