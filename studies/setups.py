@@ -121,7 +121,7 @@ class SetupSize:
 
     width, height, tests, spp: of the images. images: that a run takes, seeds among them. fewer:
     divisor of the numbers of frames of `setups`. gaussians: of the prior; None: automatic. passes:
-    of the fit that is judged; twice the default. draws: runs of `random`, averaged. count: default
+    of the fit that is judged, as by default. draws: runs of `random`, averaged. count: default
     number of rocks. rocks: set by the options.
     """
 
@@ -132,7 +132,7 @@ class SetupSize:
     images: int = 12
     fewer: int = 1
     gaussians: int | None = None
-    passes: int = 20
+    passes: int = 10
     draws: int = 5
     setups: Mapping[str, Setup] = field(default_factory=lambda: SETUPS)
     policies: tuple[str, ...] = POLICIES
