@@ -67,8 +67,8 @@ def studies():
             continue
         study = program.study_of(path.stem)
         for scale, size in study.sizes.items():
-            if study.name == "photographs":
-                continue  # its cells are of datasets that are given
+            if study.name in ("photographs", "blender"):
+                continue  # their cells are of datasets that are given
             options = study.parser().parse_args(["OUT", "--scale", scale])
             work = Work(options, "", study.sized(size, options))
             yield study.name, study.cells(work)
