@@ -4,22 +4,22 @@ left over. Each check is tried by one command."""
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+import synthetic
 import tiny
+from PIL import Image
 from refusals import refused
 
-from mgs.images import write_png
+from mgs.camera import look_at
+from mgs.data.clouds import SparseCloud, write_cloud
+from mgs.data.dataset import load_dataset, write_transforms
+from mgs.images import write_exr, write_png
 
 Change = Callable[[Path], object]
-
-
-def cases(table: dict[str, tuple[Any, str]]) -> Any:
-    """Parametrise a test by the rows of a table: name -> (change or input, words of the line)."""
-    return pytest.mark.parametrize(("given", "named"), table.values(), ids=table.keys())
 
 
 def edit(change: Callable[[dict], object], name: str = "transforms.json") -> Change:
@@ -37,8 +37,12 @@ def header(**values) -> Change:
     return edit(lambda data: data.update(values))
 
 
-def frame(**values) -> Change:
-    return edit(lambda data: data["frames"][2].update(values))
+def frame(number=2, **values) -> Change:
+    return edit(lambda data: data["frames"][number].update(values))
+
+
+def text(name: str, content: str) -> Change:
+    return lambda root: (root / name).write_text(content)
 
 
 def truncate(name: str) -> Change:
@@ -55,97 +59,205 @@ def remove(name: str) -> Change:
     return lambda root: (root / name).unlink()
 
 
+def png(name: str, values: np.ndarray) -> Change:
+    return lambda root: write_png(root / name, values)
+
+
+def corrupt_jpeg(root: Path) -> None:
+    """The header is whole, the pixels are cut off."""
+    jpeg = root / "images/kf_0000.jpg"
+    Image.open(root / "images/kf_0000.png").save(jpeg, quality=95)
+    jpeg.write_bytes(jpeg.read_bytes()[:-500])
+    frame(0, file_path="images/kf_0000.jpg")(root)
+
+
+def points_in_one_place(root: Path) -> None:
+    write_cloud(root / "points.ply", SparseCloud(np.ones((500, 3))))
+    header(ply_file_path="points.ply")(root)
+
+
+def every(key: str, make: Callable[[Path], object]) -> Change:
+    """Write the files of all frames anew. key: field of a frame that has the path."""
+    return lambda root: [make(getattr(frame, key)) for frame in load_dataset(root).frames]
+
+
+def frames(change: Callable[[list], list]) -> Change:
+    """Write transforms.json with other frames."""
+    return lambda root: write_transforms(root, change(list(load_dataset(root).frames)))
+
+
+def photographs(count: int = 10) -> Change:
+    """Frames without depth."""
+    return lambda root: synthetic.write_dataset(
+        root, synthetic.orbit_cameras(count, 64, 48), depth=False
+    )
+
+
+def apart(root: Path) -> None:
+    """Every camera looks away from what the others look at."""
+    made = []
+    for k, one in enumerate(synthetic.write_dataset(root, depth=False).frames):
+        pose = look_at([10.0 * k, 0, 1], [10.0 * k, 1, 1 + 0.1 * (-1) ** k])
+        made.append(replace(one, camera=replace(one.camera, world_to_camera=pose)))
+    write_transforms(root, made)
+
+
+def bare(root: Path) -> None:
+    """Photographs of bare ground: no masks, no depth."""
+    cameras = synthetic.orbit_cameras(10, 64, 48)
+    dataset = synthetic.write_dataset(root, cameras, rocks=[], depth=False)
+    write_transforms(root, [replace(frame, mask_path=None) for frame in dataset.frames])
+
+
+def no_object(root: Path) -> None:
+    """Bare ground with points on it."""
+    bare(root)
+    ground = np.column_stack([np.random.default_rng(0).uniform(-2, 2, (3000, 2)), np.zeros(3000)])
+    write_cloud(root / "sparse.ply", SparseCloud(ground))
+
+
+def millimetres(root: Path) -> None:
+    mesh = synthetic.rock_mesh()
+    mesh.vertices *= 1000
+    mesh.export(root / "mm.ply")
+
+
+def nothing(root: Path) -> None:
+    pass
+
+
 FAR = [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-DATASETS: dict[str, tuple[Change, str]] = {
-    "no transforms.json": (remove("transforms.json"), "transforms.json"),
-    "transforms.json of another shape": (
-        lambda root: (root / "transforms.json").write_text("[1, 2]"),
-        "no frames",
-    ),
-    "pose of words": (frame(transform_matrix=[["a"] * 4] * 4), "frame 2"),
-    "pose of NaN": (frame(transform_matrix=[[float("nan")] * 4] * 4), "not a finite 4x4"),
-    "singular pose": (frame(transform_matrix=np.diag([1, 1, 0, 1]).tolist()), "singular"),
-    "pose far away": (frame(transform_matrix=FAR), "entries beyond 1e+08"),
-    "no pose": (edit(lambda data: data["frames"][2].pop("transform_matrix")), "frame 2 lacks"),
-    "no intrinsics": (edit(lambda data: data.pop("fl_x")), "intrinsics"),
-    "width 0": (header(w=0), "image size"),
-    "negative focal length": (header(fl_x=-1), "focal lengths"),
-    "no image file": (frame(file_path="images/none.png"), "does not exist"),
-    "width of half a pixel": (header(w=16.5), "must be whole pixels"),
-    "width without end": (header(w=float("inf")), "must be whole pixels"),
-    "focal length without end": (header(fl_x=float("inf")), "frame 0"),
-    "distortion of one frame": (frame(p2=-1e-3), "mgs import"),
-    "fisheye": (header(camera_model="OPENCV_FISHEYE"), "mgs import"),
-    "name twice": (frame(file_path="images/../images/kf_0000.png"), "kf_0000"),
-    "file_path with a null character": (frame(file_path="a\0b"), "frame 2"),
-    "mask_path that is a list": (frame(mask_path=["a"]), "mask_path"),
-    "timestamp of words": (frame(timestamp="noon"), "timestamp"),
-    "missing depth": (remove("depth/kf_0003.exr"), "kf_0003.exr"),
-}
-"""Datasets that no command accepts."""
-
-
-@cases(DATASETS)
-def test_broken_dataset(capsys, dataset, tmp_path, given, named):
-    given(dataset)
-    assert named in refused(capsys, ["nbv", dataset, "--out", tmp_path / "out"], tmp_path / "out")
-
-
-@cases(
-    {
-        "image that is text": (
-            lambda root: (root / "images/kf_0000.png").write_text("no pixels"),
-            "kf_0000.png",
-        ),
-        "image of the wrong size": (
-            lambda root: write_png(root / "images/kf_0000.png", np.zeros((5, 7, 3), np.float32)),
-            "7x5",
-        ),
-    }
-)
-def test_broken_pixels(capsys, dataset, prior, tmp_path, given, named):
-    """They are found when a frame is used; frame 0 is a seed."""
-    given(dataset)
-    arguments = ["nbv", dataset, "--out", tmp_path / "out", "--prior", prior, "--budget", 1]
-    assert named in refused(capsys, arguments)
-    assert not (tmp_path / "out/steps.jsonl").exists()
-
-
 DUST = "[rock]\ndetail = 0.1\nburied = 0.999\n[orbit]\naltitude = 0\n[arena]\nstones = 0"
-
-
-@cases(
-    {
-        "unknown key of a lobe": ("[[rock.lobes]]\nradius = 1", "centre, radii"),
-        "detail coarser than the rock": ("[rock]\ndetail = 2", "rock.detail"),
-        "detail of a slip": ("[rock]\ndetail = 1e-9", "rock.detail"),
-        "rock behind its dust": (DUST, "altitude"),
-        "negative size": ("[rock]\nsize = -1", "rock.size"),
-        "no TOML": ("[rock", "not valid TOML"),
-        "NaN": ("[sky]\nturbidity = nan", "sky.turbidity"),
-    }
-)
-def test_scene_files(capsys, tmp_path, given, named):
-    (tmp_path / "mine.toml").write_text(given)
-    arguments = ["synth-orbit", tmp_path / "out", "--scene", tmp_path / "mine.toml"]
-    arguments += ["--frames", 1, "--size", "16x12"]
-    assert named in refused(capsys, arguments, tmp_path / "out")
-
-
-@cases(
-    {
-        "missing": (shutil.rmtree, "mgs prior"),
-        "truncated numbers": (truncate("prior.json"), "prior.json"),
-        "negative spacing": (
-            edit(lambda data: data.update(spacing=-1), "prior.json"),
-            "must be positive metres",
+BLACK, ZEROS = np.zeros((48, 64), bool), {"Z": np.zeros((48, 64))}
+BUILD, PRIOR = "prior {d} --gaussians 300", "nbv {d} --out {out} --prior {d}/prior --budget 1"
+ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
+    (tiny.write_dataset, "nbv {d} --out {out}"): [
+        ("transforms.json", remove("transforms.json")),
+        ("no frames", text("transforms.json", "[1, 2]")),
+        ("frame 2", frame(transform_matrix=[["a"] * 4] * 4)),
+        ("not a finite 4x4", frame(transform_matrix=[[float("nan")] * 4] * 4)),
+        ("singular", frame(transform_matrix=np.diag([1, 1, 0, 1]).tolist())),
+        ("entries beyond 1e+08", frame(transform_matrix=FAR)),
+        ("frame 2 lacks", edit(lambda data: data["frames"][2].pop("transform_matrix"))),
+        ("intrinsics", edit(lambda data: data.pop("fl_x"))),
+        ("image size", header(w=0)),
+        ("focal lengths", header(fl_x=-1)),
+        ("does not exist", frame(file_path="images/none.png")),
+        ("must be whole pixels", header(w=16.5)),
+        ("must be whole pixels", header(w=float("inf"))),
+        ("frame 0", header(fl_x=float("inf"))),
+        ("mgs import", frame(p2=-1e-3)),
+        ("mgs import", header(camera_model="OPENCV_FISHEYE")),
+        ("kf_0000", frame(file_path="images/../images/kf_0000.png")),
+        ("frame 2", frame(file_path="a\0b")),
+        ("mask_path", frame(mask_path=["a"])),
+        ("timestamp", frame(timestamp="noon")),
+        ("kf_0003.exr", remove("depth/kf_0003.exr")),
+    ],
+    (lambda d: tiny.write_prior(tiny.write_dataset(d) / "prior"), PRIOR): [
+        ("mgs prior", lambda root: shutil.rmtree(root / "prior")),
+        ("prior.json", truncate("prior/prior.json")),
+        ("must be positive metres", edit(lambda data: data.update(spacing=-1), "prior/prior.json")),
+    ],
+    (Path.mkdir, "synth-orbit {out} --frames 1 --size 16x12 --scene {d}/a.toml"): [
+        ("centre, radii", text("a.toml", "[[rock.lobes]]\nradius = 1")),
+        ("rock.detail", text("a.toml", "[rock]\ndetail = 2")),
+        ("rock.detail", text("a.toml", "[rock]\ndetail = 1e-9")),
+        ("altitude", text("a.toml", DUST)),
+        ("rock.size", text("a.toml", "[rock]\nsize = -1")),
+        ("not valid TOML", text("a.toml", "[rock")),
+        ("sky.turbidity", text("a.toml", "[sky]\nturbidity = nan")),
+    ],
+    (synthetic.write_dataset, "import {d} --out {out}"): [
+        ("no such file or folder", shutil.rmtree),
+        ("no usable intrinsics", edit(lambda d: (d.pop("fl_x"), d.update(camera_angle_x=0)))),
+        ("not supported", header(camera_model="EQUIRECTANGULAR")),
+        ("has k4", header(k4=0.1)),
+        ("not finite", header(k1=float("nan"))),
+        *[("the distortion", header(k1=k1)) for k1 in (-1e6, -5, 1e6)],
+        ("more than once", frame(0, file_path="images/kf_0001.png")),
+        ("is 64x48, but its camera is 100x48", header(w=100)),
+        ("no such EXR", frame(0, depth_file_path="depth/none.exr")),
+        ("depth_unit", header(depth_unit_scale_factor="mm")),
+        ("up: must be three finite numbers", header(up="skyward")),
+        ("none of the 8 images", lambda root: shutil.rmtree(root / "images")),
+        ("kf_0000.jpg: not a readable image", corrupt_jpeg),
+        ("points.ply: has values that are not finite", points_in_one_place),
+    ],
+    (synthetic.write_dataset, "import {d}/images --out {out}"): [
+        ("photographs can be placed", nothing)
+    ],
+    (synthetic.write_dataset, "import {d} --out {out} --masks {d}/masks"): [
+        ("no mask for image kf_0000.png", remove("masks/kf_0000.png")),
+        (
+            "kf_0000.png: is 32x24, but its camera is 64x48",
+            png("masks/kf_0000.png", np.ones((24, 32), bool)),
         ),
-    }
-)
-def test_broken_prior(capsys, dataset, prior, tmp_path, given, named):
-    given(prior)
+    ],
+    (synthetic.write_dataset, "import {d} --out {out} --masks none"): [
+        ("none: no such folder", nothing)
+    ],
+    (synthetic.write_dataset, "import {d} --out {out} --masks b --mesh a.glb"): [
+        ("give one of them", nothing)
+    ],
+    (synthetic.write_dataset, "import {d} --out {out} --mesh {d}/mm.ply"): [
+        ("the mesh is in no picture", millimetres),
+        ("mm.ply", nothing),
+    ],
+    (synthetic.write_dataset, "prior {d} --mesh {d}/mm.ply"): [
+        ("the mesh is in no picture", millimetres),
+        ("mm.ply", nothing),
+    ],
+    (synthetic.write_dataset, "prior {d}"): [
+        ("masks are black in every frame", every("mask_path", lambda p: write_png(p, BLACK))),
+        ("no depth image has a return", every("depth_path", lambda p: write_exr(p, ZEROS))),
+        ("is 10x10", lambda d: write_exr(d / "depth/kf_0003.exr", {"Z": np.ones((10, 10))})),
+    ],
+    (lambda d: synthetic.write_dataset(d, rocks=[]), "prior {d}"): [
+        ("no rock in the cloud", nothing)
+    ],
+    (nothing, BUILD): [
+        ("7 photographs without depth are too few; take at least 8", photographs(7)),
+        ("the photographs do not overlap", apart),
+        ("points lie in one cluster above the ground; give masks", no_object),
+    ],
+    (bare, f"{BUILD} --source random --poisson-depth 6"): [("has no surface", nothing)],
+    (bare, f"{BUILD} --source hull"): [("has no masks; ", nothing)],
+    (photographs(), f"{BUILD} --source depth"): [("has no depth images; take the", nothing)],
+    (synthetic.write_dataset, "survey {d}"): [
+        ("too few for a survey", frames(lambda all: all[:2])),
+        ("depth_file_path", frames(lambda all: [replace(one, depth_path=None) for one in all])),
+        ("cannot be registered", lambda d: write_exr(d / "depth/kf_0002.exr", ZEROS)),
+    ],
+}
+"""World and command -> words of the line, and what is wrong with the world."""
+CASES = [(*to, *row) for to, rows in ROWS.items() for row in rows]
+IDS = [f"{command.split()[0]}: {words}" for _, command, words, _ in CASES]
+
+
+@pytest.mark.parametrize(("world", "command", "words", "change"), CASES, ids=IDS)
+def test_bad_input_is_one_line_and_leaves_nothing(capsys, tmp_path, world, command, words, change):
+    world(tmp_path / "d")
+    change(tmp_path / "d")
+    given = command.format(d=tmp_path / "d", out=tmp_path / "out").split()
+    # Of a cloud without an object, a picture is left.
+    kept = tmp_path / "d/prior" if change is no_object else tmp_path
+    assert words in refused(capsys, given, kept)
+
+
+BROKEN = {
+    "kf_0000.png": text("images/kf_0000.png", "no pixels"),
+    "7x5": png("images/kf_0000.png", np.zeros((5, 7, 3), np.float32)),
+}
+
+
+@pytest.mark.parametrize("words", BROKEN)
+def test_broken_pixels(capsys, dataset, prior, tmp_path, words):
+    """They are found when a frame is used; frame 0 is a seed."""
+    BROKEN[words](dataset)
     arguments = ["nbv", dataset, "--out", tmp_path / "out", "--prior", prior, "--budget", 1]
-    assert named in refused(capsys, arguments, tmp_path / "out")
+    assert words in refused(capsys, arguments)
+    assert not (tmp_path / "out/steps.jsonl").exists()
 
 
 @pytest.mark.parametrize(

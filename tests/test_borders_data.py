@@ -268,15 +268,6 @@ def write_far(tmp_path, far):
     return tmp_path / "far.obj"
 
 
-def test_a_mesh_in_millimetres_is_refused(data, tmp_path, capsys):
-    mesh = synthetic.rock_mesh()
-    mesh.vertices *= 1000
-    mesh.export(tmp_path / "mm.ply")
-    for name in ("import", "prior"):
-        asked = [name, data.root, "--mesh", tmp_path / "mm.ply", "--out", tmp_path / "out"]
-        assert "the mesh is in no picture" in refused(capsys, asked)
-
-
 def test_masks_in_folders_are_those_of_their_images(data, tmp_path, capsys):
     """Two cameras with pictures of the same names."""
 

@@ -14,6 +14,7 @@ import pytest
 import tiny
 from program import command
 from refusals import refused
+from test_gltf import glb, parts_of
 from test_render_command import CAMERAS, gaussians
 from test_splat_ply import assert_close
 
@@ -78,8 +79,7 @@ def test_a_glb_says_how_far_its_positions_reach(tmp_path):
     model = gaussians(0, n=30)
     path = tmp_path / "x.glb"
     write_gaussians(path, model, "glb", np.eye(3))
-    data = path.read_bytes()
-    document = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    document, _ = parts_of(path)
     position = document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
     reach = [document["accessors"][position][name] for name in ("min", "max")]
     assert np.array_equal(reach, [model.means.min(0), model.means.max(0)])
@@ -181,15 +181,9 @@ def tilted(scale, shear: float = 0.0) -> np.ndarray:
 
 def glb_with(path, change) -> None:
     """Change the JSON of a GLB in place."""
-    data = path.read_bytes()
-    size = struct.unpack("<I", data[12:16])[0]
-    content = json.loads(data[20 : 20 + size])
+    content, body = parts_of(path)
     change(content)
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + size :]
-    head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
-    path.write_bytes(head + text + rest)
+    path.write_bytes(glb(content, body))
 
 
 @pytest.mark.parametrize("scale", [2.0, -0.5, (2.0, 0.5, 1.0)])
@@ -350,46 +344,6 @@ def test_the_export_of_a_run_fits_its_colours_again(dataset, prior, tmp_path, ca
     command("export", tmp_path / "fitted.ply", "--to", "ply", "--out", tmp_path / "same.ply")
     assert "one by one" not in capsys.readouterr().out
     assert read_ply(tmp_path / "same.ply") == fitted
-
-
-def glb(content: object) -> bytes:
-    text = json.dumps(content).encode()
-    return struct.pack("<4sIIII", b"glTF", 2, 0, len(text), 0x4E4F534A) + text
-
-
-SPLATS = {"mode": 0, "attributes": {}, "extensions": {"KHR_gaussian_splatting": {}}}
-PACKED = {"KHR_gaussian_splatting": {"extensions": {"KHR_spz": {}}}}
-BAD = {
-    "a.ksplat": (b"\0" * 64, "npx @playcanvas/splat-transform a.ksplat a.ply"),
-    "empty.glb": (b"glTF", "not a readable GLB"),
-    "list.glb": (glb([]), "not a readable GLB"),
-    "mesh.glb": (glb({"meshes": [{"primitives": [{}]}]}), "no Gaussians in it"),
-    "bare.glb": (glb({"meshes": [{"primitives": [SPLATS]}]}), "not a readable GLB"),
-    "packed.glb": (
-        glb({"meshes": [{"primitives": [SPLATS | {"extensions": PACKED}]}]}),
-        "its Gaussians are compressed (KHR_spz)",
-    ),
-    "cut.spz": (gzip.compress(b"NGSP\3\0\0\0\xff\xff\0\0"), "not a readable SPZ"),
-    "old.spz": (
-        gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 1, 9, 0, 12, 0, 0)),
-        "readable SPZ",
-    ),
-    "few.spz": (
-        gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 10**9, 3, 12, 0, 0) + b"\0" * 99),
-        "not a readable SPZ",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_bad_files_are_refused(tmp_path, capsys, name):
-    if name.endswith("spz"):
-        pytest.importorskip("gsply_cpp")
-    data, message = BAD[name]
-    (tmp_path / name).write_bytes(data)
-    line = refused(capsys, ["export", tmp_path / name, "--to", "ply"], tmp_path)
-    assert message in line
-    assert str(tmp_path / name) in line
 
 
 def test_a_damaged_glb_is_refused_or_read(tmp_path):

@@ -19,6 +19,23 @@ FLOAT, SHORT, USHORT, UINT = 5126, 5122, 5123, 5125
 RED, GREEN = (200, 60, 60), (60, 170, 60)
 
 
+def glb(content: object, body: bytes = b"") -> bytes:
+    """A GLB of this JSON and binary chunk."""
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    body += b"\0" * (-len(body) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
+    chunks += struct.pack("<II", len(body), 0x004E4942) + body
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def parts_of(path):
+    """JSON and binary chunk of a GLB."""
+    data = path.read_bytes()
+    size = struct.unpack("<I", data[12:16])[0]
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
 class Made:
     """A GLB in the making: one node with the mesh of the primitives."""
 
@@ -45,13 +62,7 @@ class Made:
     def write(self, path, *primitives, **more):
         content = self.json | {"meshes": [{"primitives": list(primitives)}], **more}
         content["buffers"] = [{"byteLength": len(self.body)}]
-        text = json.dumps(content).encode()
-        text += b" " * (-len(text) % 4)
-        body = self.body + b"\0" * (-len(self.body) % 4)
-        head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(body))
-        chunks = [struct.pack("<II", len(text), 0x4E4F534A), text]
-        chunks += [struct.pack("<II", len(body), 0x004E4942), body]
-        path.write_bytes(head + b"".join(chunks))
+        path.write_bytes(glb(content, self.body))
         return path
 
 
@@ -125,23 +136,6 @@ def test_instances_and_mirrored_nodes(tmp_path):
     np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [6, 1, 0]])
     np.testing.assert_allclose(mesh.face_normals, [[0, 0, -1]] * 4)
     np.testing.assert_allclose(mesh.vertex_normals, [[0, 0, -1]] * 8)
-
-
-@pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "X_y"])
-def test_an_extension_that_is_not_read_is_named(tmp_path, name):
-    made = Made()
-    primitive = {"attributes": {"POSITION": made.add(QUAD)}, "mode": 6}
-    path = made.write(tmp_path / "x.glb", primitive, extensionsRequired=[name])
-    for read in (load_mesh, read_mesh):
-        with pytest.raises(InputError, match=f"needs the glTF extension {name}"):
-            read(path)
-
-
-def test_lines_alone_are_no_mesh(tmp_path):
-    made = Made()
-    path = made.write(tmp_path / "x.glb", {"attributes": {"POSITION": made.add(QUAD)}, "mode": 3})
-    with pytest.raises(InputError, match="not points or lines"):
-        read_mesh(path)
 
 
 def halves(left, right) -> bytes:
@@ -220,8 +214,6 @@ def test_the_transform_of_a_texture(tmp_path):
 def test_a_texture_that_is_not_read_does_not_hide_the_shape(tmp_path):
     path = coloured(tmp_path / "x.glb", texture=b"\xabKTX 20\xbb" + bytes(90), mime="image/ktx2")
     assert len(read_mesh(path).faces) == 2
-    with pytest.raises(InputError, match="KHR_texture_basisu"):
-        load_mesh(path)
 
 
 def test_parts_with_and_without_a_texture(tmp_path):

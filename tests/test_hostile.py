@@ -15,20 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
-import trimesh
 from program import change_steps, command, said
 from refusals import refused
-from test_fuzz import colmap, mesh
 
-from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset
-from mgs.data.meshes import load_mesh
-from mgs.data.sources import read_source
 from mgs.errors import InputError
 from mgs.files import atomic_folder, folder_locked, read_json, write_json
-from mgs.images import image_size, read_exr, write_exr
+from mgs.images import image_size
 from mgs.run.folder import open_run
-from mgs.splat_ply import read_ply, write_ply
+from mgs.splat_ply import write_ply
 from mgs.view.subject import read_subject
 
 
@@ -46,16 +41,6 @@ def bomb(path: Path, side: int) -> Path:
     return path
 
 
-def exr_bomb(path: Path) -> Path:
-    """An EXR file of 4x4 pixels whose header says 2^21 x 4."""
-    write_exr(path, {"Z": np.zeros((4, 4))})
-    window = b"dataWindow\0box2i\0" + struct.pack("<i", 16)
-    said = window + struct.pack("<iiii", 0, 0, 2**21 - 1, 3)
-    small = window + struct.pack("<iiii", 0, 0, 3, 3)
-    path.write_bytes(path.read_bytes().replace(small, said))
-    return path
-
-
 def test_an_image_is_measured_by_its_header(capsys, dataset, tmp_path, monkeypatch):
     out = tmp_path / "out"
     for side in (4_000, 13_300, 200_000):
@@ -64,40 +49,10 @@ def test_an_image_is_measured_by_its_header(capsys, dataset, tmp_path, monkeypat
             load_dataset(dataset).frames[0].rgb()
         line = refused(capsys, ["import", dataset, "--out", out], out)
         assert f"{side}x{side}" in line
-    with pytest.raises(InputError, match="2097152x4 pixels"):
-        read_exr(exr_bomb(tmp_path / "a.exr"))
     monkeypatch.setattr("mgs.memory.MEMORY_FILE", tmp_path / "meminfo")
     (tmp_path / "meminfo").write_text("MemAvailable: 1000 kB")
     with pytest.raises(InputError, match="GiB are free"):
         image_size(bomb(tmp_path / "b.png", 11_000))
-
-
-def test_json(tmp_path):
-    """JSON in other encodings is read; a file larger than the memory is refused."""
-    (tmp_path / "a.json").write_text('{"ä": 1}', encoding="utf-16")
-    assert read_json(tmp_path / "a.json") == {"ä": 1}
-    os.truncate(tmp_path / "a.json", 1 << 40)
-    with pytest.raises(InputError, match="GiB are free"):
-        read_json(tmp_path / "a.json")
-
-
-def test_a_damaged_exr_is_one_line(tmp_path, capfd):
-    write_exr(tmp_path / "a.exr", {"Z": np.random.default_rng(0).normal(size=(48, 64))})
-    data = (tmp_path / "a.exr").read_bytes()
-    (tmp_path / "a.exr").write_bytes(data[: len(data) // 2])
-    with pytest.raises(InputError, match="not a readable EXR"):
-        read_exr(tmp_path / "a.exr")
-    assert capfd.readouterr().err == ""
-
-
-def test_an_exr_of_several_parts_is_not_called_damaged(tmp_path):
-    import OpenEXR
-
-    kind, grey = OpenEXR.scanlineimage, np.zeros((4, 4), np.float32)
-    parts = [OpenEXR.Part({"type": kind}, {"Z": grey}, name) for name in "ab"]
-    OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
-    with pytest.raises(InputError, match="has 2 parts, which mgs does not read; save one of them"):
-        read_exr(tmp_path / "a.exr")
 
 
 def test_a_full_disk_behind_the_standard_output():
@@ -125,46 +80,6 @@ def test_a_terminal_of_ascii_and_no_home():
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "1 m?\n", "")
 
 
-def endless_mesh(path: Path) -> None:
-    """A GLB file whose arrays are said to have 10^11 numbers."""
-    mesh(path)
-    data = path.read_bytes()
-    size = struct.unpack("<I", data[12:16])[0]
-    header, rest = json.loads(data[20 : 20 + size]), data[20 + size :]
-    for one in header["accessors"]:
-        del one["bufferView"]
-        one["count"] = 10**11
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    whole = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
-    path.write_bytes(whole + text + rest)
-
-
-def test_bombs_of_geometry(tmp_path):
-    mesh(tmp_path / "a.glb", 13_300)
-    with pytest.raises(InputError, match="13300x13300 pixels"):
-        load_mesh(tmp_path / "a.glb")
-    endless_mesh(tmp_path / "b.glb")
-    with pytest.raises(InputError, match="GiB that are free"):
-        load_mesh(tmp_path / "b.glb")
-    columns = "".join(f"property float {name}\n" for name in "xyz")
-    head = f"ply\nformat ascii 1.0\nelement vertex 10000000000\n{columns}end_header\n"
-    (tmp_path / "c.ply").write_text(f"{head}0 0 0\n")
-    for read in (read_cloud, read_ply):
-        with pytest.raises(InputError, match="GiB that are free"):
-            read(tmp_path / "c.ply")
-    shutil.make_archive(str(tmp_path / "d"), "zip", tmp_path)
-    with pytest.raises(InputError, match="not a readable mesh; give"):
-        load_mesh(tmp_path / "d.zip")
-
-
-def test_a_mesh_without_a_height(capsys, tmp_path):
-    flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[0, 1, 2]], process=False)
-    flat.export(tmp_path / "flat.glb")
-    arguments = ["synth-orbit", tmp_path / "out", "--mesh", tmp_path / "flat.glb"]
-    assert "flat on the ground" in refused(capsys, arguments, tmp_path / "out")
-
-
 def test_a_pipe_is_no_file(capsys, dataset, tmp_path):
     os.mkfifo(tmp_path / "pipe.glb")
     pipe, out = tmp_path / "pipe.glb", tmp_path / "out"
@@ -175,69 +90,6 @@ def test_a_pipe_is_no_file(capsys, dataset, tmp_path):
         ["render", dataset, "--cameras", pipe, "--out", out],
     ):
         assert "is no regular file" in refused(capsys, arguments, out)
-
-
-def test_a_mesh_that_names_a_pipe(tmp_path):
-    """It is not opened, which would never end; the library takes a texture as missing."""
-    os.mkfifo(tmp_path / "pipe.bin")
-    content = {
-        "asset": {"version": "2.0"},
-        "buffers": [{"uri": "pipe.bin", "byteLength": 36}],
-        "bufferViews": [{"buffer": 0, "byteLength": 36}],
-        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
-    }
-    (tmp_path / "a.gltf").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=r"pipe\.bin is no regular file"):
-        load_mesh(tmp_path / "a.gltf")
-    (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd pipe.bin\n")
-    (tmp_path / "a.obj").write_text("mtllib a.mtl\nusemtl a\n" + TRIANGLE)
-    assert len(load_mesh(tmp_path / "a.obj").faces) == 1
-
-
-TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
-
-
-COLMAP = {"endless": lambda data: b"\xff" * 8 + data[8:], "cut off": lambda data: data[:-9]}
-
-
-@pytest.mark.parametrize("damage", COLMAP)
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "frames", "rigs"])
-def test_a_colmap_file_of_another_length_than_it_says(tmp_path, name, damage):
-    colmap("binary")(tmp_path / "cameras.bin")
-    file = tmp_path / f"{name}.bin"
-    file.write_bytes(COLMAP[damage](file.read_bytes()))
-    with pytest.raises(InputError, match=rf"{name}\.bin: is damaged or cut off"):
-        read_source(tmp_path)
-
-
-IMAGES = {
-    "no rotation": (12, b"\0" * 32),
-    "position": (44, b"\0" * 6 + b"\xf0\x7f"),
-    "camera": (68, b"\xff" * 4),
-    "name of two lines": (72, b"\n"),
-}
-"""Damage of images.bin: place and bytes."""
-
-
-@pytest.mark.parametrize("damage", IMAGES)
-def test_damaged_images_of_a_colmap_model(tmp_path, damage):
-    colmap("binary")(tmp_path / "cameras.bin")
-    for name in ("frames", "rigs"):  # else the poses are theirs
-        (tmp_path / f"{name}.bin").unlink()
-    file = tmp_path / "images.bin"
-    data, (place, value) = file.read_bytes(), IMAGES[damage]
-    file.write_bytes(data[:place] + value + data[place + len(value) :])
-    with pytest.raises(InputError) as error:
-        read_source(tmp_path)
-    assert len(str(error.value).splitlines()) == 1
-
-
-def test_distortion_that_folds_the_image(capsys, dataset, tmp_path):
-    out = tmp_path / "out"
-    for k1 in (-1e6, -5, 1e6):
-        change(dataset, k1=k1)
-        assert "the distortion" in refused(capsys, ["import", dataset, "--out", out], out)
 
 
 def test_the_loser_is_told_who_works_there(capsys, dataset, prior, tmp_path):

@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from program import command, exit_code, said
-from refusals import refused
 
 from mgs.camera import Camera, look_at, opengl_from_opencv
 from mgs.colour import linear_from_srgb, srgb_from_linear
@@ -362,72 +361,3 @@ def test_masks_by_projecting_a_mesh_or_from_files(dataset, tmp_path, capsys):
         # The mesh reaches below the ground, where the image shows ground.
         assert (a.mask() & mask).sum() > 0.97 * mask.sum()
         assert (a.mask() & ~mask).sum() < 0.15 * mask.sum()
-
-
-# What cannot be imported: how to spoil a dataset, options, what the error says.
-
-Spoil = Callable[[Path], Path | None]
-
-
-def changed(**values: Any) -> Spoil:
-    return lambda root: synthetic.edit(root, lambda data: data.update(values))
-
-
-def first(key: str, value: Any) -> Spoil:
-    return lambda root: synthetic.edit(root, lambda data: data["frames"][0].update({key: value}))
-
-
-def no_angle_of_view(root: Path) -> None:
-    synthetic.edit(root, lambda data: (data.pop("fl_x"), data.update(camera_angle_x=0)))
-
-
-def corrupt_jpeg(root: Path) -> None:
-    """The header is whole, the pixels are cut off."""
-    jpeg = root / "images/kf_0000.jpg"
-    Image.open(root / "images/kf_0000.png").save(jpeg, quality=95)
-    jpeg.write_bytes(jpeg.read_bytes()[:-500])
-    first("file_path", "images/kf_0000.jpg")(root)
-
-
-def points_in_one_place(root: Path) -> None:
-    write_cloud(root / "points.ply", SparseCloud(np.ones((500, 3))))
-    changed(ply_file_path="points.ply")(root)
-
-
-MASKS = ["--masks", "{source}/masks"]
-BAD: dict[str, tuple[Spoil, list[str], str]] = {
-    "missing": (lambda root: root / "nowhere", [], "no such file or folder"),
-    "angle of view of 0": (no_angle_of_view, [], "no usable intrinsics"),
-    "panorama": (changed(camera_model="EQUIRECTANGULAR"), [], "not supported"),
-    "k4": (changed(k4=0.1), [], "has k4"),
-    "nan distortion": (changed(k1=float("nan")), [], "not finite"),
-    "duplicate frames": (first("file_path", "images/kf_0001.png"), [], "more than once"),
-    "wrong size": (changed(w=100), [], "is 64x48, but its camera is 100x48"),
-    "no depth file": (first("depth_file_path", "depth/none.exr"), [], "no such EXR"),
-    "unit of words": (changed(depth_unit_scale_factor="mm"), [], "depth_unit"),
-    "up of words": (changed(up="skyward"), [], "up: must be three finite numbers"),
-    "no images": (lambda root: shutil.rmtree(root / "images"), [], "none of the 8 images"),
-    "corrupt JPEG": (corrupt_jpeg, [], "kf_0000.jpg: not a readable image"),
-    "points in one place": (points_in_one_place, [], "points.ply: has values that are not finite"),
-    "no source": (lambda root: root / "images", [], "photographs can be placed"),
-    "one mask missing": (
-        lambda root: (root / "masks/kf_0000.png").unlink(), MASKS, "no mask for image kf_0000.png",
-    ),
-    "mask of another size": (
-        lambda root: write_png(root / "masks/kf_0000.png", np.ones((24, 32), bool)),
-        MASKS,
-        "kf_0000.png: is 32x24, but its camera is 64x48",
-    ),
-    "no mask folder": (changed(), ["--masks", "none"], "none: no such folder"),
-    "both masks": (changed(), ["--mesh", "a.glb", "--masks", "b"], "give one of them"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_one_line_and_leaves_nothing(case, tmp_path, capsys):
-    spoil, options, message = BAD[case]
-    root = synthetic.write_dataset(tmp_path / "src").root
-    source = spoil(root) or root
-    given = [option.format(source=source) for option in options]
-    out = tmp_path / "out"
-    assert message in refused(capsys, ["import", source, "--out", out, *given], out)

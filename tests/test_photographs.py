@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -19,6 +18,7 @@ from refusals import refused
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
+from test_bad_input import bare
 
 from mgs.camera import Camera, look_at
 from mgs.data.check import check_dataset
@@ -295,10 +295,6 @@ def test_a_cloud_survives_its_file_and_of_points_in_one_place_one_is_kept(tmp_pa
     read = read_cloud(tmp_path / "c.ply")
     assert np.array_equal(read.points, points)
     assert np.array_equal(read.track, np.arange(50))
-    whole = (tmp_path / "c.ply").read_bytes()
-    (tmp_path / "c.ply").write_bytes(whole[:500])
-    with pytest.raises(InputError, match=r"c.ply: not a readable cloud"):
-        read_cloud(tmp_path / "c.ply")
 
 
 # Up and units
@@ -444,58 +440,6 @@ def test_masks_are_made_of_the_prior(exact, colmap, tmp_path):
     with Image.open(tmp_path / "d/masks.png") as sheet:
         assert sheet.size == (6 * 240, 4 * 180)
     assert exit_code("dataset", "masks", tmp_path / "d") == 2
-
-
-# What cannot be used: how to make the dataset, options, what the error says.
-
-
-def few(root: Path) -> None:
-    synthetic.write_dataset(root, synthetic.orbit_cameras(7, 64, 48), depth=False)
-
-
-def apart(root: Path) -> None:
-    """Every camera looks away from what the others look at."""
-    frames = []
-    for k, frame in enumerate(synthetic.write_dataset(root, depth=False).frames):
-        pose = look_at([10.0 * k, 0, 1], [10.0 * k, 1, 1 + 0.1 * (-1) ** k])
-        frames.append(replace(frame, camera=replace(frame.camera, world_to_camera=pose)))
-    write_transforms(root, frames)
-
-
-def bare(root: Path) -> None:
-    """Photographs of bare ground: no masks, no depth."""
-    cameras = synthetic.orbit_cameras(10, 64, 48)
-    dataset = synthetic.write_dataset(root, cameras, rocks=[], depth=False)
-    write_transforms(root, [replace(frame, mask_path=None) for frame in dataset.frames])
-
-
-def no_object(root: Path) -> None:
-    """Bare ground with points on it."""
-    bare(root)
-    ground = np.column_stack([np.random.default_rng(0).uniform(-2, 2, (3000, 2)), np.zeros(3000)])
-    write_cloud(root / "sparse.ply", SparseCloud(ground))
-
-
-REFUSED: dict[str, tuple[Callable[[Path], object], list[str], str]] = {
-    "few": (few, [], "7 photographs without depth are too few; take at least 8"),
-    "no overlap": (apart, [], "the photographs do not overlap"),
-    "no object": (no_object, [], "points lie in one cluster above the ground; give masks"),
-    "a surface at random": (bare, ["--source", "random", "--poisson-depth", "6"], "has no surface"),
-    "hull without masks": (bare, ["--source", "hull"], "has no masks; "),
-    "depth without depth": (
-        few,
-        ["--source", "depth"],
-        "has no depth images; take the",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_used_is_one_line(case, tmp_path, capsys):
-    make, options, message = REFUSED[case]
-    make(tmp_path / "d")
-    arguments = ["prior", tmp_path / "d", "--gaussians", "300", *options]
-    assert message in refused(capsys, arguments, tmp_path / "d/prior")
 
 
 def test_a_world_in_which_nothing_would_be_drawn_is_one_line(tmp_path, capsys):

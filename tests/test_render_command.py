@@ -9,7 +9,6 @@ import OpenEXR
 import pytest
 from PIL import Image
 from program import command
-from refusals import refused
 
 from mgs.camera import Camera, look_at, opengl_from_opencv
 from mgs.colour import linear_from_srgb, srgb_from_linear
@@ -224,58 +223,3 @@ def test_images_of_one_name_in_two_folders(folder):
     run(folder)
     names = sorted(path.name for path in (folder / "out").iterdir())
     assert names == ["0000_0001.png", "0001_0001.png"]
-
-
-def replaced(old: str, new: str):
-    """Write x.ply anew, with three Gaussians and a part of its text replaced."""
-
-    def change(folder):
-        foreign_ply(folder / "x.ply", gaussians(0, n=3))
-        (folder / "x.ply").write_text((folder / "x.ply").read_text().replace(old, new))
-
-    return change
-
-
-def written(name: str, text: str):
-    return lambda folder: (folder / name).write_text(text)
-
-
-def framed(path: str):
-    """Write a transforms.json without intrinsics and with one frame of this path."""
-    frame = {"file_path": path, "transform_matrix": np.eye(4).tolist()}
-    return written("transforms.json", json.dumps({"frames": [frame]}))
-
-
-HUGE = "ply\nformat binary_little_endian 1.0\nelement vertex 9223372036854775808\n"
-EMPTY = "ply\nformat ascii 1.0\nelement point 0\n"
-ONE_FLOAT = "property float x\nend_header\n"
-UNREADABLE = "not a readable 3DGS PLY"
-BAD = {
-    "no PLY": (
-        lambda folder: (folder / "x.ply").unlink(),
-        "x.ply: no such file; give a PLY, GLB or SPZ of Gaussians",
-    ),
-    "not a PLY": (replaced("ply\n", "solid ply\n"), UNREADABLE),
-    "a point cloud": (replaced("opacity", "quality"), "property 'opacity' is missing"),
-    "odd f_rest": (replaced("opacity", "f_rest_0"), "1 f_rest properties fit no SH degree"),
-    "a list for a number": (replaced("float opacity", "list uchar float opacity"), "x.ply: not a"),
-    "more vertices than memory": (replaced("vertex 3", "vertex 2147483648"), "decoding it takes"),
-    "more vertices than an integer": (written("x.ply", HUGE + ONE_FLOAT), UNREADABLE),
-    "no vertices": (written("x.ply", EMPTY + ONE_FLOAT), "it has no vertices"),
-    "no cameras": (lambda folder: (folder / "transforms.json").unlink(), "json: no such file"),
-    "another shape": (written("transforms.json", '{"frames": [1]}'), "frame 0 lacks file_path"),
-    "a zero byte": (framed("a\0b.png"), "frame 0 has a file_path that is no text or cannot be"),
-    "no intrinsics": (framed("a.png"), "frame 0 lacks fl_x; correct the intrinsics"),
-    "open brackets": (written("transforms.json", "[" * 100_000), "not valid JSON"),
-    "5000 digits": (written("transforms.json", '{"w": ' + "9" * 5000 + "}"), "not valid JSON"),
-    "not empty": (lambda folder: (folder / "out/kept").mkdir(parents=True), "is there already"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_one_line_and_nothing_is_written(folder, capsys, case):
-    change, message = BAD[case]
-    foreign_ply(folder / "x.ply", gaussians(0))
-    change(folder)
-    arguments = ["render", folder / "x.ply", "--cameras", folder / "transforms.json"]
-    assert message in refused(capsys, [*arguments, "--out", folder / "out"], folder)
