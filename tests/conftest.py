@@ -22,12 +22,12 @@ import tiny  # noqa: E402
 from mgs.data.dataset import load_dataset  # noqa: E402
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def pristine(tmp_path_factory):
     return tiny.write_dataset(tmp_path_factory.mktemp("pristine") / "dataset")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def loaded(pristine):
     """A tiny dataset that no test changes."""
     return load_dataset(pristine)

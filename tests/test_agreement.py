@@ -2,8 +2,6 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
@@ -40,9 +38,14 @@ def frames(tmp_path_factory):
     return made
 
 
-def agreement(frames):
-    with TemporaryDirectory() as folder:
-        return poses.agreement(frames, Matcher.of_frames(frames, Path(folder)))
+@pytest.fixture(scope="module")
+def matches(tmp_path_factory):
+    """A folder that keeps the matches of the pictures, whatever their poses."""
+    return tmp_path_factory.mktemp("matches") / "kept"
+
+
+def agreement(frames, folder):
+    return poses.agreement(frames, Matcher.of_frames(frames, folder))
 
 
 def wrong(frames, change):
@@ -54,8 +57,8 @@ def wrong(frames, change):
     return made
 
 
-def test_right_poses_fit(frames):
-    found = agreement(frames)
+def test_right_poses_fit(frames, matches):
+    found = agreement(frames, matches)
     assert found.error < 0.3
     assert found.problem == ""
 
@@ -69,22 +72,24 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_a_wrong_convention_is_named(frames, tmp_path, name):
+def test_a_wrong_convention_is_named(frames, matches, tmp_path, name):
     if change := MISTAKES[name]:
-        found = agreement(wrong(frames, change))
+        found = agreement(wrong(frames, change), matches)
     else:
         mirrored = [tmp_path / frame.image_path.name for frame in frames]
         for frame, path in zip(frames, mirrored, strict=True):
             write_png(path, frame.rgb()[:, ::-1])
-        found = agreement([replace(f, image_path=p) for f, p in zip(frames, mirrored, strict=True)])
+        pairs = zip(frames, mirrored, strict=True)
+        found = agreement([replace(f, image_path=p) for f, p in pairs], tmp_path / "matches")
     assert found.error > 1
     assert name in found.problem
 
 
-def test_a_wrong_focal_length_is_named(frames):
+def test_a_wrong_focal_length_is_named(frames, tmp_path):
     K = frames[0].camera.K * [[1.3, 1, 1], [1, 1.3, 1], [1, 1, 1]]
     zoomed = [Camera(K, 320, 240, frame.camera.world_to_camera) for frame in frames]
-    found = agreement([replace(f, camera=c) for f, c in zip(frames, zoomed, strict=True)])
+    changed = [replace(f, camera=c) for f, c in zip(frames, zoomed, strict=True)]
+    found = agreement(changed, tmp_path / "matches")
     assert "fit a focal length 0.7" in found.problem
 
 
@@ -92,8 +97,8 @@ def test_a_wrong_focal_length_is_named(frames):
 @pytest.mark.parametrize("depth", [True, False])
 def test_without_matches_depth_or_directions_tell(tmp_path, depth, name):
     """Pictures of little texture, where cameras are far apart."""
-    frames = synthetic.write_dataset(tmp_path, depth=depth).frames
-    right, found = agreement(frames), agreement(wrong(frames, MISTAKES[name]))
+    frames, folder = synthetic.write_dataset(tmp_path, depth=depth).frames, tmp_path / "matches"
+    right, found = agreement(frames, folder), agreement(wrong(frames, MISTAKES[name]), folder)
     assert right is None or (right.error < 1 and not right.problem)
     assert depth == (right is not None)
     assert name in found.problem
@@ -105,7 +110,9 @@ def test_depth_in_another_unit_is_named(tmp_path):
     frames = synthetic.write_dataset(tmp_path, cameras).frames
     for frame in frames:
         write_exr(frame.depth_path, {"Z": 5 * frame.depth()})
-    assert re.search("fit lengths (4.9|5).* times as long", agreement(frames).problem)
+    assert re.search(
+        "fit lengths (4.9|5).* times as long", agreement(frames, tmp_path / "matches").problem
+    )
 
 
 def test_points_that_pictures_show_tell(frames):
@@ -126,4 +133,4 @@ def test_poses_of_other_pictures_are_noticed_and_said(frames, tmp_path, capsys):
     write_transforms(root, shuffled)
     command("import", root, "--out", tmp_path / "out")
     assert "the poses do not belong to these pictures" in said(capsys)[1]
-    assert agreement(frames[:1]) is None
+    assert agreement(frames[:1], tmp_path / "one") is None

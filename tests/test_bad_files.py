@@ -14,8 +14,8 @@ import pytest
 import tiny
 import trimesh
 from test_fuzz import cloud, colmap, exr, mesh
-from test_gltf import Made, coloured, glb, parts_of
-from test_gltf import plain as square
+from test_meshes import Made, coloured, glb, parts_of
+from test_meshes import plain as square
 from test_render_command import foreign_ply, gaussians
 
 from mgs.data.clouds import read_cloud

@@ -10,18 +10,15 @@ import synthetic
 from PIL import Image
 from program import command, said
 from refusals import refused
-from test_recordings import MOUNT, OPTICAL, Bag, write_open3d, write_rtabmap
+from test_recordings import write_bag, write_open3d, write_rtabmap
 
 from mgs.camera import Camera
-from mgs.data import tracks
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.lens import Lens
 from mgs.data.sources import read_source
 from mgs.errors import InputError
 from mgs.images import read_depth, read_mask
-
-COLOUR = "/camera/color/image_raw"
 
 
 @pytest.fixture
@@ -41,92 +38,31 @@ def errors(dataset, shots) -> np.ndarray:
     return np.array(found)
 
 
-class Robot:
-    """A bag of a robot's camera; each test adds the poses."""
-
-    def __init__(self, path, data):
-        self.bag, self.path, self.frames = Bag(path, 2), path, data.frames
-
-    def images(self):
-        for k, frame in enumerate(self.frames):
-            rgb = np.asarray(Image.open(frame.image_path))
-            self.bag.image(COLOUR, 100 + 0.5 * k, "rgb8", rgb)
-            self.bag.lens("/camera/color/camera_info", 100 + 0.5 * k, frame.camera)
-
-    def bodies(self):
-        for k, frame in enumerate(self.frames):
-            yield k, 100 + 0.5 * k, frame.camera.camera_to_world @ np.linalg.inv(MOUNT)
-
-    def mount(self):
-        self.bag.tf("/tf_static", 99, "base_link", OPTICAL, MOUNT)
-
-    def odometry(self, topic, time, pose):
-        T = self.bag
-        place = T.pose("Pose", "Point", pose)
-        made = T.make("geometry_msgs/msg/PoseWithCovariance", place, np.zeros(36))
-        zero = T.make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
-        twist = T.make("geometry_msgs/msg/Twist", zero, zero)
-        twist = T.make("geometry_msgs/msg/TwistWithCovariance", twist, np.zeros(36))
-        head = T.header(time, "odom")
-        T.write(topic, "nav_msgs/msg/Odometry", time, head, "base_link", made, twist)
-
-
-def wrong(pose, k):
-    """A pose of wheels that slip."""
-    return tracks.rigid((0.3 * k, 0, 0), (0, 0, np.sin(0.1 * k), np.cos(0.1 * k))) @ pose
-
-
-def bag_of(tmp_path, data, kind):
-    robot = Robot(tmp_path / "bag", data)
-    with robot.bag.writer:
-        robot.images()
-        if kind != "pose only":
-            robot.mount()
-        for k, time, body in robot.bodies():
-            if kind in ("tf and wheels", "tf and goal", "gap") and not (
-                kind == "gap" and 3 < k < 8
-            ):
-                robot.bag.tf("/tf", time, "odom", "base_link", body)
-            if kind in ("tf and wheels", "wheels and filter"):
-                robot.odometry("/wheels", time + 0.01, wrong(body, k))
-            if kind == "wheels and filter":
-                robot.odometry("/filter", time, body)
-            if kind == "motion capture":
-                step = robot.bag.pose("Transform", "Vector3", body)
-                values = robot.bag.header(time, "room"), "base_link", step
-                name = "geometry_msgs/msg/TransformStamped"
-                robot.bag.write("/mocap/robot", name, time, *values)
-            if kind in ("body", "pose only"):
-                pose = body if kind == "body" else body @ MOUNT
-                robot.bag.stamped("/local/pose", time, pose)
-        if kind == "tf and goal":
-            robot.bag.stamped("/goal_pose", 99.5, np.eye(4))
-    return robot.path
-
-
 @pytest.mark.parametrize(
-    ("kind", "pose", "frames"),
+    ("poses", "topic", "frames"),
     [
-        ("tf and wheels", None, 12),
-        ("tf and goal", None, 12),
-        ("gap", None, 8),
-        ("wheels and filter", "/filter", 12),
-        ("body", "/local/pose", 12),
-        ("pose only", "/local/pose", 12),
-        ("motion capture", "/mocap/robot", 12),
+        (("mount", "tf", "wheels"), None, 12),
+        (("mount", "tf", "goal"), None, 12),
+        (("mount", "gap"), None, 8),
+        (("mount", "wheels", "filter"), "/filter", 12),
+        (("mount", "body"), "/slam/pose", 12),
+        (("camera",), "/slam/pose", 12),
+        (("mount", "motion capture"), "/mocap/robot", 12),
     ],
 )
-def test_poses_of_a_bag_are_those_that_move_the_camera(tmp_path, data, kind, pose, frames):
-    source = read_source(bag_of(tmp_path, data, kind), unpack=tmp_path / "x", pose=pose)
+def test_poses_of_a_bag_are_those_that_move_the_camera(tmp_path, data, poses, topic, frames):
+    bag = write_bag(tmp_path / "bag", data, poses=poses, depth=False)
+    source = read_source(bag, unpack=tmp_path / "x", pose=topic)
     assert errors(data, source.shots).max() < 1e-6
     assert len(source.shots) == frames
     assert source.left_out.total() == 12 - frames
 
 
-@pytest.mark.parametrize("kind", ["static", "wheels and filter", "body", "motion capture"])
-def test_a_bag_whose_poses_are_not_plain_is_refused(tmp_path, data, kind):
+@pytest.mark.parametrize("pose", [(), ("wheels", "filter"), ("body",), ("motion capture",)])
+def test_a_bag_whose_poses_are_not_plain_is_refused(tmp_path, data, pose):
+    bag = write_bag(tmp_path / "bag", data, poses=("mount", *pose), depth=False)
     with pytest.raises(InputError, match=r"does not move|come from|no tf or odometry leads"):
-        read_source(bag_of(tmp_path, data, kind), unpack=tmp_path / "x")
+        read_source(bag, unpack=tmp_path / "x")
 
 
 def test_names_with_numbers_are_in_their_order(tmp_path, data):

@@ -1,4 +1,4 @@
-"""Charts: times, commands of rows, presets; and a whole chart of a tiny rock."""
+"""Charts: times, commands of rows, presets, a whole chart of a tiny rock; and the benchmark."""
 
 import csv
 import json
@@ -16,7 +16,9 @@ import mgs
 from mgs.cli.app import app
 from mgs.cli.nbv import nbv
 from mgs.cli.options import parse_settings
+from mgs.files import read_json
 from mgs.run.settings import NbvSettings
+from studies import bench as core
 from studies import chart, photographs
 from studies.frame import timing
 from studies.frame.case import Size
@@ -158,3 +160,32 @@ def test_photographs_are_charted_beside_another_program(dataset, tmp_path, capsy
     assert parsed(record["command"])["peer"] == [peer]
     assert all(parsed(row["command"])["passes"] == row["passes"] for row in ours)
     assert (out / "photographs.png").stat().st_size > 10_000
+
+
+def test_cold_keeps_no_lists(monkeypatch):
+    gaussians = tiny.initial([])
+    camera, cold, draw = core.surface_camera(gaussians, 32, 24), [], core.render
+
+    def watched(gaussians, camera, cache=None):
+        if cache is None:
+            cold.append(camera)
+        return draw(gaussians, camera, cache=cache)
+
+    monkeypatch.setattr(core, "render", watched)
+    core.time_core(gaussians, camera, 3)
+    assert len(cold) == 3 + core.WARM_UP
+
+
+@pytest.mark.slow
+def test_times_every_operation_and_writes_json(capsys, tmp_path):
+    json = tmp_path / "a b.json"
+    arguments = ["--gaussians", "1000", "--repeats", "3", "--json", str(json)]
+    study("bench", *arguments)
+    written = read_json(json)
+    line = f"python -m studies.bench --gaussians 1000 --repeats 3 --json '{json}'"
+    assert written["command"] == line
+    own = {"forward_cold", "forward_warm", "gradient_warm", "fisher_exact", "fisher_block"}
+    assert set(written["seconds"]) == own | {"volprim_forward", "volprim_gradient"}
+    assert all(value > 0 for value in [*written["seconds"].values(), *written["ratios"].values()])
+    assert "forward warm speedup" in capsys.readouterr().out
+    assert "is there already" in refused(capsys, ["--json", json], tmp_path, "bench")

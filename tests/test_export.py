@@ -14,7 +14,7 @@ import pytest
 import tiny
 from program import command
 from refusals import refused
-from test_gltf import glb, parts_of
+from test_meshes import glb, parts_of
 from test_render_command import CAMERAS, gaussians
 from test_splat_ply import assert_close
 

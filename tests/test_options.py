@@ -1,12 +1,19 @@
-"""Options that cannot be, through the real command line: one line, exit code 2, nothing written."""
+"""Options that cannot be, and outputs that cannot be written, through the real command line: known
+before any work, one line, exit code 2."""
 
+import importlib
+import os
 import shlex
+from pathlib import Path
 
 import pytest
 import synthetic
 import tiny
-from refusals import refused
+import typer
+from program import command, said, steps
+from refusals import a_file, listing, occupied, refused
 
+from mgs.cli.app import COMMANDS, app
 from mgs.splat_ply import write_ply
 
 OPTIONS = {
@@ -131,3 +138,155 @@ def test_what_cannot_be_is_one_line_that_names_it(capsys, places, begin, end):
     line = refused(capsys, shlex.split(f"{begin.format(**places)} {end}"), places["root"])
     assert any(name[:100].replace("-", "_") in line.replace("-", "_") for name in names(end)), line
     assert len(line) < 600
+
+
+pytestmark = pytest.mark.usefixtures("coarse_priors")
+
+
+def read_only(tmp_path: Path) -> Path:
+    """A folder nobody may write to: root is not held back by permissions, so for root it is the
+    kernel's own."""
+    if os.geteuid() == 0:
+        return Path("/proc/mgs")
+    folder = tmp_path / "locked"
+    folder.mkdir(mode=0o555)
+    return folder / "out"
+
+
+def writers(dataset: Path, prior: Path, splats: Path, out: Path) -> dict[str, list]:
+    """Every command that writes into a folder of one's choice."""
+    return {
+        "nbv": ["nbv", dataset, "--out", out, "--prior", prior, "--budget", 1],
+        "prior": ["prior", dataset, "--out", out, "--gaussians", 40],
+        "synth-orbit": ["synth-orbit", out, "--frames", 2, "--size", "16x12"],
+        "survey": ["survey", dataset, "--out", out],
+        "import": ["import", dataset, "--out", out],
+        "render": ["render", splats, "--cameras", dataset, "--out", out],
+        "demo": ["demo", out],
+    }
+
+
+IN_THE_WAY = {
+    "is there already": lambda tmp_path: occupied(tmp_path / "out"),
+    "is a file": lambda tmp_path: a_file(tmp_path / "out"),
+    "under a file": lambda tmp_path: a_file(tmp_path / "file") / "out",
+    "long name": lambda tmp_path: tmp_path / ("long" * 99),
+    "read only": read_only,
+}
+COMMANDS_THAT_WRITE = list(writers(*[Path()] * 4))
+
+
+@pytest.mark.parametrize(
+    ("command", "place"),
+    [(command, "is there already") for command in COMMANDS_THAT_WRITE]
+    + [("render", place) for place in IN_THE_WAY if place != "is there already"]
+    + [("prior", "read only"), ("nbv", "read only")],
+)
+def test_output_that_is_in_the_way(capsys, dataset, prior, tmp_path, command, place):
+    write_ply(tmp_path / "splats.ply", tiny.initial([]))
+    out = IN_THE_WAY[place](tmp_path)
+    before = listing(tmp_path)
+    line = refused(capsys, writers(dataset, prior, tmp_path / "splats.ply", out)[command])
+    assert (place if place in ("is there already", "is a file") else "cannot be written") in line
+    assert listing(tmp_path) == before
+
+
+def test_force_replaces_what_the_command_made_and_nothing_else(capsys, dataset, prior, tmp_path):
+    out, few = tmp_path / "out", ["--gaussians", 60]
+    made = ["prior", dataset, "--out", out, *few]
+    command(*made)
+    assert "is there already" in refused(capsys, made, out)
+    (out / "prior.png").write_text("old")
+    command(*made, "--force")
+    assert {path.name for path in tmp_path.iterdir()} == {"dataset", "prior", "out"}
+    assert (out / "prior.png").read_bytes()[:4] == b"\x89PNG"
+    again = [*made, "--force"]
+    assert "mesh.ply is in it" in refused(capsys, [*again, "--mesh", out / "mesh.ply"], out)
+    (out / "notes.txt").write_text("keep me")
+    assert "it holds notes.txt" in refused(capsys, again, out)
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    assert "it holds" in refused(capsys, ["prior", dataset, "--out", run, *few, "--force"], run)
+    nbv = ["nbv", dataset, "--prior", prior, "--out", out, "--budget", 1, "--force"]
+    assert "is there already" in refused(capsys, nbv, out)
+    nbv[nbv.index(out)] = run
+    command(*nbv, "--seeds", 3, "--set", "train.passes=1", "--set", "warm_passes=1")
+    assert not (run / "renders").exists()
+    assert len(steps(run)) == 2
+
+
+ONE_FILE = {
+    "report {run} --html {out}/kept.html": "kept.html",
+    "simplify {run}": "run/gaussians_pruned.ply",
+}
+"""Command -> the file that it would write."""
+
+
+@pytest.mark.parametrize("arguments", ONE_FILE)
+def test_a_file_that_is_there_is_kept(capsys, dataset, prior, tmp_path, arguments):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    a_file(tmp_path / ONE_FILE[arguments])
+    words = arguments.format(run=run, out=tmp_path).split()
+    assert "is there already; choose another place" in refused(capsys, words, tmp_path)
+
+
+def test_a_run_is_drawn_through_its_own_cameras(capsys, dataset, prior, tmp_path):
+    run, out = tiny.write_run(tmp_path / "run", dataset, prior), tmp_path / "out"
+    drawn = ["render", run, "--out", out, "--width", 8]
+    command(*drawn)
+    pictures = [path.name for path in (dataset / "images").iterdir()]
+    assert sorted(path.name for path in out.iterdir()) == sorted(pictures)
+    assert "is there already" in refused(capsys, drawn, out)
+    command(*drawn, "--force")
+    both = ["export", run, run, "--out", out / "a.glb"]
+    assert "is one file for 2; leave it out" in refused(capsys, both, tmp_path)
+
+
+def test_a_file_where_a_run_keeps_its_pictures(capsys, dataset, prior, tmp_path):
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    for folder, name in (("renders", "eval"), ("diagnostics", "diagnose")):
+        a_file(run / folder)
+        line = refused(capsys, [name, run], run)
+        assert "cannot be written" in line or "is a file, not a folder" in line
+
+
+WHOLE = {
+    "prior": ("mgs.prior.figure", "mesh.ply points.ply prior.json prior.png"),
+    "survey": ("mgs.survey.folder", "cloud.ply rock.glb survey.json survey.png transforms.json"),
+}
+"""Command -> module that draws its picture, and the files that it writes."""
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_result_appears_whole(tmp_path, monkeypatch, name):
+    """Nothing is under its name while its picture, the last file, is drawn."""
+    module, files = importlib.import_module(WHOLE[name][0]), WHOLE[name][1]
+    draw, drawn, out = getattr(module, f"draw_{name}"), [], tmp_path / "out"
+    root = synthetic.write_dataset(tmp_path / "data").root
+
+    def watched(path, *rest):
+        drawn.append(len(list(path.parent.iterdir())) > 2 and not out.exists())
+        draw(path, *rest)
+
+    monkeypatch.setattr(module, f"draw_{name}", watched)
+    option = ["--gaussians", 60] if name == "prior" else ["--poses", "exact"]
+    command(name, root, "--out", out, *option)
+    assert drawn == [True]
+    assert sorted(path.name for path in out.iterdir() if path.is_file()) == files.split()
+    assert not list(tmp_path.glob(".*"))
+
+
+def printed(capsys, *arguments) -> str:
+    """Everything that `mgs ARGUMENTS` prints, in one line."""
+    command(*arguments)
+    return said(capsys)[0]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_word_of_a_help_text_is_printed(capsys, monkeypatch, name):
+    """rich takes a word in brackets, such as [colour=1], for markup and leaves it out."""
+    monkeypatch.setenv("COLUMNS", "1000")
+    text = printed(capsys, name, "--help")
+    made = typer.main.get_command(app).commands[name]
+    for words in filter(None, [made.help, *(parameter.help for parameter in made.params)]):
+        for paragraph in words.split("\n\n"):
+            assert " ".join(paragraph.split()) in text

@@ -127,35 +127,68 @@ class Bag:
         made = self.pose("Pose", "Point", pose)
         self.write(topic, "geometry_msgs/msg/PoseStamped", time, self.header(time, "map"), made)
 
+    def odometry(self, topic: str, time: float, pose: np.ndarray) -> None:
+        made = (self.pose("Pose", "Point", pose), np.zeros(36))
+        zero = self.make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+        still = self.make("geometry_msgs/msg/Twist", zero, zero), np.zeros(36)
+        values = self.header(time, "odom"), "base_link"
+        values += (self.make("geometry_msgs/msg/PoseWithCovariance", *made),)
+        values += (self.make("geometry_msgs/msg/TwistWithCovariance", *still),)
+        self.write(topic, "nav_msgs/msg/Odometry", time, *values)
+
+    def motion_capture(self, time: float, pose: np.ndarray) -> None:
+        values = self.header(time, "room"), "base_link", self.pose("Transform", "Vector3", pose)
+        self.write("/mocap/robot", "geometry_msgs/msg/TransformStamped", time, *values)
+
+
+def slipped(pose: np.ndarray, k: int) -> np.ndarray:
+    """A pose of wheels that slip."""
+    return tracks.rigid((0.3 * k, 0, 0), (0, 0, np.sin(0.1 * k), np.cos(0.1 * k))) @ pose
+
+
+POSES = {
+    "mount": lambda bag, k, time, body: bag.tf("/tf_static", time, "base_link", OPTICAL, MOUNT),
+    "tf": lambda bag, k, time, body: bag.tf("/tf", time, "map", "base_link", body),
+    "gap": lambda bag, k, time, body: 3 < k < 8 or POSES["tf"](bag, k, time, body),
+    "wheels": lambda bag, k, time, body: bag.odometry("/wheels", time + 0.01, slipped(body, k)),
+    "filter": lambda bag, k, time, body: bag.odometry("/filter", time, body),
+    "motion capture": lambda bag, k, time, body: bag.motion_capture(time, body),
+    "body": lambda bag, k, time, body: bag.stamped("/slam/pose", time, body),
+    "camera": lambda bag, k, time, body: bag.stamped("/slam/pose", time, body @ MOUNT),
+    "goal": lambda bag, k, time, body: k or bag.stamped("/goal_pose", 99.5, np.eye(4)),
+}
+"""What a robot may record of where it is, at each frame."""
+
 
 def write_bag(
     path: Path,
     dataset,
     version: int = 2,
     leave_out: str = "",
-    poses: str = "tf",
+    poses: tuple[str, ...] = ("mount", "tf"),
     storage: str = "SQLITE3",
     compressed: str = "",
+    depth: bool = True,
 ) -> Path:
     """Write a bag without the topics whose names contain `leave_out`. compressed: encoding of
-    compressed depth."""
+    compressed depth. depth: with depth, and images that are no keyframes."""
     bag = Bag(path, version, storage)
     with bag.writer:
         for k, frame in enumerate(dataset.frames):
             time, camera = 100 + 0.5 * k, frame.camera
-            if poses == "stamped":
-                bag.stamped("/slam/pose", time, camera.camera_to_world)
-            elif leave_out != "tf":
-                body = camera.camera_to_world @ np.linalg.inv(MOUNT)
-                bag.tf("/tf_static", time, "base_link", OPTICAL, MOUNT)
-                bag.tf("/tf", time, "map", "base_link", body)
+            for kind in poses if leave_out != "tf" else ():
+                POSES[kind](bag, k, time, camera.camera_to_world @ np.linalg.inv(MOUNT))
             rgb = np.asarray(Image.open(frame.image_path))
-            if leave_out != "colour":
+            if not depth:
+                bag.image("/camera/color/image_raw", time, "rgb8", rgb)
+            elif leave_out != "colour":
                 bag.image("/camera/color/image_raw", time, "bgr8", rgb[..., ::-1])
                 bag.image("/camera/color/image_raw", time + 0.2, "bgr8", 0 * rgb)  # no keyframe
             if leave_out != "camera_info":
                 bag.lens("/camera/color/camera_info", time, camera)
             topic = "/camera/aligned_depth/image_raw"
+            if not depth:
+                continue
             if compressed:
                 topic = f"{topic}/compressedDepth"
                 bag.compressed_depth(topic, time + 0.01, compressed, frame.depth())
@@ -236,7 +269,7 @@ def write_metashape(root: Path, dataset) -> Path:
 WRITERS = {
     "ROS bag 2": lambda root, data: write_bag(root / "bag", data),
     "ROS bag MCAP": lambda root, data: write_bag(
-        root / "bag", data, storage="MCAP", poses="stamped", compressed="16UC1"
+        root / "bag", data, storage="MCAP", poses=("camera",), compressed="16UC1"
     ),
     "ROS bag 1": lambda root, data: write_bag(root / "one.bag", data, 1, compressed="32FC1"),
     "TUM RGB-D": lambda root, data: write_tum(root / "tum", data),
@@ -246,13 +279,10 @@ WRITERS = {
 }
 
 
-POSES = {"ROS bag MCAP": ("--pose", "/slam/pose")}
-
-
 @pytest.mark.parametrize("kind", WRITERS)
 def test_cameras_pixels_and_depth_are_those_recorded(dataset, tmp_path, capsys, kind):
     source, out = WRITERS[kind](tmp_path, dataset), tmp_path / "out"
-    command("import", source, "--out", out, *POSES.get(kind, ()))
+    command("import", source, "--out", out, *(("--pose", "/slam/pose") if "MCAP" in kind else ()))
     printed, _ = said(capsys)
     assert "lengths in metres" in printed
     assert not (tmp_path / "out.unpacked").exists()
