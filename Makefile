@@ -17,7 +17,7 @@ test: setup
 	@echo "ruff check";  $(BIN)/ruff check -q .
 	@echo "ruff format"; $(BIN)/ruff format -q --check .
 	@echo "mypy";        $(BIN)/mypy --no-error-summary
-	@echo "pytest";      $(BIN)/python -m pytest -n 2 --dist loadfile --max-worker-restart=0
+	@echo "pytest";      $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart=0
 
 # Not --quiet: it hides warnings from --strict. NO_MKDOCS_2_WARNING silences a notice about Material's successor.
 docs: setup

@@ -21,6 +21,23 @@ import tiny  # noqa: E402
 
 from mgs.data.dataset import load_dataset  # noqa: E402
 
+LONGEST = """
+setups view pages docs sweep refit photographs page synth scene structure_from_motion plugin kernels
+determinism fisher stress chart capture survey prior world end_to_end derivatives exposure agreement
+detectors suggest
+"""
+
+
+def pytest_collection_modifyitems(items):
+    """Files that take longest go first: otherwise one worker waits for the other at the end."""
+    names = LONGEST.split()
+
+    def place(item):
+        name = item.path.stem.removeprefix("test_")
+        return names.index(name) if name in names else len(names)
+
+    items.sort(key=place)
+
 
 @pytest.fixture(scope="session")
 def pristine(tmp_path_factory):
@@ -43,6 +60,15 @@ def dataset(pristine, tmp_path):
 def prior(tmp_path):
     """A tiny prior that fits the tiny dataset."""
     return tiny.write_prior(tmp_path / "prior")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A headless Chromium."""
+    from browser import chromium
+
+    with chromium() as found:
+        yield found
 
 
 @pytest.fixture(scope="module")

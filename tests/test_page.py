@@ -11,7 +11,7 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 import tiny
-from browser import chromium, opened
+from browser import opened
 from program import change_steps, command
 from program import steps as read_steps
 from refusals import refused
@@ -245,12 +245,6 @@ def test_a_page_about_a_strangers_run_is_safe(browser, hostile, tmp_path, script
         assert tab.locator("h1 img").count() == 1
         if scripts:
             assert tab.evaluate("typeof owned") == "undefined"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
 
 
 @pytest.mark.parametrize(("width", "height", "scheme"), [(1280, 900, "light"), (390, 844, "dark")])

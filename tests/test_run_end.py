@@ -17,7 +17,7 @@ from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.policy import criteria
 from mgs.run import folder as run_folder
-from mgs.run.ending import run_end, why_ended
+from mgs.run.ending import run_end
 from mgs.run.settings import NbvSettings
 
 
@@ -96,13 +96,6 @@ def test_a_run_that_ended_goes_on_only_when_its_rule_is_changed(loaded, whole, t
     assert last.taken == whole.taken
     assert ["ended" in line for line in last.steps] == [False] * 5 + [True]
     np.testing.assert_array_equal(last.gaussians.sh, whole.gaussians.sh)
-
-
-def test_reasons_in_words():
-    assert why_ended({"reason": "budget", "views": 1}) == "its budget is spent, 1 chosen view"
-    left = {"reason": "uncertainty", "views": 2, "uncertainty": 0.5, "limit": 0.6}
-    limit = "no more than stop_uncertainty = 0.6"
-    assert f"of the prior's variance is left after 2 chosen views, {limit}" in why_ended(left)
 
 
 def other_image(root: Path, name: str) -> None:

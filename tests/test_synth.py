@@ -15,7 +15,7 @@ from mgs.files import locked, read_json
 from mgs.resources import resource_folder
 from mgs.seeds import generator
 from mgs.synth.orbit import evaluation_cameras, rock_cameras
-from mgs.synth.rendering import ROCK_EXPOSURE, PoseNoise, RenderPreset, _meter, rock_of, synth_orbit
+from mgs.synth.rendering import ROCK_EXPOSURE, PoseNoise, RenderPreset, _meter, synth_orbit
 from mgs.synth.rock import make_rock
 from mgs.synth.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_scene_file
 
@@ -149,15 +149,6 @@ def test_the_rock_of_a_dataset_given_back_as_mesh_is_the_same_scene(dataset, tmp
         assert (a.mask() != b.mask()).mean() < 1e-3
         both = a.mask() & b.mask()
         np.testing.assert_allclose(a.depth()[both], b.depth()[both], atol=1e-3)
-
-
-def test_what_is_taken_as_up_is_said(tmp_path):
-    path, notes = tmp_path / "rock.ply", []
-    trimesh.creation.icosphere(subdivisions=2).export(path)
-    for up in (None, "y"):
-        rock_of(SCENE, 0, path, up, notes.append)
-    assert "+Z is up" in notes[0]
-    assert "+Y is up" in notes[1]
 
 
 def test_a_dark_rock_does_not_blow_out_the_ground(tmp_path):

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import tiny
-from browser import chromium, opened
+from browser import opened
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -292,13 +292,6 @@ def choose(tab, label, option):
     tab.get_by_role("option", name=option, exact=True).click()
 
 
-@pytest.fixture(scope="module")
-def browser():
-    pytest.importorskip("viser", reason="viser is not installed")
-    with chromium() as found:
-        yield found
-
-
 def tick(tab, label, on):
     """Set a checkbox. A click before the page listens is lost, so it may take several."""
     box = tab.get_by_label(label, exact=True).first
@@ -313,6 +306,7 @@ def tick(tab, label, on):
 def test_the_viewer_in_a_browser(browser, run):
     """The screen shows the kernel's image of each layer, a click on a camera shows its frame, and a
     new step appears."""
+    pytest.importorskip("viser", reason="viser is not installed")
     subject = read_subject(run)
     camera = start_camera(subject)
     centre = camera.project(subject.gaussians.means)[0].mean(0)

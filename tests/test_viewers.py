@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import chromium, opened
+from browser import opened
 from PIL import Image
 from program import command
 
@@ -65,12 +65,6 @@ def run(tmp_path_factory):
     for kind in FORMATS:
         command("export", root / "run", "--to", kind)
     return open_run(root / "run")
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
 
 
 def projection(camera) -> np.ndarray:

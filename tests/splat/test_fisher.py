@@ -103,11 +103,6 @@ def test_recorded_kernels_know_numbers_of_gaussians_from_other_numbers():
             np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
-def test_an_image_of_one_pixel():
-    camera = make_camera((1, 1), focal=1.0)
-    assert_right(calm(lambda seed: make_gaussians(12, seed), camera, 1), camera)
-
-
 @pytest.mark.parametrize("means", MEANS)
 def test_images_of_several_tiles(means):
     camera = make_camera((150, 70), focal=165.0, eye=(0.2, -2.0, 1.0))
