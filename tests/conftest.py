@@ -22,7 +22,7 @@ import tiny  # noqa: E402
 from mgs.data.dataset import load_dataset  # noqa: E402
 
 LONGEST = """
-setups view pages docs sweep refit photographs page synth scene structure_from_motion plugin kernels
+setups view docs sweep refit photographs page synth scene structure_from_motion plugin kernels
 determinism fisher stress chart capture survey prior world end_to_end derivatives exposure agreement
 detectors suggest
 """

@@ -97,11 +97,13 @@ def write_dataset(
     return load_dataset(root)
 
 
-def edit(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    """Change a dataset's transforms.json."""
-    data = read_json(root / "transforms.json")
+def edit(
+    root: Path, change: Callable[[dict[str, Any]], object], name: str = "transforms.json"
+) -> None:
+    """Change a dataset's transforms.json, or another JSON file."""
+    data = read_json(root / name)
     change(data)
-    (root / "transforms.json").write_text(json.dumps(data))  # NaN, which write_json refuses, too
+    (root / name).write_text(json.dumps(data))  # NaN, which write_json refuses, too
 
 
 def write_colmap(dataset: Dataset, root: Path, binary: bool) -> None:

@@ -1,7 +1,6 @@
 """Bad input through the real command line: one line that says what is wrong, exit code 2, nothing
 left over. Each check is tried by one command."""
 
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,15 +21,8 @@ from mgs.images import write_exr, write_png
 Change = Callable[[Path], object]
 
 
-def edit(change: Callable[[dict], object], name: str = "transforms.json") -> Change:
-    """A change of a JSON file."""
-
-    def apply(root: Path) -> None:
-        data = json.loads((root / name).read_text())
-        change(data)
-        (root / name).write_text(json.dumps(data))
-
-    return apply
+def edit(change: Callable[[dict], object], *name: str) -> Change:
+    return lambda root: synthetic.edit(root, change, *name)
 
 
 def header(**values) -> Change:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import synthetic
 import tiny
 from program import change_steps, command, said
 from refusals import refused
@@ -27,7 +28,6 @@ from mgs.files import (
     check_writable,
     folder_locked,
     locked,
-    read_json,
     remove_file,
     remove_leftovers,
     scratch_folder,
@@ -38,12 +38,6 @@ from mgs.images import image_size
 from mgs.run.folder import open_run
 from mgs.splat_ply import write_ply
 from mgs.view.subject import read_subject
-
-
-def change(dataset: Path, frame: dict | None = None, **header: object) -> None:
-    data = read_json(dataset / "transforms.json") | header
-    data["frames"][2] |= frame or {}
-    (dataset / "transforms.json").write_text(json.dumps(data))
 
 
 def bomb(path: Path, side: int) -> Path:
@@ -129,7 +123,7 @@ def test_a_finished_import_says_so(capsys, dataset, tmp_path):
     for words in ("wrote", "is finished already"):
         command(*arguments)
         assert words in said(capsys)[0]
-    change(dataset, {"timestamp": 99})
+    synthetic.edit(dataset, lambda data: data["frames"][2].update(timestamp=99))
     assert "a finished dataset of other" in refused(capsys, arguments, tmp_path / "out")
 
 

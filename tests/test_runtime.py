@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from program import exit_code
 
 from mgs import runtime
 from mgs.errors import InputError
@@ -87,12 +86,11 @@ def test_a_bad_library_is_named(monkeypatch, library, message):
     assert runtime.LIBRARY_VARIABLE in str(error.value)
 
 
-def test_the_doctor_names_a_bad_library_in_one_line_and_exits_with_2(monkeypatch, capsys):
-    monkeypatch.setenv(runtime.LIBRARY_VARIABLE, "/nowhere.so")
-    monkeypatch.setenv("COLUMNS", "400")
-    assert exit_code("doctor") == 2
-    shown = capsys.readouterr().out
-    (line,) = [line for line in shown.splitlines() if line.startswith("wrong:")]
+def test_the_doctor_names_a_bad_library_in_one_line_and_exits_with_2():
+    code = "from mgs.cli.app import main; main(['doctor'])"
+    result = python(code, **{runtime.LIBRARY_VARIABLE: "/nowhere.so", "COLUMNS": "400"})
+    assert result.returncode == 2, result.stderr
+    (line,) = [line for line in result.stdout.splitlines() if line.startswith("wrong:")]
     assert "no such file" in line
     assert runtime.LIBRARY_VARIABLE in line
 
