@@ -12,7 +12,7 @@ from mgs.cli.options import Settings, merged, not_none, parse_gaussians, parse_s
 from mgs.run.settings import NbvSettings
 
 if TYPE_CHECKING:
-    from mgs.run.folder import Run
+    pass
 
 
 @with_keys(
@@ -67,21 +67,20 @@ def fit(
         **merged(parse_settings(settings, fit), options | {"train": train}),
     )
     if run.poses_moved:
-        console.print(moved_poses(run))
+        console.print(moves_in_words(run.poses_moved, run.dataset.unit))
     if prior is None and (seen := run.prior.numbers.get("triangulated")) is not None:
         others = run.prior.numbers["n"] - seen
         console.print(f"start: {seen:,} points of the cameras and {others:,} random ones")
     resume_and_print(run, console, run.settings.policy)
 
 
-def moved_poses(run: Run) -> str:
-    """How far poses were moved, in the mean and most."""
-    moves = run.poses_moved
+def moves_in_words(moves: dict[str, dict[str, float]], unit: str) -> str:
+    """How far poses were moved, in the mean and most. moves: by frame, degrees and length."""
     name = max(moves, key=lambda one: moves[one]["degrees"])
     degrees, length = (
         sum(move[key] for move in moves.values()) / len(moves) for key in ("degrees", "length")
     )
     return (
-        f"poses moved {degrees:.2f} degrees and {length:.3g} {run.dataset.unit} in the mean, "
+        f"poses moved {degrees:.2f} degrees and {length:.3g} {unit} in the mean, "
         f"{name} most: {moves[name]['degrees']:.2f} and {moves[name]['length']:.3g}"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -50,6 +51,7 @@ def import_data(
     test_every: Annotated[int | None, typer.Option(min=2)] = None,
     pose: str | None = None,
     exclude: list[str] | None = None,
+    refine_poses: bool = False,
     split: str = "train",
     test_split: str | None = None,
     force: bool = False,
@@ -77,6 +79,8 @@ def import_data(
     - test_every N: Make the first and every further Nth image, by name, a test view; 8 is usual.
     - pose TOPIC: Topic of a bag's poses of the camera, or of the body that carries it.
     - exclude NAME: Leave this image out; repeat for more.
+    - refine_poses: Adjust the poses that came with the images, also those of test views, to the
+      points that pictures share; for poses that are a little wrong. Needs texture.
     - split: Split of NeRF-synthetic data to import: train, val or test.
     - test_split: Split of NeRF-synthetic data that becomes the test views; publications take test.
     """
@@ -137,11 +141,15 @@ def import_data(
             matcher = Matcher.of_frames(result.frames, scratch / "matches")
             compared = agreement(result.frames, matcher)
             poses = poses if compared is None or (poses and poses.problem) else compared
-            if lacks_points(result) and not (poses and poses.problem):
+            right = not (poses and poses.problem)
+            if refine_poses and right and not finished:
+                result, cloud, moved = refined(result, scratch / "every")
+                console.print(moved)
+            elif lacks_points(result) and right:
                 cameras = [result.world.leave(frame.camera) for frame in result.frames]
                 cloud = matcher.triangulated(cameras)
-                if cloud is not None:
-                    write_cloud(out / CLOUD, cloud)
+            if cloud is not None:
+                write_cloud(out / CLOUD, cloud)
     if mesh is not None and mesh.suffix.lower() in GLTF:
         console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
     for note in [*shots.notes, *_advice(shots, result)]:
@@ -157,6 +165,34 @@ def import_data(
     world = f"up {_numbers(upward)}, {reason}"
     _print_summary(console, shots, tests, result, f"{fits}; {world}")
     console.print(f"{out} is finished already" if finished else f"wrote {out}", soft_wrap=True)
+
+
+def refined(dataset: Dataset, folder: Path) -> tuple[Dataset, SparseCloud | None, str]:
+    """Adjust the poses of a dataset and its test views, and write them; returns the dataset as it
+    is then, its points, and a line on how far poses moved. folder: for matches."""
+    from mgs.cli.fit import moves_in_words
+    from mgs.data.dataset import TEST_FOLDER, load_dataset, write_transforms
+    from mgs.data.structure import Matcher
+    from mgs.fit.poses import motion_between
+
+    world, tests = dataset.world, dataset.test_views()
+    frames = [*dataset.frames, *(tests.frames if tests else ())]
+    given = [world.leave(frame.camera) for frame in frames]
+    cameras, cloud = Matcher.of_frames(frames, folder).refined(given)
+    moves = {}
+    for frame, old, new in zip(frames, given, cameras, strict=True):
+        motion = motion_between(old, new)
+        degrees, length = np.degrees(np.linalg.norm(motion[:3])), np.linalg.norm(motion[3:])
+        moves[frame.name] = {"degrees": float(degrees), "length": float(length)}
+    there = [
+        replace(frame, camera=world.enter(camera))
+        for frame, camera in zip(frames, cameras, strict=True)
+    ]
+    count = len(dataset.frames)
+    if tests:
+        write_transforms(dataset.root / TEST_FOLDER, there[count:], world)
+    write_transforms(dataset.root, there[:count], world)
+    return load_dataset(dataset.root), cloud, moves_in_words(moves, dataset.unit)
 
 
 def _points(cloud: SparseCloud) -> str:

@@ -11,6 +11,7 @@ import shutil
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,15 @@ CLOUD = "sparse.ply"
 
 LEAST_POINTS = 100
 """Fewest triangulated points from which a fit can start."""
+
+POSITION_STD = 0.0025
+"""Standard deviation of a given position, over the distance to what its camera sees."""
+
+ADJUSTMENTS = 2
+"""Bundle adjustments of given poses, each after another triangulation."""
+
+LEAST_SHARED = 15
+"""Fewest points that a picture shares with others for its pose to be adjusted."""
 
 
 class Matcher:
@@ -156,9 +166,61 @@ class Matcher:
 
     def triangulated(self, cameras: Sequence[Camera]) -> SparseCloud | None:
         """Points of the matches at the poses of cameras; None if they are under LEAST_POINTS."""
+        self.match(alike(cameras))
+        return self._cloud(self._points(cameras))
+
+    def refined(self, cameras: Sequence[Camera]) -> tuple[list[Camera], SparseCloud | None]:
+        """Cameras after bundle adjustment of their poses, and the points of `triangulated`.
+
+        A prior holds each position to POSITION_STD of the distance to what the camera sees. Cameras
+        that share no points with others, and all if there are under LEAST_POINTS, stay.
+        """
         import pycolmap
 
         self.match(alike(cameras))
+        result, moved = self._points(cameras), list(cameras)
+        for _ in range(ADJUSTMENTS):
+            if result.num_points3D() < LEAST_POINTS:
+                return list(cameras), None
+            report("adjusting poses", 0, 0)
+            config, priors = pycolmap.BundleAdjustmentConfig(), []
+            for number, image in result.images.items():
+                if image.num_points3D < LEAST_SHARED:
+                    continue
+                config.add_image(number)
+                config.set_constant_cam_intrinsics(image.camera_id)
+                place = self.names.index(image.name)
+                numbers = [mark.point3D_id for mark in image.points2D if mark.has_point3D()]
+                seen = np.stack([result.points3D[k].xyz for k in numbers])
+                std = POSITION_STD * float(np.median(cameras[place].project(seen)[1]))
+                priors.append(
+                    pycolmap.PosePrior(
+                        corr_data_id=image.data_id,
+                        position=cameras[place].position,
+                        position_covariance=std**2 * np.eye(3),
+                        coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+                    )
+                )
+            options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+            options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+            how = options, pycolmap.PosePriorBundleAdjustmentOptions(), config, priors, result
+            pycolmap.create_pose_prior_bundle_adjuster(*how).solve()
+            for number in config.images:
+                image = result.images[number]
+                place, pose = self.names.index(image.name), np.eye(4)
+                pose[:3] = image.cam_from_world().matrix()
+                moved[place] = replace(cameras[place], world_to_camera=pose)
+            result = self._points(moved)
+        return moved, self._cloud(result)
+
+    def _cloud(self, result: Any) -> SparseCloud | None:
+        cloud = cloud_of(result)
+        return cloud if cloud is not None and len(cloud.points) >= LEAST_POINTS else None
+
+    def _points(self, cameras: Sequence[Camera]) -> Any:
+        """Reconstruction of pycolmap with the points of the matches at the poses of cameras."""
+        import pycolmap
+
         report("triangulating", 0, 0)
         model = pycolmap.Reconstruction()
         with closing(pycolmap.Database.open(self.database)) as database:
@@ -170,11 +232,9 @@ class Matcher:
                     model.add_image_with_trivial_frame(image, pose)
         options = pycolmap.IncrementalPipelineOptions(extract_colors=False, random_seed=0)
         options.triangulation.random_seed = 0
-        result = pycolmap.triangulate_points(
+        return pycolmap.triangulate_points(
             model, self.database, self.folder, self.folder, options=options
         )
-        cloud = cloud_of(result)
-        return cloud if cloud is not None and len(cloud.points) >= LEAST_POINTS else None
 
 
 def _link_upright(path: Path, link: Path) -> None:
