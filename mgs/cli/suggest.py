@@ -249,6 +249,12 @@ def _print(console: Terminal, result: Suggestion, run: Run, crossed: str) -> Non
     """Print what was dropped, the views as a table, and the flight."""
     from mgs.policy.criteria import GAIN_UNIT
 
+    if run.prior.kind == "random":
+        console.print(
+            "the model has no surface of an object: nothing tells seen from unseen, and gains are "
+            "no guide; import with masks or depth, or fit with `prior`",
+            soft_wrap=True,
+        )
     for reason, count in result.dropped.items():
         console.print(f"candidates left out: {count} {reason}")
     rows = result.plan if len(result.plan) > 1 else result.ranking[:SHOWN]
