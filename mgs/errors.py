@@ -20,6 +20,7 @@ EXTRAS = {
     "jinja2": "page",
     "viser": "view",
     "gsply": "export",
+    "constriction": "export",
     "imageio_ffmpeg": "video",
     "rosbags": "ros",
 }

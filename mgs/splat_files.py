@@ -1,4 +1,4 @@
-"""Gaussians in the formats of other programs: PLY, compressed PLY, binary glTF and SPZ.
+"""Gaussians in files: PLY, compressed PLY, binary glTF, SPZ, and what `mgs.compact` writes.
 
 `load_gaussians` tells the format from the first bytes of a file, not from its name.
 """
@@ -18,11 +18,14 @@ from typing import Any
 
 import numpy as np
 
+from mgs.compact import container
+from mgs.compact.decode import read_compact, up_of_compact
 from mgs.data.gltf import MAGIC
 from mgs.data.world import PLUS_Z, Vector
 from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, parsing, reading
 from mgs.gaussians import ARRAYS, Gaussians
+from mgs.prior.build import load_prior
 from mgs.rotation import QUAT_MIN
 from mgs.splat.constants import LOG_SCALE_RANGE
 from mgs.splat_gltf import read_glb, up_of_glb, write_glb
@@ -64,8 +67,9 @@ OTHERS = {
 """Endings of formats that are not read."""
 
 
-def load_gaussians(path: str | Path) -> Gaussians:
-    """Read Gaussians from a PLY in the layout of 3DGS, a compressed PLY, a GLB, or an SPZ.
+def load_gaussians(path: str | Path, prior: str | Path | None = None) -> Gaussians:
+    """Read Gaussians from a PLY in the layout of 3DGS, a compressed PLY, a GLB, an SPZ or a file
+    of the format mgs. prior: folder of the prior that the last was made with, if it needs one.
 
     Colours are unchanged. Infinite logits of opacity are cut to finite ones, flat Gaussians get the
     least thickness, and quaternions of a length under QUAT_MIN, which would mean the identity, are
@@ -74,8 +78,12 @@ def load_gaussians(path: str | Path) -> Gaussians:
     needs is missing.
     """
     path = Path(path)
-    read = {"glb": read_glb, "spz": _read_spz, "ply": parse_ply}[_kind(path)]
-    g = read(path)
+    kind = _kind(path)
+    if kind == "mgs":
+        return read_compact(path, load_prior(prior) if prior else None).check(path)
+    if prior is not None:
+        raise InputError(f"{path}: has positions, and needs no prior; leave out `prior`")
+    g = {"glb": read_glb, "spz": _read_spz, "ply": parse_ply}[kind](path)
     g.check_shapes(path)
     flat, logits = np.isneginf(g.log_scales), np.clip(g.logit_opacities, -UNBOUNDED, UNBOUNDED)
     longest = np.abs(g.quats).max(axis=1, keepdims=True, initial=0)
@@ -106,16 +114,19 @@ def load_gaussians(path: str | Path) -> Gaussians:
 
 
 def upward(path: str | Path) -> Vector:
-    """Upward direction of a file's world: what a GLB says, else +Z."""
-    return up_of_glb(Path(path)) if _kind(Path(path)) == "glb" else PLUS_Z
+    """Upward direction of a file's world: what a GLB or mgs file says, else +Z."""
+    ups = {"glb": up_of_glb, "mgs": up_of_compact}
+    return ups.get(_kind(Path(path)), lambda path: PLUS_Z)(Path(path))
 
 
 def _kind(path: Path) -> str:
-    """Format of a file by its first bytes: "glb", "spz" or "ply". Raises InputError."""
-    with reading(path, "file; give a PLY, GLB or SPZ of Gaussians"), path.open("rb") as file:
+    """Format of a file by its first bytes: "glb", "mgs", "spz" or "ply". Raises InputError."""
+    with reading(path, "file; give a PLY, GLB, SPZ or MGS of Gaussians"), path.open("rb") as file:
         first = file.read(4)
     if first == MAGIC:
         return "glb"
+    if first == container.MAGIC:
+        return "mgs"
     if first.startswith(SPZ_MAGIC):
         return "spz"
     suffix = path.suffix.lower()

@@ -28,7 +28,7 @@ ROOMS = [
     "errors", "progress", "seeds", "runtime", "resources", "provenance", "colour", "rotation",
     "memory", "notebook", "camera", "gaussians", "files", "images", "metrics", "plotting",
     "data", "synth", "survey", "prior", "splat",
-    "splat_places", "splat_ply", "splat_gltf", "splat_files", "evaluation",
+    "splat_places", "compact", "splat_ply", "splat_gltf", "splat_files", "evaluation",
     "policy", "fit", "scene", "learning", "run", "reports", "view",
     "cli", "__main__",
 ]  # fmt: skip

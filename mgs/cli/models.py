@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 def evaluate(
     subjects: list[Path],
     dataset: Path | None = None,
+    prior: Path | None = None,
     pictures: bool = True,
 ) -> None:
     """Measure PSNR and SSIM of models on test views, all views and held-out views; write
@@ -41,8 +42,9 @@ def evaluate(
     and masked to the pixels of the rock. metrics.json also has the errors of alpha and depth, where
     the dataset has their truth.
 
-    - subjects RUN|SPLATS...: Folders that `mgs nbv` wrote, or PLY, GLB, SPZ.
+    - subjects RUN|SPLATS...: Folders that `mgs nbv` wrote, or PLY, GLB, SPZ, MGS.
     - dataset: Dataset for a file. Default: that of the run whose folder holds it.
+    - prior: Folder of the prior that an mgs file was written with, if it needs one.
     - pictures: Write truth, render and difference of each view to RUN/renders.
     """
     from mgs.reports.evaluation import evaluate as measured
@@ -70,7 +72,17 @@ def evaluate(
                 files = [path for path in smaller if path.is_file()]
             for path in files:
                 name = path.name if path == subject else f"  {path.stem.partition('_')[2]}"
-                rows.append(metrics_row(name, measured(path, dataset, progress=progress)))
+                rows.append(
+                    metrics_row(
+                        name,
+                        measured(
+                            path,
+                            dataset,
+                            prior=prior if path == subject else None,
+                            progress=progress,
+                        ),
+                    )
+                )
                 lines.append(f"wrote {path.with_suffix('.metrics.json')}")
     print_quality(Terminal(), rows)
     _print(lines)

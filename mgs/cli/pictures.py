@@ -27,6 +27,7 @@ def render(
     antialiased: bool | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     exr: bool = False,
+    prior: Path | None = None,
     force: bool = False,
 ) -> None:
     """Draw a run's model, or Gaussians from a file, through every camera of a transforms.json. The
@@ -35,7 +36,7 @@ def render(
     Writes one PNG for each camera, with the name of the camera's image.
 
     - subject RUN|SPLATS: Folder that `mgs nbv` wrote, or Gaussians of mgs or others: 3DGS PLY
-      (binary, ascii, compressed), GLB or SPZ.
+      (binary, ascii, compressed), GLB, SPZ or MGS.
     - out: Folder to write.
     - cameras: transforms.json (nerfstudio), or the dataset folder that holds it. Default: the
       run's.
@@ -45,6 +46,7 @@ def render(
     - antialiased: Whether Gaussians that are smaller than a pixel are fainter. Default: what the
       file says, else not.
     - background R G B: Colour behind the Gaussians, sRGB, each from 0 to 1. Default: black.
+    - prior: Folder of the prior that an mgs file was written with, if it needs one.
     - exr: Write an EXR too: linear R G B, opacity A, z-depth Z in metres (0: none).
     """
     from mgs.data.dataset import load_cameras, load_origin
@@ -62,7 +64,7 @@ def render(
     views = [
         (name, camera.resized(width) if width else camera) for name, camera in load_cameras(cameras)
     ]
-    gaussians = read_model(subject)[0].counted_from(load_origin(cameras))
+    gaussians = read_model(subject, prior)[0].counted_from(load_origin(cameras))
     if colour_space != "auto":
         gaussians = replace(gaussians, linear=colour_space == "linear")
     if antialiased is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +13,7 @@ import typer
 from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import echo
 from mgs.errors import InputError
-from mgs.files import Ours, atomic_folder, check_new_file
+from mgs.files import Ours, atomic_folder, atomic_path, check_new_file
 
 if TYPE_CHECKING:
     from mgs.gaussians import Gaussians
@@ -20,11 +21,15 @@ if TYPE_CHECKING:
 
 def export(
     models: list[Path],
-    to: Literal["glb", "spz", "ply", "compressed-ply", "nerfstudio", "colmap"] = "glb",
+    to: Literal["glb", "spz", "ply", "compressed-ply", "mgs", "nerfstudio", "colmap"] = "glb",
     out: Path | None = None,
     colour_space: Literal["srgb", "linear"] = "srgb",
     sh: Annotated[int | None, typer.Option(min=0, max=3)] = None,
     views: Literal["taken", "all"] = "taken",
+    most: Annotated[str | None, typer.Option("--bytes")] = None,
+    psnr: float | None = None,
+    shared_prior: bool = False,
+    prior: Path | None = None,
     force: bool = False,
 ) -> None:
     """Write a model for other programs: viewers, game engines, web pages; or the views that a run
@@ -32,18 +37,32 @@ def export(
 
     All formats can also be read, so the command converts between them, too.
 
-    - models RUN|SPLATS...: Folders that `mgs nbv` wrote, or PLY, GLB, SPZ.
+    - models RUN|SPLATS...: Folders that `mgs nbv` wrote, or PLY, GLB, SPZ, MGS.
     - to: glb: glTF with KHR_gaussian_splatting; spz: needs gsply; compressed-ply: 4 times smaller
-      than ply. nerfstudio, colmap: the run's views, a folder to train on.
+      than ply; mgs: as few bytes as a link allows, of a run, with --bytes or --psnr (the default
+      with these). nerfstudio, colmap: the run's views, a folder to train on.
     - out: File to write. Default: export.* in the run; for a file, beside it.
     - colour_space: Colours to write: sRGB, as viewers expect, or linear RGB, as they were fitted.
       Those of a linear run are fitted once more, blended in sRGB.
     - sh: Raise the SH degree, for programs that read degree 3 only.
     - views: Views of nerfstudio and colmap: those taken, or all.
+    - bytes N|Nk|NM: Write the best model of at most so many bytes, as in 40k.
+    - psnr: Write the smallest model of so many dB in the views taken.
+    - shared_prior: With these: the reader has the run's prior, and no positions are written.
+    - prior: Folder of the prior that an mgs file was written with, to read it.
     """
     from mgs.reports.exporting import read_model, to_y_up
     from mgs.splat_files import FORMATS, write_gaussians
 
+    if to == "mgs" or most is not None or psnr is not None:
+        if to not in ("glb", "mgs") or (most is None) == (psnr is None):
+            raise InputError(
+                "--to mgs: is written with one of --bytes and --psnr, which are for it"
+            )
+        _export_compact(models, out, most, psnr, shared_prior, force)
+        return
+    if shared_prior:
+        raise InputError("--shared-prior: is for --to mgs; leave it out")
     if to in ("nerfstudio", "colmap"):
         _export_views(models, to, out, views == "all", force)
         return
@@ -53,7 +72,7 @@ def export(
         for one in models
     ]
     for model, path in _targets(models, defaults, out, force):
-        gaussians, up = read_model(model)
+        gaussians, up = read_model(model, prior)
         if not gaussians.linear and colour_space == "linear":
             raise InputError(
                 f"{model}: its colours are sRGB already; leave out --colour-space linear"
@@ -65,6 +84,44 @@ def export(
         write_gaussians(path, shown, to, to_y_up(up))
         megabytes = path.stat().st_size / 1e6
         echo(f"wrote {len(shown):,} Gaussians to {path} ({megabytes:.1f} MB)")
+
+
+def _export_compact(
+    runs: list[Path],
+    out: Path | None,
+    most: str | None,
+    psnr: float | None,
+    shared: bool,
+    force: bool,
+) -> None:
+    """Write the model of each run in the format mgs."""
+    from mgs import runtime
+    from mgs.reports.compacting import compact_run
+    from mgs.run.folder import open_run
+
+    size = None if most is None else _bytes(most)
+    targets = _targets(runs, [run / "export.mgs" for run in runs], out, force)
+    runtime.start()
+    for run, path in targets:
+        with progress_bar() as bar:
+            result = compact_run(open_run(run), size, psnr, shared, bar)
+        data = bytes(result.file)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(data)
+        count, (before, after) = len(result.file.model), result.psnr
+        echo(
+            f"wrote {count:,} Gaussians to {path} ({len(data):,} bytes); "
+            f"PSNR of the views taken: {before:.2f} dB in the run, {after:.2f} dB in the file"
+        )
+
+
+def _bytes(text: str) -> int:
+    """Number of bytes of a text like 40k. Raises InputError for anything else."""
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)([kM]?)", text)
+    number = float(found[1]) * {"": 1, "k": 1e3, "M": 1e6}[found[2]] if found else 0
+    if not 1 <= number < 1e12:
+        raise InputError(f"--bytes {text}: expected a number of bytes, as in 40k or 1.5M")
+    return int(number)
 
 
 def _export_views(runs: list[Path], kind: str, out: Path | None, every: bool, force: bool) -> None:

@@ -145,6 +145,7 @@ def evaluate(
     dataset: str | Path | Dataset | None = None,
     *,
     trained: Iterable[str] = (),
+    prior: str | Path | None = None,
     progress: Progress = no_progress,
     **options: Any,
 ) -> dict[str, Any]:
@@ -155,6 +156,7 @@ def evaluate(
     - dataset: of Gaussians or a file. Default for a file in a run folder: the run's.
     - trained: names of the frames that the model was trained on. Default for a file in a run
       folder, on the run's dataset: the views taken.
+    - prior: of a file, as in `load_gaussians`.
 
     Raises InputError as `evaluate_run`, `load_gaussians` and `load_dataset`, if a model comes
     without a dataset, if trained names no frame of it, and if dataset or trained are given for a
@@ -171,7 +173,7 @@ def evaluate(
         path = Path(subject)
         if not path.exists():
             raise InputError(f"{path}: no such run folder or file of Gaussians")
-        subject = load_gaussians(path)
+        subject = load_gaussians(path, prior)
         if holds_run(path.parent):
             root = dataset.root if isinstance(dataset, Dataset) else dataset
             of_run = Path(read_config(path.parent)["settings"]["dataset"])

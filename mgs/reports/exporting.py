@@ -11,6 +11,7 @@ import numpy as np
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import target_of
 from mgs.data.world import Vector, levelled
+from mgs.errors import InputError
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.memory import Deferred
@@ -32,13 +33,15 @@ PART = 1 << 16
 """Gaussians whose colours are converted at a time."""
 
 
-def read_model(source: str | Path) -> tuple[Gaussians, Vector]:
+def read_model(source: str | Path, prior: str | Path | None = None) -> tuple[Gaussians, Vector]:
     """Read the model of a run folder, in the coordinates that its dataset was made of, or of a file
-    with the up that it has (`upward`). Raises InputError as `open_run`, `Run.state` and
-    `load_gaussians`."""
+    with the up that it has (`upward`). prior: as in `load_gaussians`. Raises InputError as
+    `open_run`, `Run.state` and `load_gaussians`."""
     source = Path(source)
     if not source.is_dir():
-        return load_gaussians(source), upward(source)
+        return load_gaussians(source, prior), upward(source)
+    if prior is not None:
+        raise InputError(f"{source}: is a run, and needs no prior; leave out `prior`")
     run = open_run(source)
     return as_imported(run, run.gaussians), run.dataset.world.up
 

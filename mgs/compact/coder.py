@@ -1,0 +1,100 @@
+"""Integers as bytes: adaptive range coding with the package constriction.
+
+Probabilities are counts of what was coded before, so no table is sent, and they are the same on
+every machine. One function serves both directions: a decoder gets zeros in place of the numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mgs.errors import InputError, missing
+
+Stream = Callable[[np.ndarray, Any], np.ndarray]
+"""(symbols, probability model) -> the symbols: those given, or as many that are read."""
+
+CLASSES = 21
+"""Numbers of bits of a magnitude: 0 to 20."""
+
+LARGEST = (1 << (CLASSES - 1)) - 1
+"""Largest magnitude that is coded."""
+
+FIRST_BLOCK, LAST_BLOCK = 32, 4096
+"""Symbols coded with the same probabilities, first and at most; each block is twice the last."""
+
+UNSEEN = 0.02
+"""Count of a symbol that was never coded."""
+
+
+def _library() -> Any:
+    """The package constriction. Raises InputError if it is not installed."""
+    try:
+        import constriction
+    except ImportError:
+        raise InputError(missing("constriction")) from None
+    return constriction.stream
+
+
+def encode(write: Callable[[Stream], object]) -> bytes:
+    """Bytes of all that write(stream) codes."""
+    coder = _library().queue.RangeEncoder()
+
+    def stream(symbols: np.ndarray, model: Any) -> np.ndarray:
+        coder.encode(np.ascontiguousarray(symbols, np.int32), model)
+        return symbols
+
+    write(stream)
+    return bytes(coder.get_compressed().astype("<u4").tobytes())
+
+
+def decoder(data: bytes) -> Stream:
+    """Stream that reads bytes of `encode`. It raises ValueError where they are no such bytes."""
+    words = np.frombuffer(data[: len(data) // 4 * 4], "<u4").astype(np.uint32)
+    coder = _library().queue.RangeDecoder(words)
+
+    def stream(symbols: np.ndarray, model: Any) -> np.ndarray:
+        try:
+            return np.asarray(coder.decode(model, len(symbols)), np.int64)
+        except AssertionError as error:
+            raise ValueError(str(error)) from None
+
+    return stream
+
+
+def adaptive(stream: Stream, symbols: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Code symbols [n] from 0 to K-1. counts: [K] of those before, which are updated in place."""
+    result, at, size = np.zeros(len(symbols), np.int64), 0, FIRST_BLOCK
+    categorical = _library().model.Categorical
+    while at < len(symbols):
+        block = slice(at, at + size)
+        model = categorical((counts + UNSEEN) / (counts + UNSEEN).sum(), perfect=False)
+        result[block] = stream(symbols[block], model)
+        counts[:] = counts / 2 + np.bincount(result[block], minlength=len(counts))
+        at, size = at + size, min(2 * size, LAST_BLOCK)
+    return result
+
+
+def integers(stream: Stream, values: np.ndarray) -> np.ndarray:
+    """Code integers [n,C] of magnitudes up to LARGEST, column by column.
+
+    The number of bits of a magnitude is coded adaptively, separately for rows in which an earlier
+    column is not 0; then sign and lower bits as they are.
+    """
+    result = np.zeros(values.shape, np.int64)
+    uniform = _library().model.Uniform
+    for column in range(values.shape[1]):
+        busy = (result[:, :column] != 0).any(1)
+        for rows in (np.flatnonzero(busy), np.flatnonzero(~busy)):
+            part = values[rows, column]
+            classes = adaptive(stream, np.frexp(np.abs(part))[1], 0.5 ** np.arange(CLASSES))
+            for bits in range(1, int(classes.max(initial=0)) + 1):
+                of = np.flatnonzero(classes == bits)
+                if len(of):
+                    least = 1 << (bits - 1)
+                    code = 2 * (np.abs(part[of]) - least) + (part[of] < 0)
+                    code = stream(code, uniform(1 << bits))
+                    result[rows[of], column] = (code // 2 + least) * (1 - 2 * (code % 2))
+    return result

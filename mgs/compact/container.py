@@ -1,0 +1,176 @@
+"""The file of a compact model: a header, and packets that each improve it.
+
+All numbers are little-endian. Header: `HEAD`; float32 axes of the colours [3,3] and centres of the
+columns by layer [2,C]; a byte for each step [BANDS,C]; CRC-32 of all that.
+
+Packets: MARK, `PACKET`, the payload, CRC-32 of both. One that is damaged or lost takes only what it
+adds: the reader goes on at the next MARK.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from mgs.compact.tree import BANDS, DEPTH
+from mgs.errors import InputError
+from mgs.gaussians import MAX_GAUSSIANS, MAX_SH_DEGREE
+
+MAGIC, MARK, VERSION = b"MGSC", b"\xa7\x5e", 1
+
+HEAD = struct.Struct("<4sBBBBBIHH3d3d3dddd16s")
+"""Magic, version, flags, SH degree, cut of the tree, layers, number of Gaussians, tiles, packets;
+corner of the grid [3], up and origin of the world of the data [3], step of the grid, inset, scale
+of the steps, hash of the prior."""
+
+PACKET = struct.Struct("<HBBI")
+"""Tile, group, layer, and size of the payload."""
+
+ANTIALIASED, LINEAR, SHARED = 1, 2, 4
+"""Flags. SHARED: positions follow from the receiver's prior."""
+
+GROUPS = ("position", "colour", "directional", "scale", "rotation", "opacity")
+"""Content of a packet, by its number."""
+
+FINER = 4
+"""Steps of a layer over those of the next."""
+
+QUARTERS = (1.0, 1.189207115002721, 1.4142135623730951, 1.681792830507429)
+"""2^(k/4): steps are coded as exponents, with no power function that differs by machine."""
+
+ZERO_STEP = 128
+"""Code of a step of 1."""
+
+Key = tuple[int, str, int]
+"""Tile, group and layer of a packet."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """What all packets need. steps: [BANDS,C] codes, uint8; see `Header.step`. The rest as in
+    `HEAD`."""
+
+    flags: int
+    degree: int
+    cut: int
+    layers: int
+    n: int
+    tiles: int
+    packets: int
+    low: np.ndarray
+    up: np.ndarray
+    origin: np.ndarray
+    grid: float
+    inset: float
+    scale: float
+    digest: bytes
+    colours: np.ndarray
+    centres: np.ndarray
+    steps: np.ndarray
+
+    def step(self, layer: int) -> np.ndarray:
+        """Steps [BANDS,C] of a layer, from 0."""
+        code = self.steps.astype(np.int64) - ZERO_STEP
+        fine = np.ldexp(np.array(QUARTERS)[code % 4], code // 4) * self.scale
+        return np.asarray(fine * float(FINER ** (self.layers - 1 - layer)))
+
+    def __bytes__(self) -> bytes:
+        numbers = self.flags, self.degree, self.cut, self.layers, self.n, self.tiles, self.packets
+        reals = *self.low, *self.up, *self.origin, self.grid, self.inset, self.scale
+        head = HEAD.pack(MAGIC, VERSION, *numbers, *reals, self.digest)
+        tables = [a.astype("<f4").tobytes() for a in (self.colours, self.centres)]
+        return _with_sum(head + b"".join(tables) + self.steps.astype(np.uint8).tobytes())
+
+
+def step_codes(steps: np.ndarray) -> np.ndarray:
+    """Codes of steps nearest to these, uint8."""
+    code = np.rint(4 * np.log2(steps)) + ZERO_STEP
+    return np.clip(code, 0, 255).astype(np.uint8)
+
+
+def _with_sum(data: bytes) -> bytes:
+    return data + zlib.crc32(data).to_bytes(4, "little")
+
+
+def packet(key: Key, payload: bytes) -> bytes:
+    """Bytes of a packet."""
+    tile, group, layer = key
+    return _with_sum(MARK + PACKET.pack(tile, GROUPS.index(group), layer, len(payload)) + payload)
+
+
+def join(header: Header, packets: Iterable[bytes]) -> bytes:
+    """Bytes of a file."""
+    return bytes(header) + b"".join(packets)
+
+
+def split(data: bytes, path: Path) -> tuple[Header, dict[Key, bytes]]:
+    """Header and payloads of a file's whole packets, in their order.
+
+    Raises InputError for another format, version or a damaged header. Nothing is allocated by a
+    number of the file before it was checked.
+    """
+    again = "; send or export it again"
+    if data[:4] != MAGIC or len(data) < HEAD.size:
+        raise InputError(f"{path}: is no mgs file, or ends within its header{again}")
+    _, version, *numbers = HEAD.unpack_from(data)
+    flags, degree, cut, layers, n, tiles, packets, *reals, digest = numbers
+    if version != VERSION:
+        raise InputError(
+            f"{path}: has version {version} of the format, and this mgs reads {VERSION}; "
+            "use the mgs that made it"
+        )
+    if degree > MAX_SH_DEGREE:
+        raise InputError(f"{path}: has SH degree {degree}, and {MAX_SH_DEGREE} is the most{again}")
+    columns = 3 * (degree + 1) ** 2 + 7
+    sizes = np.cumsum([HEAD.size, 4 * 9, 4 * 2 * columns, BANDS * columns])
+    end = int(sizes[-1])
+    if len(data) < end + 4 or zlib.crc32(data[:end]) != int.from_bytes(
+        data[end : end + 4], "little"
+    ):
+        raise InputError(f"{path}: its header is damaged or incomplete{again}")
+    first, second, third = (data[a:b] for a, b in pairwise(sizes))
+    colours, centres = (np.frombuffer(part, "<f4").astype(np.float64) for part in (first, second))
+    real = np.concatenate([reals, colours, centres])
+    up = np.abs(reals[3:6]).max()
+    usable = (
+        up > 1e-9
+        and 0 < n <= MAX_GAUSSIANS
+        and 0 < tiles <= n
+        and 0 < layers <= 8
+        and 3 <= cut < DEPTH
+    )
+    if not usable or not (np.abs(real) < 1e15).all() or min(reals[9], reals[11]) <= 0:
+        raise InputError(f"{path}: its header has impossible numbers{again}")
+    low, up, origin = np.reshape(reals[:9], (3, 3))
+    grid, inset, scale = reals[9:]
+    header = Header(
+        *(flags, degree, cut, layers, n, tiles, packets),
+        *(low, up, origin, grid, inset, scale, digest),
+        colours.reshape(3, 3),
+        centres.reshape(2, columns),
+        np.frombuffer(third, np.uint8).reshape(BANDS, columns),
+    )
+    return header, _packets(data, end + 4, header)
+
+
+def _packets(data: bytes, at: int, header: Header) -> dict[Key, bytes]:
+    """Payloads of the whole packets from `at` on; the first of each key counts."""
+    whole: dict[Key, bytes] = {}
+    while (at := data.find(MARK, at)) >= 0 and at + 2 + PACKET.size <= len(data):
+        tile, group, layer, size = PACKET.unpack_from(data, at + 2)
+        start = at + 2 + PACKET.size
+        end = start + size
+        said = int.from_bytes(data[end : end + 4], "little")
+        if end + 4 > len(data) or zlib.crc32(data[at:end]) != said:
+            at += 1
+            continue
+        if tile <= header.tiles and group < len(GROUPS) and layer < header.layers:
+            whole.setdefault((tile, GROUPS[group], layer), data[start:end])
+        at = end + 4
+    return whole

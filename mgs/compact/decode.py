@@ -1,0 +1,150 @@
+"""Read a compact model: `read_compact`. The same bytes give the same numbers on every machine."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mgs.compact.coder import decoder, integers
+from mgs.compact.columns import Start, gaussians_of, groups, start_of
+from mgs.compact.container import ANTIALIASED, LINEAR, SHARED, Header, Key, split
+from mgs.compact.tree import DEPTH, Tree, cells_of, code_descendants, codes_of, tree_of
+from mgs.data.world import Vector, World, unit_up
+from mgs.errors import InputError, Notice
+from mgs.files import parsing, read_bytes
+from mgs.gaussians import Gaussians
+from mgs.memory import check_room
+from mgs.splat_places import to_source
+
+if TYPE_CHECKING:
+    from mgs.prior.build import Prior
+
+MOST_BYTES = 1 << 28
+"""Most bytes of a file."""
+
+CELL_BYTES = 200
+"""Memory of a Gaussian while it is decoded, for each column, bytes."""
+
+CELLS_OF_BYTE = 64
+"""Most cells that a byte of a packet places: a file of few bytes never has many."""
+
+IDENTITY = np.array([[1.0, 0, 0, 0]])
+
+
+def read_compact(path: Path, prior: Prior | None = None) -> Gaussians:
+    """Read Gaussians from a file of the format mgs, in the world of the data; an incomplete file
+    gives what it has, with a Notice.
+
+    prior: where the file leaves positions to it. Raises InputError if the file is damaged at its
+    start, needs a prior, or was made with another one.
+    """
+    header, packets = split(read_bytes(path, "file", MOST_BYTES), path)
+    if lost := header.packets - len(packets):
+        notice = (
+            f"{path}: {lost} of {header.packets} packets are missing or damaged; the rest is read"
+        )
+        warnings.warn(notice, Notice, stacklevel=3)
+    start = None
+    if header.flags & SHARED:
+        if prior is None:
+            raise InputError(f"{path}: has no positions; give the prior it was made with, `prior`")
+        start = start_of(prior, header.inset)
+        if start.digest != header.digest or len(start.means) != header.n:
+            raise InputError(f"{path}: was made with another prior; give that one")
+    elif (0, "position", 0) not in packets:
+        raise InputError(f"{path}: has lost the packet that places its Gaussians; send it again")
+    columns = header.centres.shape[1]
+    most = sum(
+        _most(header, data) for (_, group, _), data in packets.items() if group == "position"
+    )
+    check_room(
+        (header.n if start else min(most, header.n)) * columns * CELL_BYTES,
+        f"{path}: decoding it",
+        "give a smaller file",
+    )
+    with parsing(path, "mgs file", "send or export it again"):
+        g = to_source(decoded(header, packets, start), World(unit_up(header.up)))
+    x, y, z = header.origin.tolist()
+    return replace(g, origin=(x, y, z))
+
+
+def up_of_compact(path: Path) -> Vector:
+    """Upward direction of a file's world. Raises InputError as `read_compact`."""
+    return unit_up(split(read_bytes(path, "file", MOST_BYTES), path)[0].up)
+
+
+def decoded(header: Header, packets: Mapping[Key, bytes], start: Start | None) -> Gaussians:
+    """Gaussians of packets, in the upright world. Raises ValueError for what no encoder writes."""
+    if start is None:
+        codes, wider = _positions(header, packets)
+        cells, layer = cells_of(codes)
+        means, quats = header.low + (cells + 0.5) * header.grid, IDENTITY
+        order = np.arange(len(codes))
+    else:
+        means, quats, layer, wider = start.means, start.quats, start.layer, None
+        order, codes = codes_of(grid_cells(means, header.low, header.grid), layer)
+    tree = tree_of(codes, header.cut, header.tiles)
+    values = tree.inverse(_coefficients(header, packets, tree))
+    columns = np.empty_like(values)
+    columns[order] = values
+    columns += header.centres[layer]
+    if wider is not None:
+        columns[:, groups((header.degree + 1) ** 2)["scale"]] += wider[:, None]
+    g = gaussians_of(columns, means, quats, header.colours)
+    antialiased, linear = bool(header.flags & ANTIALIASED), bool(header.flags & LINEAR)
+    return replace(g, antialiased=antialiased, linear=linear)
+
+
+def grid_cells(means: np.ndarray, low: np.ndarray, grid: float) -> np.ndarray:
+    """Cells [N,3] of positions [N,3]."""
+    return np.clip(np.floor((means - low) / grid), 0, (1 << (DEPTH // 3)) - 1).astype(np.int64)
+
+
+def _positions(header: Header, packets: Mapping[Key, bytes]) -> tuple[np.ndarray, np.ndarray]:
+    """Codes of the cells [N], and by how much their log-scales grow [N]: where the packet of a tile
+    is missing, one Gaussian stands for all of a node."""
+    cut, tiles = header.cut, header.tiles
+    data = packets[0, "position", 0]
+    root = np.zeros(1, np.int64)
+    top = code_descendants(decoder(data), root, DEPTH - cut, _most(header, data))
+    tile = 1 + np.arange(len(top)) * tiles // len(top)
+    codes, lone = [], []
+    for number in range(1, tiles + 1):
+        nodes = top[tile == number]
+        data = packets.get((number, "position", 0), b"")
+        if data:
+            part = code_descendants(decoder(data), nodes, cut, _most(header, data))
+        else:
+            part = (nodes << cut) | (7 << (cut - 3))
+        codes.append(part)
+        lone.append(np.full(len(part), not data))
+    # A node of the surface has n / M cells; sizes grow by the root of that, in steps of 1/64.
+    wider = np.rint(32 * np.log(max(header.n / len(top), 1))) / 64
+    return np.concatenate(codes), wider * np.concatenate(lone)
+
+
+def _most(header: Header, data: bytes) -> int:
+    """Most cells that a packet of positions can hold."""
+    return min(CELLS_OF_BYTE * (len(data) + 8), header.n)
+
+
+def _coefficients(header: Header, packets: Mapping[Key, bytes], tree: Tree) -> np.ndarray:
+    """Coefficients [N,C] that the packets give; 0 where there is none."""
+    found = np.zeros((len(tree.band), header.centres.shape[1]))
+    of = groups((header.degree + 1) ** 2)
+    for (tile, group, layer), data in packets.items():
+        rows = rows_of(tree, tile)
+        if group != "position" and len(rows):
+            step = header.step(layer)[tree.band[rows], of[group]]
+            found[rows, of[group]] += step * integers(decoder(data), np.zeros(step.shape, np.int64))
+    return found
+
+
+def rows_of(tree: Tree, tile: int) -> np.ndarray:
+    """Coefficients of a tile, those of large nodes first."""
+    return np.flatnonzero(tree.tile == tile)[::-1]

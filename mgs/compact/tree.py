@@ -1,0 +1,143 @@
+"""A binary tree of cells in space, and a transform of values along it.
+
+Cells are numbered by Morton codes, so neighbours are near each other, and cells with the same
+leading bits form a node. The transform (RAHT: de Queiroz and Chou 2016) replaces two children by
+their weighted sum, which goes on to the parent, and their weighted difference, a coefficient. It is
+orthonormal, and smooth values have small differences. All is arithmetic of integers and of float64
+with +, *, / and sqrt, element by element, which IEEE 754 defines to the last bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mgs.compact.coder import Stream, adaptive
+
+AXIS_BITS = 20
+"""Bits of a cell's index along an axis."""
+
+DEPTH = 3 * AXIS_BITS + 1
+"""Bits of a code: those of three axes, and a leading one for the layer."""
+
+BANDS = 12
+"""Kinds of coefficients by the size of their node, each twice as large; the last has the rest."""
+
+
+def codes_of(cells: np.ndarray, layer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Order [N] of cells [N,3] by code, and their codes in it, uint64, strictly increasing.
+
+    layer: [N] 0 or 1. Of equal codes all but the first are raised, which moves a Gaussian to a
+    neighbouring cell.
+    """
+    code = layer.astype(np.int64) << (DEPTH - 1)
+    for bit in range(AXIS_BITS):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    order = np.argsort(code, kind="stable")
+    rank = np.arange(len(code))
+    return order, np.maximum.accumulate(code[order] - rank) + rank
+
+
+def cells_of(codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cells [N,3] and layers [N] of codes, the inverse of `codes_of`."""
+    cells = np.zeros((len(codes), 3), np.int64)
+    for bit in range(AXIS_BITS):
+        for axis in range(3):
+            cells[:, axis] |= ((codes >> (3 * bit + axis)) & 1) << bit
+    return cells, codes >> (DEPTH - 1)
+
+
+def code_descendants(
+    stream: Stream, nodes: np.ndarray, depth: int, most: int, codes: np.ndarray | None = None
+) -> np.ndarray:
+    """Code which descendants nodes [M] have `depth` levels below; returns their codes.
+
+    codes: these, to be written; None: they are read. Each node has a left child, a right one, or
+    both. Raises ValueError if more than `most` are read.
+    """
+    counts = np.ones((3, 2, 3))
+    forked = np.zeros(len(nodes), np.int64)
+    for shift in range(depth - 1, -1, -1):
+        pairs = np.column_stack([2 * nodes, 2 * nodes + 1])
+        kinds = np.zeros(len(nodes), np.int64)
+        if codes is not None:
+            left, right = np.isin(pairs, codes >> shift).T
+            kinds = left + 2 * right - 1
+        for before in (0, 1):
+            rows = np.flatnonzero(forked == before)
+            kinds[rows] = adaptive(stream, kinds[rows], counts[shift % 3, before])
+        there = np.column_stack([kinds != 1, kinds != 0])
+        nodes, forked = pairs[there], np.repeat(kinds == 2, 1 + (kinds == 2)).astype(np.int64)
+        if len(nodes) > most:
+            raise ValueError(f"more than {most} cells")
+    return nodes
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Tree of N cells, and how their values are transformed.
+
+    merges: for each level, from cells to the root, the places of the left ones of its pairs of
+    children, and the weights of both. cut: level at which a node's sum becomes its mean: a node
+    stands for its cells where these are unknown. counts: cells of each node there. band, tile: [N]
+    of each coefficient: 0 to BANDS - 1; 0 above the cut, else the tile of the node there, from 1.
+    """
+
+    merges: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    cut: int
+    counts: np.ndarray
+    band: np.ndarray
+    tile: np.ndarray
+
+    def forward(self, values: np.ndarray, adjoint: bool = False) -> np.ndarray:
+        """Coefficients [N,C] of values [N,C]. adjoint: those of a gradient by the values, which is
+        a gradient by the coefficients."""
+        parts = []
+        for level, (left, a, b) in enumerate(self.merges):
+            if level == self.cut:
+                root = np.sqrt(self.counts)[:, None]
+                values = values * root if adjoint else values / root
+            first, second = values[left], values[left + 1]
+            parts.append(a * second - b * first)
+            values = np.delete(values, left + 1, axis=0)
+            values[left - np.arange(len(left))] = a * first + b * second
+        return np.concatenate([*parts, values])
+
+    def inverse(self, coefficients: np.ndarray) -> np.ndarray:
+        """Values [N,C] of coefficients [N,C]."""
+        values, end = coefficients[-1:], len(coefficients) - 1
+        for level in range(len(self.merges) - 1, -1, -1):
+            left, a, b = self.merges[level]
+            part = coefficients[end - len(left) : end]
+            place = left - np.arange(len(left))
+            low = values[place]
+            values = np.insert(values, place + 1, b * low + a * part, axis=0)
+            values[left] = a * low - b * part
+            if level == self.cut:
+                values = values * np.sqrt(self.counts)[:, None]
+            end -= len(left)
+        return values
+
+
+def tree_of(codes: np.ndarray, cut: int, tiles: int) -> Tree:
+    """Tree of sorted codes [N], with its nodes `cut` levels above the cells in this many tiles."""
+    nodes, weight, counts = codes, np.ones(len(codes)), np.ones(1)
+    top = np.unique(codes >> cut)
+    merges, bands, of_tile = [], [], []
+    for level in range(DEPTH):
+        if level == cut:
+            counts, weight = weight, np.ones(len(nodes))
+        parents = nodes >> 1
+        left = np.flatnonzero(parents[1:] == parents[:-1])
+        first, second = weight[left, None], weight[left + 1, None]
+        total = first + second
+        merges.append((left, np.sqrt(first / total), np.sqrt(second / total)))
+        bands.append(np.full(len(left), min(level // 3, BANDS - 1)))
+        place = np.searchsorted(top, nodes[left] >> max(cut - level, 0)) if level < cut else left
+        of_tile.append(1 + place * tiles // len(top) if level < cut else np.zeros(len(left)))
+        weight[left] += weight[left + 1]
+        weight, nodes = np.delete(weight, left + 1), np.delete(parents, left + 1)
+    band = np.concatenate([*bands, [BANDS - 1]]).astype(np.int64)
+    return Tree(merges, cut, counts, band, np.concatenate([*of_tile, [0]]).astype(np.int64))

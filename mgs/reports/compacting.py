@@ -1,0 +1,159 @@
+"""A run's model in so many bytes, or with so much quality: `mgs export RUN --bytes`, `--psnr`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from mgs.colour import srgb_from_linear
+from mgs.compact.columns import Start, start_of
+from mgs.compact.encode import Compact, Encoder
+from mgs.errors import InputError
+from mgs.evaluation import psnr_over
+from mgs.gaussians import Gaussians
+from mgs.policy.criteria import PRUNE_NOISE
+from mgs.run.folder import Run
+from mgs.seeds import generator
+
+SCALES = (1e-3, 1.0)
+"""Range of the steps' scale: rms error of an image, (pixel value) per coefficient."""
+
+HALVINGS = 9
+"""Halvings of that range, in its logarithm: steps are found to 1.4 %."""
+
+VIEWS = 16
+"""Most views, evenly spread over those taken, in which errors are weighed."""
+
+NOISES = (PRUNE_NOISE, 4 * PRUNE_NOISE)
+"""Where positions are sent, each Gaussian costs a byte or more: as many are removed as change the
+views taken by so much (`mgs.fit.pruning.prune`), whichever of these gives the better model."""
+
+
+@dataclass(frozen=True)
+class Compacted:
+    """A compact model. psnr: mean of the views taken, dB, of the run's model and of this one."""
+
+    file: Compact
+    psnr: tuple[float, float]
+
+
+def compact_run(
+    run: Run,
+    size: int | None = None,
+    psnr: float | None = None,
+    shared: bool = False,
+    say: Callable[[str], None] = lambda stage: None,
+) -> Compacted:
+    """Make the best model of at most `size` bytes, or the smallest of `psnr` dB in the views taken.
+
+    shared: the receiver has the run's prior, so positions are not sent. say(stage): called as a
+    stage starts. Raises InputError if neither can be reached, for a shared prior whose Gaussians
+    were moved or changed by the fit, and as `Run.state`.
+    """
+    from mgs.splat import ListCache
+
+    cache, whole = ListCache(), run.state.gaussians
+    exposure, views = run.settings.exposure, range(len(run.taken))
+    quality = psnr_over(run.taken, cache, exposure, run.dataset.world)
+
+    def measured(model: Gaussians) -> float:
+        return float(np.nanmean(quality(model, views)["psnr_corrected" if exposure else "psnr"]))
+
+    before, results = measured(whole), list[tuple[Compact, float]]()
+    if psnr is not None and before <= psnr:
+        raise InputError(
+            f"psnr {psnr:g}: {run.folder} itself has {before:.2f} dB in the views it took; ask for "
+            "less"
+        )
+    for encoder in encoders(run, shared, say):
+        say("choosing steps")
+        file = _fitted(encoder, size, None if psnr is None else lambda m: measured(m) >= psnr)
+        if file is not None:
+            results.append((file, measured(file.model)))
+    if not results:
+        least = "it takes more bytes to place its Gaussians" if size else "no steps are fine enough"
+        raise InputError(f"{run.folder}: {least}; ask for more bytes or a lower psnr")
+    rank = (lambda pair: pair[1]) if size else (lambda pair: -len(pair[0]))
+    file, after = max(results, key=rank)
+    return Compacted(file, (before, after))
+
+
+def encoders(
+    run: Run, shared: bool, say: Callable[[str], None] = lambda stage: None
+) -> Iterator[Encoder]:
+    """Encoders of the run's model, pruned by each of NOISES where positions are sent."""
+    from mgs.fit.pruning import prune
+
+    g, world = run.state.gaussians, run.dataset.world
+    start = _start(run, g) if shared or run.settings.prior.is_dir() else None
+    if shared:
+        if start is None:
+            raise InputError(
+                f"{run.folder}: its fit moved the Gaussians of its prior or has others; leave out "
+                "`shared_prior`"
+            )
+        say("weighing errors")
+        yield Encoder(g, lambda model: _gradients(run, model), start, None, world.up, world.origin)
+        return
+    cameras = [frame.camera for frame in run.taken]
+    for noise in NOISES:
+        say("removing Gaussians")
+        kept = prune(g, cameras, noise).kept
+        say("weighing errors")
+        layer = start.layer[kept] if start else None
+        yield Encoder(
+            g[kept], lambda model: _gradients(run, model), None, layer, world.up, world.origin
+        )
+
+
+def _start(run: Run, g: Gaussians) -> Start | None:
+    """Where the prior places the Gaussians of a run; None if they are elsewhere."""
+    prior, count = run.prior, len(run.prior.points)
+    if prior.kind == "random" or len(g) != count + prior.backed:
+        return None
+    inset = ((prior.points - g.means[:count]) * prior.normals).sum(1).mean()
+    start = start_of(prior, float(inset))
+    near = np.abs(start.means - g.means).max() < prior.spacing / 100
+    return start if near else None
+
+
+def _gradients(run: Run, g: Gaussians) -> Iterator[Mapping[str, np.ndarray]]:
+    """Gradients of sum(z image) in sRGB, in which PSNR is measured, of up to VIEWS views."""
+    from mgs.splat import as_drjit, render, vjp
+
+    model, rng = as_drjit(g), generator(0, "compact")
+    frames = run.taken[:: -(-len(run.taken) // VIEWS)]
+    weight = np.sqrt(len(run.taken) / len(frames))
+    for frame in frames:
+        image = np.asarray(render(model, frame.camera).rgb)
+        slope = _slope(image) if g.linear else np.ones_like(image)
+        signs = rng.choice([-weight, weight], image.shape)
+        yield vjp(model, (signs * slope).astype(np.float32), frame.camera)
+
+
+def _slope(linear: np.ndarray) -> np.ndarray:
+    """Derivative of sRGB by linear RGB, 0 where it is clipped."""
+    step = 1e-4
+    return (srgb_from_linear(linear + step) - srgb_from_linear(linear)) / step
+
+
+def _fitted(
+    encoder: Encoder, size: int | None, enough: Callable[[Gaussians], bool] | None
+) -> Compact | None:
+    """File of the finest steps that fit into `size` bytes, or the coarsest that give `enough`; None
+    if there is none. Too small a size is filled with the first packets."""
+    low, high = np.log(SCALES)
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        file = encoder.file(float(np.exp(middle)))
+        if enough(file.model) if enough else len(file) > (size or 0):
+            low = middle
+        else:
+            high = middle
+    file = encoder.file(float(np.exp(low if enough else high)))
+    if enough:
+        return file if enough(file.model) else None
+    first = file.first(size or 0)
+    return first if first.payloads else None

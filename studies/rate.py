@@ -1,0 +1,279 @@
+"""Bytes against quality: the format mgs beside SPZ, compressed PLY, SOG, and the pictures as JPEG.
+
+Each rock is fitted with several numbers of Gaussians, and each model is written by every coder,
+whole and pruned as by `mgs simplify`. A coder is judged by the best of its files at each size. All
+files are read back and drawn in linear RGB, as fitted, so only the coding differs.
+"""
+
+from __future__ import annotations
+
+import io
+import shutil
+import subprocess
+import warnings
+from argparse import Namespace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+import mgs
+from mgs.colour import srgb_from_linear
+from mgs.errors import Notice
+from mgs.evaluation import render_view
+from mgs.plotting import NO_GRID, crop, drawing
+from mgs.reports.compacting import compact_run, encoders
+from mgs.run.folder import Run
+from mgs.run.nbv import start_fit
+from mgs.splat_files import FORMATS, load_gaussians, write_gaussians
+from studies.frame.case import FRESH, ROCKS, Case, Rock, Size, judge, rocks_of, test_views_of
+from studies.frame.claim import Claim, Row, judged, pareto_front, single, verdict_table
+from studies.frame.output import Content, Panel, draw_panels, table, write_table
+from studies.frame.program import Study, Work, study_of
+from studies.frame.sweep import Cell
+
+WITH, ALONE, JPEG, SOG = "mgs, mesh at the receiver", "mgs", "JPEG, fitted at home", "SOG"
+OTHERS = {"SPZ": "spz", "compressed PLY": "compressed-ply"}
+
+SCALES = (0.01, 0.02, 0.05, 0.1, 0.25)
+"""Scales of the steps (`mgs.compact.encode.Encoder.file`)."""
+
+QUALITIES = (30, 80)
+"""Of JPEG."""
+
+SENT = (10_000, 30_000, 100_000)
+"""Bytes after which the picture shows the model."""
+
+LINK = 4000
+"""Bits per second."""
+
+COMMON = 24
+"""Values of PSNR at which two coders are compared, evenly over what both reach."""
+
+
+@dataclass(frozen=True)
+class RateSize:
+    """Rocks, images, and numbers of Gaussians. tool: command of splat-transform, or empty."""
+
+    images: Size
+    counts: tuple[int | str, ...]
+    rocks: tuple[Rock, ...] = FRESH[:6]
+    tool: str = ""
+
+    def cells(self) -> list[Cell]:
+        """Cells of all rocks: files of each number of Gaussians, of JPEG, and of the picture."""
+        cells: list[Cell] = []
+        for rock in self.rocks:
+            whole = Case(rock, self.images, {"gaussians": "auto", "seed": rock.index})
+            for count in self.counts:
+                case = replace(whole, settings={"gaussians": count, "seed": rock.index})
+                task, name = f"{__name__}:code", f"files/{rock.name}/{count}"
+                cells += case.with_task(name, task, tool=self.tool)
+            for quality in QUALITIES:
+                name = f"jpeg/{rock.name}/{quality}"
+                cells += whole.with_task(name, f"{__name__}:by_jpeg", quality=quality)
+        first = Case(self.rocks[0], self.images, {"gaussians": "auto", "seed": self.rocks[0].index})
+        return cells + first.with_task("picture", f"{__name__}:picture")
+
+
+def fitted(root: Path, out: Path, dataset: str, prior: str) -> Run:
+    """Fit of all images of a dataset, in OUT/run."""
+    run = start_fit(root / dataset, out / "run", prior=root / prior, force=True)
+    return mgs.resume_nbv(run)
+
+
+def code(root: Path, out: Path, dataset: str, prior: str, tool: str) -> dict[str, Any]:
+    """Task: fit a model; write it by every coder. Returns the rows of its files."""
+    run, data, rows = fitted(root, out, dataset, prior), mgs.load_dataset(root / dataset), []
+    rows.append(_row("whole model", 0, run.gaussians, data))
+    models = [run.gaussians]
+    for name, shared in ((WITH, True), (ALONE, False)):
+        for encoder in encoders(run, shared):
+            models += [encoder.g] if not shared else []
+            for scale in SCALES:
+                file = encoder.file(scale)
+                rows.append(_row(name, len(file), file.model, data) | {"scale": scale})
+    # Not every format says in which space colours are blended, or that splats are antialiased.
+    g = run.gaussians
+    marks = partial(replace, linear=g.linear, antialiased=g.antialiased)
+    for model in models:
+        for name, kind in OTHERS.items():
+            path = out / f"model{FORMATS[kind]}"
+            write_gaussians(path, model, kind, np.eye(3))
+            read = marks(load_gaussians(path))
+            rows.append(_row(name, path.stat().st_size, read, data))
+        if tool:
+            mgs.write_ply(out / "model.ply", model)
+            for pair in (("model.ply", "model.sog"), ("model.sog", "back.ply")):
+                subprocess.run(
+                    [*tool.split(), "-w", *pair], cwd=out, check=True, capture_output=True
+                )
+            size = (out / "model.sog").stat().st_size
+            read = marks(load_gaussians(out / "back.ply"))
+            rows.append(_row(SOG, size, read, data))
+    return {"rows": rows}
+
+
+def _row(coder: str, size: int, model: mgs.Gaussians, dataset: mgs.Dataset) -> Row:
+    """Row of a file, by the model read from it."""
+    found = judge(model, dataset)
+    row = {"coder": coder, "gaussians": len(model), "kB": size / 1e3}
+    return row | {key: found[key] for key in ("psnr", "psnr_mask", "psnr_inside")}
+
+
+def by_jpeg(root: Path, out: Path, dataset: str, prior: str, quality: int) -> dict[str, Any]:
+    """Task: fit the images as they come out of JPEG. The receiver has poses, masks and prior."""
+    sent, size = out / "dataset", 0
+    shutil.rmtree(sent, ignore_errors=True)
+    shutil.copytree(root / dataset, sent)
+    for frame in mgs.load_dataset(sent).frames:
+        with Image.open(frame.image_path) as image, io.BytesIO() as file:
+            image.convert("RGB").save(file, "JPEG", quality=quality, optimize=True)
+            size += file.tell()
+            with Image.open(file) as read:
+                read.save(frame.image_path)
+    run = fitted(root, out, str(sent.resolve()), prior)
+    return {"rows": [_row(JPEG, size, run.gaussians, mgs.load_dataset(root / dataset))]}
+
+
+def picture(root: Path, out: Path, dataset: str, prior: str) -> dict[str, Any]:
+    """Task: draw a test view after SENT bytes of one file each, with and without positions, beside
+    the truth."""
+    run, view = fitted(root, out, dataset, prior), test_views_of(mgs.load_dataset(root / dataset))
+    frame = view.frames[0]
+    truth, part = frame.target()[0][..., :3], crop(frame.mask())
+    files = {name: compact_run(run, SENT[-1], shared=name == WITH).file for name in (WITH, ALONE)}
+    shown = list[tuple[str, str, np.ndarray]]()
+    for name, file in files.items():
+        path = out / f"{len(shown)}.mgs"
+        for sent in SENT:
+            path.write_bytes(bytes(file)[:sent])
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", Notice)
+                model = load_gaussians(path, root / prior if name == WITH else None)
+            rgb = render_view(model, frame.camera)[0]
+            error = np.mean((srgb_from_linear(rgb) - srgb_from_linear(truth)) ** 2)
+            title = f"{sent // 1000} kB, {8 * sent / LINK:.0f} s: {-10 * np.log10(error):.1f} dB"
+            shown.append((name, title, rgb))
+    with drawing(out / "sent.png", 9.6, 4.6, NO_GRID) as figure:
+        axes = figure.subplots(2, 4)
+        for k, line in enumerate(axes):
+            images = [*shown[3 * k : 3 * k + 3], ("", "truth", truth)]
+            for axis, (_, title, rgb) in zip(line, images, strict=True):
+                axis.imshow(srgb_from_linear(rgb)[part], interpolation="lanczos")
+                axis.set_title(title)
+                axis.set(xticks=[], yticks=[])
+            line[0].set_ylabel(images[0][0])
+    return {"bytes": {name: len(file) for name, file in files.items()}}
+
+
+def rows_of(work: Work) -> Iterator[Row]:
+    """Rows of all files; `front`: no file of its coder is smaller and better."""
+    for rock in work.size.rocks:
+        of = [f"files/{rock.name}/{count}" for count in work.size.counts]
+        of += [f"jpeg/{rock.name}/{quality}" for quality in QUALITIES]
+        rows = [row for name in of for row in work.results[name]["rows"]]
+        for coder in dict.fromkeys(row["coder"] for row in rows):
+            mine = sorted((r for r in rows if r["coder"] == coder), key=lambda row: row["kB"])
+            front = pareto_front([r["kB"] for r in mine], [r["psnr"] for r in mine])
+            for row, best in zip(mine, front, strict=True):
+                yield {"run": rock.name, **row, "front": bool(best)}
+
+
+def share(rows: Sequence[Row], run: str, one: str, other: str) -> float:
+    """Bytes of a coder over those of another at equal PSNR: geometric mean over the values that
+    both reach; NaN if there is none."""
+    fronts = [
+        [r for r in rows if r["run"] == run and r["coder"] == coder and r["front"]]
+        for coder in (one, other)
+    ]
+    if not all(fronts):
+        return float("nan")
+    ends = [(front[0]["psnr"], front[-1]["psnr"]) for front in fronts]
+    low, high = max(a for a, _ in ends), min(b for _, b in ends)
+    if low > high:
+        return float("nan")
+    at = np.linspace(low, high, COMMON)
+    logs = [np.interp(at, [r["psnr"] for r in f], np.log([r["kB"] for r in f])) for f in fronts]
+    return float(np.exp(np.mean(logs[0] - logs[1])))
+
+
+CLAIMS = (
+    Claim(
+        "With the mesh at the receiver, mgs needs at most a sixth of SPZ's bytes at equal PSNR.",
+        single("with_mesh", {}), "of SPZ", "below", 1 / 6, "rock",
+    ),
+    Claim(
+        "Without it, at most a third.", single("alone", {}), "of SPZ", "below", 1 / 3, "rock",
+    ),
+)  # fmt: skip
+
+COLUMNS: dict[str, Content] = {
+    "rock": "run",
+    "mgs with mesh / SPZ": "with_mesh:.3f",
+    "mgs / SPZ": "alone:.3f",
+    "compressed PLY / SPZ": "compressed:.2f",
+    "SOG / SPZ": "sog:.2f",
+    "mgs with mesh / JPEG": "jpeg:.2f",
+}
+
+
+def write(work: Work) -> list[Path]:
+    """Write rate.csv, .json, .md and .png, and sent.png."""
+    rows = list(rows_of(work))
+    pairs = {
+        "with_mesh": (WITH, "SPZ"),
+        "alone": (ALONE, "SPZ"),
+        "compressed": ("compressed PLY", "SPZ"),
+        "sog": (SOG, "SPZ"),
+        "jpeg": (WITH, JPEG),
+    }
+    shares: list[Row] = []
+    for run in dict.fromkeys(row["run"] for row in rows):
+        found = {key: share(rows, run, *pair) for key, pair in pairs.items()}
+        shares.append({"run": run} | {k: None if np.isnan(v) else v for k, v in found.items()})
+    claims = [judged(claim, shares) for claim in CLAIMS]
+    text = f"{table(COLUMNS, shares)}\n{verdict_table(claims)}"
+    labels = "kB", "psnr", "kB", "PSNR, test views (dB)", "coder", True
+    panels = [
+        Panel(*labels, only=(("run", row["run"]), ("front", True)), title=row["run"])
+        for row in shares
+    ]
+    drawn = [row for row in rows if row["kB"]]
+    draw_panels(work.out / "rate.png", panels, drawn, "Best files of each coder")
+    shutil.copyfile(work.out / "cells/picture/sent.png", work.out / "sent.png")
+    paths = write_table(work, "rate", rows, text, shares=shares, claims=claims)
+    return [*paths, work.out / "rate.png", work.out / "sent.png"]
+
+
+def sized(size: RateSize, options: Namespace) -> RateSize:
+    """Size with the rocks and the tool of the options."""
+    return replace(size, rocks=rocks_of(options, 6), tool=options.splat_transform)
+
+
+STUDY = Study(
+    "rate",
+    __doc__,
+    write,
+    {
+        "quick": RateSize(Size(160, 120, 12, 8), ("auto", 10_000, 3000)),
+        "full": RateSize(Size(320, 240, 16, 12), ("auto", 30_000, 10_000, 3000)),
+    },
+    lambda work: work.size.cells(),
+    ROCKS
+    | {
+        "--splat-transform": {
+            "default": "",
+            "metavar": "COMMAND",
+            "help": "Command of splat-transform, to write SOG.",
+        }
+    },
+    sized,
+)
+
+if __name__ == "__main__":
+    study_of("rate")()

@@ -1,0 +1,360 @@
+"""The format mgs: its transform, coder and allocation against brute force, and damaged files."""
+
+import hashlib
+import struct
+import warnings
+import zlib
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from program import command
+from refusals import refused
+from test_render_command import CAMERAS, gaussians
+
+import mgs
+from mgs.compact import allocate, coder, container, decode
+from mgs.compact.columns import columns_of, gaussians_of, gradient_of, start_of
+from mgs.compact.encode import Encoder
+from mgs.compact.tree import DEPTH, cells_of, code_descendants, codes_of, tree_of
+from mgs.data.world import PLUS_Z
+from mgs.errors import InputError, Notice
+from mgs.prior.build import load_prior
+from mgs.rotation import rotmat_from_quat
+from mgs.run.folder import open_run
+from mgs.splat import jvp, render, vjp
+from mgs.splat_files import load_gaussians, upward
+
+pytest.importorskip("constriction")
+FILE = Path(__file__).parent / "corpus" / "compact.mgs"
+
+
+def scattered(n: int, seed: int = 0, side: int = 64) -> np.ndarray:
+    """Sorted codes of cells, some of them equal."""
+    rng = np.random.default_rng(seed)
+    return codes_of(rng.integers(0, side, (n, 3)), rng.integers(0, 2, n))[1]
+
+
+def signs(model, draws: int = 1):
+    """Gradients of random signs, of each camera."""
+    rng = np.random.default_rng(1)
+    for camera in CAMERAS * draws:
+        z = rng.choice([-1.0, 1.0], (camera.height, camera.width, 3)) / np.sqrt(draws)
+        yield vjp(model, z.astype(np.float32), camera)
+
+
+def change(a, b) -> float:
+    """Squared change of the images, summed."""
+    pairs = ((np.asarray(render(g, camera).rgb, float) for g in (a, b)) for camera in CAMERAS)
+    return float(sum(np.square(x - y).sum() for x, y in pairs))
+
+
+def by_recursion(
+    codes: list[int], values: np.ndarray, bit: int, cut: int
+) -> tuple[dict, np.ndarray]:
+    """Slow transform of one node: coefficients by (level, code of the left child), and the sum that
+    goes on to the parent, with its number of cells (of nodes above the cut)."""
+    if bit == 0:
+        return {}, (values[0], 1)
+    middle = next((k for k, c in enumerate(codes) if c >> (bit - 1) & 1), len(codes))
+    found, sums = {}, []
+    for part in (slice(0, middle), slice(middle, None)):
+        if len(codes[part]):
+            inner, low = by_recursion(codes[part], values[part], bit - 1, cut)
+            found |= inner
+            if bit - 1 == cut:
+                low = low[0] / low[1] ** 0.5, 1
+            sums.append(low)
+    if len(sums) == 1:
+        return found, sums[0]
+    (a, m), (b, n) = sums
+    root = (m + n) ** 0.5
+    found[bit, codes[0]] = (m**0.5 * b - n**0.5 * a) / root
+    return found, ((m**0.5 * a + n**0.5 * b) / root, m + n)
+
+
+def test_the_transform_is_that_of_a_recursion():
+    codes = scattered(60)
+    values = np.random.default_rng(1).normal(size=(60, 2))
+    tree = tree_of(codes, 9, 2)
+    found, (last, _) = by_recursion(codes.tolist(), values, DEPTH, 9)
+    inner = [found[key] for key in sorted(found)]
+    np.testing.assert_allclose(tree.forward(values), [*inner, last], atol=1e-12)
+
+
+def test_the_transform_has_an_inverse_and_an_adjoint():
+    tree, rng = tree_of(scattered(500), 9, 3), np.random.default_rng(2)
+    x, g = rng.normal(size=(2, 500, 3))
+    y = tree.forward(x)
+    np.testing.assert_allclose(tree.inverse(y), x, atol=1e-12)
+    assert (g * x).sum() == pytest.approx((tree.forward(g, adjoint=True) * y).sum())
+    assert set(tree.tile) == {0, 1, 2, 3}
+
+
+def test_integers_come_back():
+    rng = np.random.default_rng(0)
+    values = np.round(rng.laplace(size=(3000, 3)) * [0.3, 2, 40]).astype(int)
+    values[:2, 0] = coder.LARGEST, -coder.LARGEST
+    data = coder.encode(lambda stream: coder.integers(stream, values))
+    zeros = np.zeros_like(values)
+    np.testing.assert_array_equal(coder.integers(coder.decoder(data), zeros), values)
+    counts = [np.unique(column, return_counts=True)[1] / 3000 for column in values.T]
+    ideal = 3000 / 8 * sum(-(p * np.log2(p)).sum() for p in counts)
+    assert len(data) < 1.1 * ideal
+
+
+def test_cells_come_back_and_none_are_shared():
+    rng = np.random.default_rng(0)
+    cells, layer = rng.integers(0, 4, (40, 3)), np.zeros(40, np.int64)
+    order, codes = codes_of(cells, layer)
+    assert (np.diff(codes) > 0).all()
+    assert sorted(order) == list(range(40))
+    read = cells_of(codes)[0]
+    assert (read == cells[order]).all(1).sum() >= 10
+    data = coder.encode(lambda s: code_descendants(s, np.zeros(1, int), DEPTH, 40, codes))
+    np.testing.assert_array_equal(
+        code_descendants(coder.decoder(data), np.zeros(1, int), DEPTH, 40), codes
+    )
+    with pytest.raises(ValueError, match="more than 39"):
+        code_descendants(coder.decoder(data), np.zeros(1, int), DEPTH, 39)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_columns_are_gaussians_and_gradients_are_by_them(degree):
+    model = gaussians(degree)
+    start = np.random.default_rng(3).normal(size=(40, 4))
+    axes = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
+    columns = columns_of(model, start, axes)
+    back = gaussians_of(columns, model.means, start, axes)
+    for name in ("log_scales", "sh"):
+        np.testing.assert_allclose(getattr(back, name), getattr(model, name), atol=1e-5)
+    np.testing.assert_allclose(
+        rotmat_from_quat(back.quats), rotmat_from_quat(model.quats), atol=1e-4
+    )
+    rng, step = np.random.default_rng(5), 1e-4
+    weights = {name: rng.normal(size=getattr(back, name).shape) for name in ("quats", "sh")}
+    weights |= {"log_scales": rng.normal(size=(40, 3)), "logit_opacities": rng.normal(size=40)}
+
+    def total(c):
+        g = gaussians_of(c, model.means, start, axes)
+        return sum((w * getattr(g, name).astype(float)).sum() for name, w in weights.items())
+
+    direction = rng.normal(size=columns.shape)
+    slope = (total(columns + step * direction) - total(columns - step * direction)) / (2 * step)
+    gradient = gradient_of(columns, start, axes, weights)
+    assert (gradient * direction)[:, :-1].sum() + (gradient * direction)[
+        np.abs(columns[:, -1] - 0.5) < 6.4, -1
+    ].sum() == pytest.approx(slope, rel=2e-2)
+
+
+def test_sensitivity_is_that_of_brute_force():
+    """h of a band is the mean squared change of the images by a unit change of a coefficient."""
+    model = replace(gaussians(0, 12), logit_opacities=np.full(12, 0.5, np.float32))
+    axes, quats = np.eye(3), np.tile([1.0, 0, 0, 0], (12, 1))
+    columns = columns_of(model, quats, axes)
+    order, codes = codes_of(
+        decode.grid_cells(model.means, model.means.min(0), 0.02), np.zeros(12, int)
+    )
+    tree, base = tree_of(codes, 3, 1), gaussians_of(columns, model.means, quats, axes)
+    model = replace(base, antialiased=False)
+    coefficients, exact, step = tree.forward(columns[order]), np.zeros((12, 10)), 1e-2
+    for k, column in product(range(12), (0, 4, 6, 9)):
+        ends = []
+        for sign in (1, -1):
+            moved = coefficients.copy()
+            moved[k, column] += sign * step
+            other = np.empty_like(columns)
+            other[order] = tree.inverse(moved)
+            ends.append(gaussians_of(other, model.means, quats, axes))
+        names = ("sh", "log_scales", "quats", "logit_opacities")
+        tangents = {n: (getattr(ends[0], n) - getattr(ends[1], n)) / (2 * step) for n in names}
+        images = (np.asarray(jvp(model, tangents, camera).rgb, float) for camera in CAMERAS)
+        exact[k, column] = sum(np.square(image).sum() for image in images)
+    each = [gradient_of(columns, quats, axes, by)[order] for by in signs(model, 60)]
+    turned = np.stack([tree.forward(one, adjoint=True) for one in each])
+    h = allocate.sensitivity(turned, np.zeros(12, int))
+    for column in (0, 4, 6, 9):
+        assert h[0, column] == pytest.approx(exact[:, column].mean(), rel=0.2)
+
+
+def test_the_expected_change_is_measured(monkeypatch):
+    """Roundings of independent Gaussians change the images as their sum of squares says."""
+    independent = dict.fromkeys(allocate.COHERENCE, 1.0)
+    monkeypatch.setattr(allocate, "COHERENCE", independent)
+    model = gaussians(0, 400)
+    model.logit_opacities = np.clip(model.logit_opacities, -2, 2)
+    encoder = Encoder(model, lambda g: signs(g, 20))
+    for scale in (0.002, 0.01):
+        file = encoder.file(scale)
+        assert change(file.model, model) == pytest.approx(file.expected, rel=0.5)
+
+
+def small(**options) -> Encoder:
+    return Encoder(gaussians(1, 300), signs, **options)
+
+
+def test_a_file_gives_the_same_numbers_everywhere():
+    """Bytes of a file, and a hash of the arrays that were read from it when it was made."""
+    g = load_gaussians(FILE)
+    digest = hashlib.blake2b(digest_size=8)
+    for array in (g.means, g.log_scales, g.quats, g.logit_opacities, g.sh):
+        digest.update(np.ascontiguousarray(array, "<f4").tobytes())
+    assert (len(g), digest.hexdigest()) == (300, "4afd2c080152b8fb")
+
+
+def test_a_file_comes_back_as_its_encoder_says(tmp_path):
+    up = (0.6, 0.0, 0.8)
+    for options in ({}, {"up": up, "origin": (5e5, -2.0, 3.0)}):
+        file = small(**options).file(0.01)
+        path = tmp_path / "x.mgs"
+        path.write_bytes(bytes(file))
+        read = load_gaussians(path)
+        assert len(read) == 300
+        if not options:
+            assert read == file.model
+    assert upward(path) == pytest.approx(up)
+    assert read.origin == (5e5, -2.0, 3.0)
+    with pytest.raises(InputError, match="needs no prior"):
+        load_gaussians(write_ply(tmp_path), tmp_path)
+
+
+def write_ply(folder: Path) -> Path:
+    mgs.write_ply(folder / "x.ply", gaussians(0))
+    return folder / "x.ply"
+
+
+def test_more_bytes_are_better_and_each_packet_improves(tmp_path):
+    encoder = small()
+    errors = [change(encoder.file(scale).model, encoder.g) for scale in (0.2, 0.05, 0.01)]
+    assert errors[0] > errors[1] > errors[2]
+    file, path, sizes = encoder.file(0.02), tmp_path / "x.mgs", []
+    for most in np.linspace(len(bytes(file.header)) + 200, len(file), 6).astype(int):
+        path.write_bytes(bytes(file.first(most)))
+        assert path.stat().st_size <= most
+        sizes.append(change(load_gaussians(path), encoder.g))
+    assert sizes[0] > 3 * sizes[-1]
+    assert np.mean(np.diff(sizes) <= 0) >= 0.8
+
+
+def test_what_is_cut_off_or_broken_is_lost_alone(tmp_path):
+    file, path = small().file(0.02), tmp_path / "x.mgs"
+    data, whole = bytes(file), change(file.model, small().g)
+    start = len(bytes(file.header))
+    path.write_bytes(data[: start + (len(data) - start) * 2 // 3])
+    with pytest.warns(Notice, match=r"\d+ of \d+ packets are missing or damaged"):
+        load_gaussians(path)
+    at = data.index(container.MARK, start + 2000)
+    broken = bytearray(data)
+    broken[at + 12] ^= 1
+    path.write_bytes(bytes(broken))
+    with pytest.warns(Notice, match=f": 1 of {file.header.packets} packets"):
+        read = load_gaussians(path)
+    assert whole < change(read, small().g) < change(file.first(start + 600).model, small().g)
+
+
+def hostile(data: bytes, place: int, form: str, value) -> bytes:
+    """A file with a number of its header replaced, and the sum that fits it."""
+    end = next(
+        k for k in range(200, 2000) if zlib.crc32(data[:k]) == struct.unpack_from("<I", data, k)[0]
+    )
+    head = bytearray(data[:end])
+    struct.pack_into(form, head, place, value)
+    return bytes(head) + zlib.crc32(bytes(head)).to_bytes(4, "little") + data[end + 4 :]
+
+
+@pytest.mark.parametrize(
+    ("place", "form", "value", "message"),
+    [
+        (4, "<B", 2, "version 2"),
+        (5, "<B", 255, "give the prior"),
+        (6, "<B", 9, "SH degree 9"),
+        (7, "<B", 0, "impossible numbers"),
+        (7, "<B", 60, "more than|impossible|not a readable"),
+        (9, "<I", 0, "impossible numbers"),
+        (9, "<I", 1 << 31, "impossible numbers"),
+        (13, "<H", 0, "impossible numbers"),
+        (17, "<d", float("nan"), "impossible numbers"),
+        (89, "<d", -1.0, "impossible numbers"),
+    ],
+)
+def test_hostile_headers_are_refused(tmp_path, place, form, value, message):
+    path = tmp_path / "x.mgs"
+    path.write_bytes(hostile(FILE.read_bytes(), place, form, value))
+    with pytest.raises(InputError, match=message) as error:
+        load_gaussians(path)
+    assert "\n" not in str(error.value)
+
+
+def test_damaged_files_are_refused_or_read(tmp_path):
+    data, path, rng = FILE.read_bytes(), tmp_path / "x.mgs", np.random.default_rng(0)
+    lines = list[str]()
+    for trial in range(150):
+        broken = bytearray(data[: rng.integers(0, len(data))] if trial % 3 == 0 else data)
+        for at in rng.integers(0, max(len(broken), 1), rng.integers(0, 4)):
+            if len(broken):
+                broken[at] = rng.integers(256)
+        payload = rng.bytes(40)
+        if trial % 3 == 2:  # packets whose sums are right
+            key = int(rng.integers(3)), container.GROUPS[rng.integers(6)], int(rng.integers(3))
+            end = data.index(container.MARK, 200)
+            broken = bytearray(data[:end] + container.packet(key, payload) + data[end:])
+        path.write_bytes(bytes(broken))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Notice)
+            try:
+                assert len(load_gaussians(path)) <= 1000
+            except InputError as error:
+                lines.append(str(error))
+    assert lines
+    assert not any("\n" in line for line in lines)
+
+
+def test_the_command_writes_what_fits_and_programs_read_it(dataset, prior, tmp_path, capsys):
+    run = tmp_path / "run"
+    settings = {"prior": prior, "seeds": 4, "budget": 0, "train": {"passes": 5}}
+    mgs.run_nbv(dataset, run, **settings)
+    capsys.readouterr()
+    command("export", run, "--bytes", "2k")
+    printed = capsys.readouterr().out
+    alone = run / "export.mgs"
+    assert alone.stat().st_size <= 2000
+    assert f"{alone.stat().st_size:,} bytes" in printed
+    shared = tmp_path / "shared.mgs"
+    command("export", run, "--bytes", "1.2k", "--shared-prior", "--out", shared)
+    assert shared.stat().st_size <= 1200
+    read, whole = load_gaussians(shared, prior), open_run(run).gaussians
+    assert len(read) == len(whole)
+    np.testing.assert_allclose(read.means, whole.means, atol=2e-3)
+    command("render", shared, "--prior", prior, "--cameras", dataset, "--out", tmp_path / "views")
+    command("eval", alone)
+    command("export", shared, "--prior", prior, "--to", "ply", "--out", tmp_path / "x.ply")
+    assert mgs.read_ply(tmp_path / "x.ply") == replace(read, sh=mgs.read_ply(tmp_path / "x.ply").sh)
+    assert "give the prior" in refused(capsys, ["eval", shared, "--dataset", dataset])
+    points = load_prior(prior)
+    other = replace(points, points=points.points + 0.01)
+    mgs.save_prior(tmp_path / "other", other)
+    with pytest.raises(InputError, match="another prior"):
+        load_gaussians(shared, tmp_path / "other")
+    for options, message in (
+        (["--bytes", "x"], "expected a number of bytes"),
+        (["--bytes", "9", "--psnr", "3"], "one of"),
+        (["--to", "mgs"], "one of"),
+        (["--bytes", "200"], "ask for more bytes"),
+        (["--psnr", "90"], "ask for less"),
+        (["--shared-prior"], "leave it out"),
+    ):
+        assert message in refused(capsys, ["export", run, *options, "--force"])
+    command("export", run, "--psnr", "12", "--shared-prior", "--force")
+    assert alone.stat().st_size < 1200
+
+
+def test_the_start_hides_the_last_bits(prior):
+    exact = load_prior(prior)
+    near = replace(exact, points=exact.points * (1 + 2e-16), normals=exact.normals * (1 - 2e-16))
+    one, other = start_of(exact, 0.01), start_of(near, 0.01)
+    assert one.digest == other.digest
+    np.testing.assert_array_equal(one.means, other.means)
+    np.testing.assert_array_equal(one.quats, other.quats)
+    assert exact.world.up == PLUS_Z
