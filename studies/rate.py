@@ -1,7 +1,7 @@
 """Bytes against quality: the format mgs beside SPZ, compressed PLY, SOG, and the pictures as JPEG.
 
 Each rock is fitted with several numbers of Gaussians, and each model is written by every coder,
-whole and pruned as by `mgs simplify`. A coder is judged by the best of its files at each size. All
+whole and pruned as by `mgs simplify` (SOG: whole). A coder is judged by the best of its files at each size. All
 files are read back and drawn in linear RGB, as fitted, so only the coding differs.
 """
 
@@ -39,10 +39,10 @@ from studies.frame.sweep import Cell
 WITH, ALONE, JPEG, SOG = "mgs, mesh at the receiver", "mgs", "JPEG, fitted at home", "SOG"
 OTHERS = {"SPZ": "spz", "compressed PLY": "compressed-ply"}
 
-SCALES = (0.01, 0.02, 0.05, 0.1, 0.25)
+SCALES = (0.01, 0.03, 0.08, 0.2)
 """Scales of the steps (`mgs.compact.encode.Encoder.file`)."""
 
-QUALITIES = (30, 80)
+QUALITIES = (50,)
 """Of JPEG."""
 
 SENT = (10_000, 30_000, 100_000)
@@ -106,7 +106,7 @@ def code(root: Path, out: Path, dataset: str, prior: str, tool: str) -> dict[str
             write_gaussians(path, model, kind, np.eye(3))
             read = marks(load_gaussians(path))
             rows.append(_row(name, path.stat().st_size, read, data))
-        if tool:
+        if tool and model is models[0]:
             mgs.write_ply(out / "model.ply", model)
             for pair in (("model.ply", "model.sog"), ("model.sog", "back.ply")):
                 subprocess.run(
@@ -260,7 +260,7 @@ STUDY = Study(
     __doc__,
     write,
     {
-        "quick": RateSize(Size(160, 120, 12, 8), ("auto", 10_000, 3000)),
+        "quick": RateSize(Size(160, 120, 12, 6), ("auto", 5000)),
         "full": RateSize(Size(320, 240, 16, 12), ("auto", 30_000, 10_000, 3000)),
     },
     lambda work: work.size.cells(),
