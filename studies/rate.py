@@ -1,8 +1,9 @@
 """Bytes against quality: the format mgs beside SPZ, compressed PLY, SOG, and the pictures as JPEG.
 
-Each rock is fitted with several numbers of Gaussians, and each model is written by every coder,
-whole and pruned as by `mgs simplify` (SOG: whole). A coder is judged by the best of its files at each size. All
-files are read back and drawn in linear RGB, as fitted, so only the coding differs.
+Each rock is fitted with several numbers of Gaussians. Each model is written by every coder, whole
+and pruned as by `mgs simplify` (mgs with positions: pruned; SOG: whole). A coder is judged by the
+best of its files at each size. What files do not say, as the space of colours, is added when they
+are read back, so only the coding differs.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,9 @@ SCALES = (0.01, 0.03, 0.08, 0.2)
 QUALITIES = (50,)
 """Of JPEG."""
 
+AUTO = "auto"
+"""Automatic number of Gaussians."""
+
 SENT = (10_000, 30_000, 100_000)
 """Bytes after which the picture shows the model."""
 
@@ -64,20 +69,28 @@ class RateSize:
     rocks: tuple[Rock, ...] = FRESH[:6]
     tool: str = ""
 
+    def case(self, rock: Rock) -> Case:
+        """Views of a rock from a hemisphere, with a prior of the automatic number of Gaussians."""
+        case = Case(rock, self.images, {"seed": 0})
+        return case.on_orbit({"kind": "hemisphere", "distances": [1]})
+
     def cells(self) -> list[Cell]:
         """Cells of all rocks: files of each number of Gaussians, of JPEG, and of the picture."""
         cells: list[Cell] = []
         for rock in self.rocks:
-            whole = Case(rock, self.images, {"gaussians": "auto", "seed": rock.index})
+            whole = self.case(rock)
             for count in self.counts:
-                case = replace(whole, settings={"gaussians": count, "seed": rock.index})
+                case = whole
+                if count != AUTO:
+                    case = replace(whole, settings={"gaussians": count, "seed": 0})
                 task, name = f"{__name__}:code", f"files/{rock.name}/{count}"
                 cells += case.with_task(name, task, tool=self.tool)
             for quality in QUALITIES:
                 name = f"jpeg/{rock.name}/{quality}"
                 cells += whole.with_task(name, f"{__name__}:by_jpeg", quality=quality)
-        first = Case(self.rocks[0], self.images, {"gaussians": "auto", "seed": self.rocks[0].index})
-        return cells + first.with_task("picture", f"{__name__}:picture")
+            if rock == self.rocks[0]:
+                cells += whole.with_task("picture", f"{__name__}:picture")
+        return cells
 
 
 def fitted(root: Path, out: Path, dataset: str, prior: str) -> Run:
@@ -92,7 +105,7 @@ def code(root: Path, out: Path, dataset: str, prior: str, tool: str) -> dict[str
     rows.append(_row("whole model", 0, run.gaussians, data))
     models = [run.gaussians]
     for name, shared in ((WITH, True), (ALONE, False)):
-        for encoder in encoders(run, shared):
+        for encoder in islice(encoders(run, shared), 1):  # the usual pruning alone
             models += [encoder.g] if not shared else []
             for scale in SCALES:
                 file = encoder.file(scale)
@@ -260,8 +273,8 @@ STUDY = Study(
     __doc__,
     write,
     {
-        "quick": RateSize(Size(160, 120, 12, 6), ("auto", 5000)),
-        "full": RateSize(Size(320, 240, 16, 12), ("auto", 30_000, 10_000, 3000)),
+        "quick": RateSize(Size(128, 96, 36, 16), (AUTO, 5000)),
+        "full": RateSize(Size(320, 240, 36, 16), (AUTO, 30_000, 10_000, 3000)),
     },
     lambda work: work.size.cells(),
     ROCKS
