@@ -53,19 +53,19 @@ def test_setups_are_made_once_and_compare_a_policy_of_ones_own(tmp_path, capsys,
     out = tmp_path / "out"
     with monkeypatch.context() as patched:
         patched.setattr("mgs.learn", None)  # these policies need no model to choose
-        assert "dataset/boulder-11" in done(capsys, "setups", out, "--rocks", 2)
+        assert "dataset/boulder-11" in done(capsys, "setups", out, "--rocks", 1)
     before = {path.name: path.read_bytes() for path in out.glob("setups*")}
     assert set(before) == {f"setups{end}" for end in (".csv", ".json", ".md", ".png", "-leads.csv")}
     rows = rows_of(out / "setups.csv")
-    assert {row["command"] for row in rows} == {f"python -m studies.setups {out} --rocks 2"}
-    assert len(rows) == 2 * 2 * 2
+    assert {row["command"] for row in rows} == {f"python -m studies.setups {out} --rocks 1"}
+    assert len(rows) == 2 * 2
     orbits = {path.name for path in out.glob("cells/dataset/boulder-11/*")}
     assert orbits == {"circle-1", "hemisphere-1", "spiral-1.25-2"}
-    assert [float(row["test_gain"]) for row in rows if row["policy"] == "random"] == [0] * 4
+    assert [float(row["test_gain"]) for row in rows if row["policy"] == "random"] == [0] * 2
     cells = [json.loads(path.read_text()) for path in out.glob("cells/setup/**/result.json")]
-    assert len(cells) >= 8
+    assert len(cells) >= 4
     assert {len(set(cell["found"]["taken"])) for cell in cells} == {6}
-    assert "setup/" not in done(capsys, "setups", out, "--rocks", 2), "a cell was done twice"
+    assert "setup/" not in done(capsys, "setups", out, "--rocks", 1), "a cell was done twice"
     assert {path.name: path.read_bytes() for path in out.glob("setups*")} == before
 
     mine = tmp_path / "mine.py"
@@ -86,9 +86,9 @@ def test_no_set_of_a_study_is_above_its_bound(tmp_path, capsys):
         training=certificate.TRAINING[:1],
     )  # fmt: skip
     out = tmp_path / "out"
-    done(capsys, "certificate", out, "--rocks", 2, sizes={"quick": size})
+    done(capsys, "certificate", out, "--rocks", 1, sizes={"quick": size})
     rows = rows_of(out / "certificate.csv")
-    assert [row["policy"] for row in rows] == [*certificate.POLICIES] * 2
+    assert [row["policy"] for row in rows] == [*certificate.POLICIES]
     for row in rows:
         kinds = ("plan", "greedy", "farthest", "random", "random_best", "best")
         shares = {key: float(row[key]) for key in kinds}
