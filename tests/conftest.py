@@ -22,9 +22,9 @@ import tiny  # noqa: E402
 from mgs.data.dataset import load_dataset  # noqa: E402
 
 LONGEST = """
-setups view docs sweep refit photographs page synth scene structure_from_motion plugin kernels
-determinism fisher stress chart capture survey prior world end_to_end derivatives exposure agreement
-detectors suggest
+setups view docs sweep refit photographs page synth scene structure_from_motion plugin capture
+kernels determinism fisher stress chart detectors survey prior world end_to_end derivatives exposure
+borders_data import directional nbv robustness evaluate agreement suggest
 """
 
 
