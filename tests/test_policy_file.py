@@ -60,6 +60,19 @@ number = 3
 
 def words(F, unused=2):
     return "a"
+
+class Stops:
+    def __init__(self):
+        exit(0)
+
+class Lost:
+    needs_fit = False
+
+    def __call__(self, views):
+        return [0.0] * len(views)
+
+    def plan(self, *_):
+        return None
 """
 
 
@@ -108,6 +121,7 @@ def test_draws_do_not_depend_on_the_folder_of_the_file(loaded, file, tmp_path):
         ("missing.py:poses", r"no such file .*missing\.py; correct the path"),
         ("bad.py:poses", r"line 2 of .*bad\.py failed: SyntaxError"),
         ("worse.py:poses", r"line 3 of .*worse\.py failed: ModuleNotFoundError: No module named"),
+        ("mine.py:Stops", r"line 51 of .*mine\.py failed: SystemExit: 0"),
         ("exit.py:poses", r"line 1 of .*exit\.py failed: SystemExit: 0"),
     ],
 )
@@ -134,6 +148,11 @@ def test_a_policy_that_fails_keeps_the_steps_before(loaded, file, tmp_path, func
     with pytest.raises(InputError, match=message):
         run(tmp_path / "run", loaded, policy=f"{file}:{function}")
     assert len((tmp_path / "run/steps.jsonl").read_text().splitlines()) == 1
+
+
+def test_an_error_in_a_plan_is_one_line(file):
+    with pytest.raises(InputError, match=r"mine\.py failed: TypeError: 'NoneType' object is not"):
+        policy_of(f"{file}:Lost").plan(None, None, [], 1, None)
 
 
 def test_a_run_goes_on_with_the_same_file_only(dataset, file, tmp_path, monkeypatch):

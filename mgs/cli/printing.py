@@ -94,7 +94,7 @@ def step_lines(step: Mapping[str, Any]) -> Iterator[str]:
     """A line of steps.jsonl in words: a line for the step, its certificate and its warnings."""
     from mgs.policy.certificate import Certificate
 
-    names = [step["name"]] if step["name"] else step["seed_names"]
+    names = [step["name"]] if step["name"] else step.get("seed_names", [])
     views = ", ".join(names) if len(names) <= MOST_NAMES else f"{len(names)} views"
     parts = [f"step {step['step']}: {views}"]
     if step["score"] is not None:
@@ -103,7 +103,7 @@ def step_lines(step: Mapping[str, Any]) -> Iterator[str]:
     if "loss" in step:
         passes = step["iterations"] // step["images"]
         parts.append(f"{passes} passes to a loss of {step['loss']:.3g} ({step['stop_reason']})")
-    measured = [key for key in MEASURED if key in step][:2]
+    measured = [key for key in MEASURED if step.get(key) is not None][:2]
     if not measured and (psnr := step.get("prediction", {}).get("psnr")):
         parts.append(f"masked PSNR of views not taken about {psnr:.1f} dB")
     parts += [f"{MEASURED[key]} {step[key]:.2f} dB" for key in measured]

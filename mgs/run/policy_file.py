@@ -5,15 +5,16 @@ from __future__ import annotations
 import inspect
 import sys
 import traceback
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mgs.errors import InputError
+from mgs.errors import InputError, from_interrupt
 from mgs.progress import Stage, report
 from mgs.run.policies import POLICIES, Policy, policy_named
 
@@ -126,17 +127,27 @@ def load(name: str) -> Policy:
             f"policy {name}: no such file {path}; correct the path "
             "(for a run, `policy` in its config.json)"
         )
-    try:
+    with _users_code(name, path):
         module = _executed(path, path.read_bytes())
-    except (Exception, SystemExit) as error:
+        wanted = name.rpartition(":")[2]
+        function = getattr(module, wanted, None)
+        if not callable(function):
+            raise InputError(
+                f"policy {name}: {path} has no function {wanted}; give the name of one that it has"
+            )
+        return Own(name, function() if isinstance(function, type) else function, path)
+
+
+@contextmanager
+def _users_code(name: str, path: Path | None) -> Iterator[None]:
+    """Context manager: turns every error of a policy's file into an InputError, also SystemExit.
+    path: the file; None for a policy in memory, whose errors stay as they are."""
+    try:
+        yield
+    except BaseException as error:
+        if path is None or isinstance(error, InputError) or from_interrupt(error):
+            raise
         raise InputError(f"policy {name}: {_failed(path, error)}") from error
-    wanted = name.rpartition(":")[2]
-    function = getattr(module, wanted, None)
-    if not callable(function):
-        raise InputError(
-            f"policy {name}: {path} has no function {wanted}; give the name of one that it has"
-        )
-    return Own(name, function() if isinstance(function, type) else function, path)
 
 
 @cache
@@ -177,14 +188,21 @@ class Own:
     def __getattr__(self, name: str) -> Any:
         if name not in OPTIONAL:
             raise AttributeError(name)
-        return getattr(self.function, name)
+        value = getattr(self.function, name)
+        return value if name == "geometric" else partial(self._planned, name, value)
+
+    def _planned(self, name: str, method: Callable[..., Any], *arguments: Any) -> Any:
+        """What a method of the object returns; of `plan` a list of views."""
+        with _users_code(self.full, self.path):
+            made = method(*arguments)
+            return [int(view) for view in made] if name == "plan" else made
 
     def __call__(self, scene: Scene, state: State, views: list[int]) -> Any:
         shared = {p: ARGUMENTS[p](scene, state, views) for p in self.parameters if p in ARGUMENTS}
         if "rng" in self.parameters:
             shared["rng"] = scene.rng(state, self.name)
         single = [p for p in self.parameters if p in OF_ONE]
-        try:
+        with _users_code(self.full, self.path):
             if not single:
                 return self.function(**shared)
             scores = []
@@ -193,12 +211,6 @@ class Own:
                 of_one = {p: OF_ONE[p](scene, state, i) for p in single}
                 scores.append(self.function(**shared, **of_one))
             return scores
-        except InputError:
-            raise
-        except (Exception, SystemExit) as error:
-            if self.path is None:
-                raise
-            raise InputError(f"policy {self.full}: {_failed(self.path, error)}") from error
 
 
 def check_policy(name: str) -> None:

@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, PositiveInt, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
 
 from mgs.errors import InputError
 from mgs.files import read_text
@@ -40,6 +40,16 @@ class _End(_Strict):
     given_up: int = 0
 
 
+class _Point(_Strict):
+    """A row of `mgs.policy.certificate.curve`."""
+
+    views: int
+    bound: float
+    plan: float
+    even: float
+    random: float
+
+
 class _Certificate(_Strict):
     """A `mgs.policy.certificate.Certificate`, with prices by name."""
 
@@ -53,7 +63,7 @@ class _Certificate(_Strict):
     nodes: int
     stopped: str
     prices: dict[str, float]
-    curve: list[dict[str, float]] = []
+    curve: list[_Point] = []
 
 
 class _Line(_Strict, extra="allow"):
@@ -66,17 +76,25 @@ class _Line(_Strict, extra="allow"):
     seeds: list[int] | None = None
     seed_names: list[str] = []
     frame: int | None = None
-    name: str | None = None
-    information_gain: float | None = None
+    name: str | None
+    score: float | None
+    information_gain: float | None
+    uncertainty: float = 0.0
     iterations: int = 0
+    loss: float = 0.0
+    residual: float = 0.0
     stop_reason: str = ""
-    exposure: dict[str, list[float]] = {}
+    exposure: dict[str, tuple[float, float, float]] = {}
     prediction: dict[str, float] = {}
-    indicators: dict[str, float | None] = {}
+    indicators: dict[str, float] = {}
     warnings: list[str] = []
-    seconds: dict[str, float] = {}
-    ended: _End | None = None
-    certificate: _Certificate | None = None
+    seconds: dict[str, float]
+    ended: _End = Field(None)  # type: ignore[assignment]  # absent, never null
+    certificate: _Certificate = Field(None)  # type: ignore[assignment]
+
+
+_FIT = {"iterations", "loss", "stop_reason"}
+"""Keys of a line with a fit, which has all of them."""
 
 
 class _Inputs(_Strict):
@@ -108,6 +126,11 @@ class Record(_Strict, extra="forbid"):
         for step, line in enumerate(self.steps):
             if (line.step, line.images) != (step, len(seeds) + step):
                 raise ValueError(f"step {step} has the number {line.step}, {line.images} images")
+            if 0 < len(_FIT & line.model_fields_set) < len(_FIT):
+                raise ValueError(f"step {step} has a part of its fit")
+            measured = {"fitted"} | ({"new", "gain"} if step else set())
+            if line.prediction and not measured <= line.prediction.keys():
+                raise ValueError(f"the prediction of step {step} has not all its numbers")
         if any(line.information_gain is None for line in chosen):
             raise ValueError("a chosen view has no information gain")
         return self
