@@ -62,7 +62,9 @@ def check_place(path: Path) -> None:
     """Raise InputError if writing or removing `path` would leave a folder that this process has
     locked, through a symbolic link, or would replace a device or a pipe."""
     path = Path(os.path.abspath(path))
-    if path.exists() and not (path.is_file() or path.is_dir()):
+    streams = path.parent.resolve()  # /dev/stdout may lead to a file, and would be replaced
+    special = streams == Path("/dev") or Path("/proc") in streams.parents
+    if special or (path.exists() and not (path.is_file() or path.is_dir())):
         raise InputError(f"{path}: is a device or a pipe; name a file to write")
     for root in _held:
         if root in path.parents:
@@ -208,6 +210,11 @@ LARGEST = 1 << 25
 """Most bytes of a text file that is read whole: 30,000 frames of transforms.json."""
 
 
+LARGEST_TOML, LONGEST_LINE = 1 << 16, 1 << 12
+"""Most bytes of a TOML file and of a line. The time of Python's parser grows with the cube of the
+keys of a line, as a.a.a.a = 1."""
+
+
 def read_bytes(path: str | Path, what: str = "file", most: int = LARGEST) -> bytes:
     """Contents of a file. Raises InputError if it is missing, unreadable or larger than `most`."""
     path = Path(path)
@@ -231,7 +238,13 @@ def read_json(path: str | Path) -> Any:
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Contents of a TOML file. Raises InputError if it is missing, unreadable or not valid TOML."""
-    found: dict[str, Any] = _parsed(path, "TOML", lambda data: tomllib.loads(data.decode()))
+
+    def values(data: bytes) -> dict[str, Any]:
+        if max(map(len, data.splitlines()), default=0) > LONGEST_LINE:
+            raise ValueError(f"a line has more than {LONGEST_LINE:,} characters")
+        return tomllib.loads(data.decode())
+
+    found: dict[str, Any] = _parsed(path, "TOML", values, LARGEST_TOML)
     return found
 
 
@@ -255,9 +268,9 @@ def read_xml(path: str | Path) -> Any:
     return _parsed(path, "XML", fromstring)
 
 
-def _parsed(path: str | Path, kind: str, parse: Callable[[bytes], Any]) -> Any:
-    """Contents of a text file. Raises InputError where `parse` fails on them."""
-    data = read_bytes(path)
+def _parsed(path: str | Path, kind: str, parse: Callable[[bytes], Any], most: int = LARGEST) -> Any:
+    """Contents of a text file. Raises InputError where `parse` fails on them, and beyond `most`."""
+    data = read_bytes(path, most=most)
     try:
         with decoding(Path(path)):
             return parse(data)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import codecs
 import struct
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path, PureWindowsPath
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -167,8 +169,12 @@ def _opened(model: Path) -> tuple[Any, dict[int, str]]:
     for file in RECORDS:
         if (model / file).is_file() and not _is_whole(model / file):
             raise InputError(f"{model / file}: is damaged or cut off; export the model again")
-    with parsing(model, "COLMAP model", "export it again"):
-        reconstruction = pycolmap.Reconstruction(model)
+    with parsing(model, "COLMAP model", "export it again"), TemporaryDirectory() as scratch:
+        texts = {path.name: path.read_bytes() for path in model.glob("*.txt")}
+        plain = {name: text.removeprefix(codecs.BOM_UTF8) for name, text in texts.items()}
+        for name, text in plain.items() if plain != texts else ():
+            Path(scratch, name).write_bytes(text)  # pycolmap takes the mark for a word
+        reconstruction = pycolmap.Reconstruction(model if plain == texts else scratch)
     names = {number: image.name for number, image in reconstruction.images.items()}
     if (model / "images.bin").is_file():
         return reconstruction, names
@@ -185,7 +191,7 @@ def _names_in_text(path: Path) -> dict[int, str]:
     """Names of the images in an images.txt by their numbers. Each has two lines, the second for its
     points. Raises InputError where these lines are missing."""
     with reading(path):
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     names, points = dict[int, str](), False
     for line in lines:
         words = line.split(maxsplit=9)

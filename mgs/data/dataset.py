@@ -226,13 +226,13 @@ def posed_camera(
 
 
 def finite_number(where: str, what: str, value: Any) -> float:
-    """A number as float. Raises InputError, which names `what`, for anything else, NaN and
-    infinity."""
+    """A number as float. Raises InputError, which names `what`, for anything else, NaN, infinity,
+    and numbers whose squares may overflow."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         number = math.nan
-    if not math.isfinite(number):
+    if not abs(number) < 1e100:
         raise InputError(f"{where}: {what} is {value!r}, no finite number; correct it")
     return number
 

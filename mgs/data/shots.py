@@ -82,8 +82,10 @@ class Source:
 
     def in_metres(self, unit: float) -> Source:
         """Scale cameras and points by `unit` metres. Raises InputError unless it is positive."""
-        if not 0 < unit < np.inf:
-            raise InputError(f"import: unit {unit} must be a positive number of metres; correct it")
+        if not 1e-9 <= unit <= 1e9:
+            raise InputError(
+                f"import: unit {unit} must be a number of metres, 1e-9 to 1e9; correct it"
+            )
         shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
         sparse, (x, y, z) = self.sparse and self.sparse.scaled(unit), self.origin
         origin = x * unit, y * unit, z * unit

@@ -105,8 +105,9 @@ def unit_up(vector: Sequence[float] | np.ndarray) -> Vector:
         values = np.asarray(vector, np.float64)
     except (TypeError, ValueError):
         values = np.full(3, np.nan)
-    length = np.linalg.norm(values)
-    if values.shape != (3,) or not np.isfinite(values).all() or length == 0:
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(values)
+    if values.shape != (3,) or not np.isfinite(length) or length == 0:
         raise InputError(
             "up: must be three finite numbers that are not all zero; "
             "correct `up`, here or in transforms.json"

@@ -71,7 +71,7 @@ class TrainSettings(BaseModel):
     """Most passes over the images in a fit."""
     tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.01
     """The fit has settled when two passes in a row lower the loss by less than this share."""
-    rates: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = RATES
+    rates: dict[str, Annotated[float, Field(ge=0, le=1e6)]] = RATES
     """Learning rate by kind of parameter, 0: not learned; `mean`, in metres, only if means move."""
     antialiased: bool = True
     """Make Gaussians that are smaller than a pixel fainter, so that near and far views agree. 3DGS

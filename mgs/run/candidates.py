@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mgs.camera import Camera, look_at
 from mgs.data.clouds import towards
-from mgs.data.dataset import load_cameras
+from mgs.data.dataset import finite_number, load_cameras
 from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.world import UPRIGHT, Thing, World
 from mgs.errors import InputError
@@ -116,14 +116,7 @@ def _csv_pose(where: str, index: int, columns: list[str], row: list[str], site: 
         raise InputError(f"{where} has {len(row)} cells, not {len(columns)}; correct it")
     cells = dict(zip(columns, (cell.strip() for cell in row), strict=True))
     name = cells.pop("name", "") or f"pose_{index:04d}"
-    numbers = dict[str, float]()
-    for key, text in cells.items():
-        try:
-            numbers[key] = float(text)
-        except ValueError:
-            numbers[key] = math.nan
-        if not math.isfinite(numbers[key]):
-            raise InputError(f"{where}: {key} is {text!r}, no finite number; correct it")
+    numbers = {key: finite_number(where, key, text) for key, text in cells.items()}
     eye = np.array([numbers[key] for key in POSITION])
     if "qw" not in numbers:
         target = np.array([numbers[key] for key in TARGET]) if "target_x" in numbers else None
