@@ -104,13 +104,18 @@ def load_gaussians(path: str | Path, prior: str | Path | None = None) -> Gaussia
         warnings.warn(notice, Notice, stacklevel=2)
         g = g[good]
     step = np.spacing(np.abs(g.means).max(initial=0))
-    if len(g.means) and step > (size := np.exp(np.median(g.log_scales))) / 2:
+    if len(g.means) and step > (size := _drawn_size(g)) / 2:
         notice = (
             f"{path}: positions of float32 have steps of {step:.2g} so far from the origin, and "
             f"Gaussians are {size:.2g} large; export it with doubles, or nearer to the origin"
         )
         warnings.warn(notice, Notice, stacklevel=2)
     return g.check(path)
+
+
+def _drawn_size(g: Gaussians) -> float:
+    """Median standard deviation of the Gaussians as they are drawn."""
+    return float(np.exp(np.clip(np.median(g.log_scales), *LOG_SCALE_RANGE)))
 
 
 def upward(path: str | Path) -> Vector:
@@ -245,7 +250,7 @@ def _write_spz(path: Path, gaussians: Gaussians) -> None:
     g = mirrored(gaussians, _axes(RUB))
     largest = max(float(np.abs(g.means).max()), 1e-6)
     bits = min(int(np.floor(SPZ_BITS - np.log2(largest * (1 + 1e-6)))), 24)
-    if bits < 0 or 2.0**-bits > np.exp(np.median(g.log_scales)):
+    if bits < 0 or 2.0**-bits > _drawn_size(g):
         raise InputError(
             f"{path}: positions up to {largest:.3g} have steps of {2.0**-bits:.3g} in an SPZ, "
             "coarser than the Gaussians; use ply or glb"

@@ -12,6 +12,7 @@ from program import command, exit_code, said
 from scipy.ndimage import map_coordinates
 
 from mgs.camera import Camera, look_at
+from mgs.cli.suggest import _place
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.frames import Frame
@@ -162,7 +163,12 @@ def test_photographs_alone_get_their_poses_in_metres(frames, placed):
     true = {frame.name: frame.camera for frame in frames}
     assert sorted(frame.name for frame in found.frames) == sorted(true)
     assert (source.unit, source.up) == ("m", (0, 0, 1))
-    offsets, angles = [], []
+    offsets, angles, place = [], [], _place(found.root)
+    for frame in found.frames:
+        east, north, _ = true[frame.name].position
+        latitude, longitude, _ = place.geodetic(frame.camera.position)
+        assert 111_320 * (latitude - 48) == pytest.approx(north, abs=0.1)
+        assert 111_320 * np.cos(np.radians(48)) * (longitude - 11) == pytest.approx(east, abs=0.1)
     middle = np.mean([camera.position for camera in true.values()], axis=0)
     centre = np.mean([frame.camera.position for frame in found.frames], axis=0)
     for frame in found.frames:

@@ -96,7 +96,8 @@ def suggest(
     - views N|auto: Views to plan together, in flying order; with a limit of the flight, at most.
       auto: as few as have the share `enough` of the gain of all candidates.
     - out: New folder for suggestions.json, transforms.json and suggestions.png.
-    - plan: Flight plan to write: .plan, .waypoints or .kml; repeatable. Needs --origin.
+    - plan: Flight plan to write: .plan, .waypoints or .kml; repeatable. Needs --origin, or
+      photographs with GPS.
     - origin: Where the world's origin is: LAT,LON,ALT or, if +Y is not north, ...,BEARING.
     - policy: Default: that of the run, or of `mgs nbv`.
     - prior: Folder of `mgs prior`. Default: DATASET/prior, or one built now.
@@ -105,13 +106,14 @@ def suggest(
     from mgs.data.flight_plan import check_plan_path, parse_origin
 
     console = Terminal()
-    place = parse_origin(origin) if origin else None
+    place = parse_origin(origin) if origin else _place(source) if plan else None
     for path in plan or ():
         check_plan_path(path)
         check_new_file(path, force)
     if plan and place is None:
         raise InputError(
-            "suggest: `plan` needs `origin`, the place of the world's 0 as LAT,LON,ALT"
+            "suggest: `plan` needs `origin`, the place of the world's 0 as LAT,LON,ALT, which "
+            "only photographs with GPS have"
         )
     values = parse_settings(settings, suggest)
     asked = validated(Candidates, values)
@@ -158,6 +160,17 @@ def suggest(
     _print(console, result, run, crossed)
     for written in [*([out] if out else []), *(plan or ())]:
         console.print(f"wrote {written}", soft_wrap=True)
+
+
+def _place(source: Path) -> Any:
+    """Place of the world's origin, as the import of photographs with GPS wrote it; else None."""
+    from mgs.data.dataset import read_records
+    from mgs.data.flight_plan import parse_origin
+    from mgs.run.folder import holds_run, open_run
+
+    root = open_run(source).settings.dataset if holds_run(source) else source
+    text = read_records(root / "transforms.json")[0].get("place")
+    return parse_origin(text) if isinstance(text, str) else None
 
 
 def _run(source: Path, scratch: Path, settings: dict[str, Any], progress: Any) -> Run:

@@ -105,7 +105,8 @@ def import_source(
             )
         world = World(up, source.unit or "unit", source.origin)
         upright = [replace(frame, camera=world.enter(frame.camera)) for frame in frames]
-        write_transforms(out, upright, world)
+        place = {"place": source.place} if source.place and up == PLUS_Z else {}
+        write_transforms(out, upright, world, place)
     return load_dataset(out)
 
 

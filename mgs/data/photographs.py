@@ -99,11 +99,9 @@ def read_photographs(
     result = replace(found, shots=shots, left_out=left_out, notes=tuple(lines))
     if georeferenced is None:
         return result
-    note = (
-        f"GPS gives scale and place: `--origin {georeferenced}` of `mgs suggest` is that of the "
-        "world's 0"
-    )
-    return replace(result, up=PLUS_Z, unit="m", notes=(*result.notes, note))
+    note = f"GPS gives scale and place: the world's 0 is at {georeferenced}"
+    notes = (*result.notes, note)
+    return replace(result, up=PLUS_Z, unit="m", place=georeferenced, notes=notes)
 
 
 def _usable(paths: Sequence[Path]) -> tuple[list[Path], dict[str, str]]:

@@ -65,7 +65,8 @@ class Source:
     sparse: triangulated points. up, unit ("m" or "unit"): None if the source does not say.
     no_cloud: file of points that the source names and that does not exist. tests: names of the
     shots that the source sets apart. origin: what was subtracted from all positions. fit: how well
-    poses and points fit.
+    poses and points fit. place: latitude, longitude and altitude of the world's 0, where +Y is
+    north; empty if unknown.
     """
 
     kind: str
@@ -79,6 +80,7 @@ class Source:
     tests: frozenset[str] = frozenset()
     fit: Agreement | None = None
     origin: Vector = (0.0, 0.0, 0.0)
+    place: str = ""
 
     def in_metres(self, unit: float) -> Source:
         """Scale cameras and points by `unit` metres. Raises InputError unless it is positive."""
@@ -89,7 +91,7 @@ class Source:
         shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
         sparse, (x, y, z) = self.sparse and self.sparse.scaled(unit), self.origin
         origin = x * unit, y * unit, z * unit
-        return replace(self, shots=shots, sparse=sparse, unit="m", origin=origin)
+        return replace(self, shots=shots, sparse=sparse, unit="m", origin=origin, place="")
 
     def with_distance(self, text: str) -> Source:
         """Scale to metres by a known distance between two cameras: A,B,METRES, with the names of
@@ -120,7 +122,7 @@ class Source:
         shots = [replace(shot, camera=shot.camera.seen_from(centre)) for shot in self.shots]
         x, y, z = centre.tolist()
         sparse = self.sparse and replace(self.sparse, points=self.sparse.points - centre)
-        return replace(self, shots=shots, sparse=sparse, origin=(x, y, z))
+        return replace(self, shots=shots, sparse=sparse, origin=(x, y, z), place="")
 
     def without(self, names: Sequence[str]) -> Source:
         """Source without the shots of these images. Raises InputError for an unknown name."""
