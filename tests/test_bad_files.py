@@ -203,6 +203,7 @@ FILES: dict[tuple[Callable[[Path], object], str], list[tuple[str, Write]]] = {
     (read_toml, "a.toml"): [
         ("not valid TOML", holding("a = " + "[" * 5000 + "]" * 5000)),
         ("not valid TOML", holding("a = 1" + "0" * 5000)),
+        ("a line has more than", holding("a." * 5000 + "a = 1")),
     ],
     (read_csv, "a.csv"): [("not valid", holding("a," + "b" * 200_000))],
     (read_xml, "a.xml"): [("not valid", holding(ENTITIES)), ("not valid", holding("<a>" * 9))],

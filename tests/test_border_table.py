@@ -1,9 +1,8 @@
-"""Imports judged by pixels: coloured balls, drawn through lenses of our own formulas, must lie in the
-imported pictures where the imported cameras project them."""
+"""Imports judged by pixels: balls drawn through lenses of our own formulas must lie in the imported
+pictures where the imported cameras project them."""
 
 import codecs
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path

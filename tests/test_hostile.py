@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 import synthetic
 import tiny
-from program import change_steps, command, said
+from program import command, said
 from refusals import refused
 
+from mgs.cli.printing import step_lines
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
 from mgs.files import (
@@ -35,7 +36,11 @@ from mgs.files import (
     write_json,
 )
 from mgs.images import image_size
-from mgs.run.folder import open_run
+from mgs.reports.page_plots import curve_plot
+from mgs.run.checks import predicted_psnr
+from mgs.run.detectors import alarms
+from mgs.run.folder import open_run, text_of
+from mgs.run.records import Record, checked
 from mgs.splat_ply import write_ply
 from mgs.view.subject import read_subject
 
@@ -277,28 +282,73 @@ def test_the_text_files_of_a_stranger(capsys, stranger, file):
             read_subject(stranger)
 
 
-WRONG = {
-    "steps": [
-        {"images": 0}, {"images": "1"}, {"step": "0"}, {"coverage": "much"}, {"coverage": math.nan},
-        {"loss": "small"}, {"score": [1]}, {"psnr": "30"}, {"prediction": {"psnr": "30"}},
-        {"seeds": [0.5]}, {"seconds": [1]}, {"warnings": "one"}, {"ended": {"reason": "tired"}},
-        {"iterations": 1.5}, {"uncertainty": True}, {"exposure": {"kf_0000": 1}},
-    ],
-    "metrics": [
-        {"images": 0}, {"images": True}, {"all": {"psnr": "30"}}, {"views": [{"name": 1}]},
-        {"pictures": "no"}, {"test_views": {}}, {"held_out": None},
-    ],
-}  # fmt: skip
-"""Values of a wrong type in the first step, and in metrics.json."""
+FIT = {"iterations": 6, "loss": 0.1, "stop_reason": "settled", "uncertainty": 0.1, "psnr": 30.0}
+FIT |= {"indicators": {"prior": 0.1}, "warnings": ["one"], "seconds": {"fit": 0.1}}
+SEEDS = {"step": 0, "images": 1, "coverage": 0.5, "seeds": [0], "seed_names": ["a"], **FIT}
+SEEDS |= {"name": None, "score": None, "information_gain": None, "prediction": {"fitted": 0.1}}
+SEEDS["certificate"] = {
+    "criterion": "d-optimal",
+    "views": 1,
+    "candidates": 2,
+    "share": 0.9,
+    "best": 1.0,
+    "nodes": 9,
+    "stopped": "gap",
+    "fewer": None,
+    "of_all": 0.5,
+    "prices": {"b": 0.1},
+    "curve": [{"views": 1, "bound": 0.9, "plan": 0.8, "even": 0.7, "random": 0.6}],
+}
+CHOSEN = {"step": 1, "images": 2, "coverage": 0.9, "frame": 1, "name": "b", "score": 1.0, **FIT}
+CHOSEN |= {"information_gain": 1.0, "exposure": {"a": [1.0, 1.0, 1.0], "b": [1.0, 1.0, 1.0]}}
+CHOSEN |= {"prediction": {"fitted": 0.1, "new": 0.2, "gain": 1.0, "left": 0.5, "psnr": 9.0}}
+CHOSEN["ended"] = {"reason": "budget", "views": 1}
+INPUTS = {"prior": "a", "cameras": {"a": "b"}, "files": {"a": {"image": "b"}}}
+RECORD = {"taken": [0, 1], "steps": [SEEDS, CHOSEN], "inputs": INPUTS, "antialiased": True}
+
+VALUES = [0, -1, 1.5, math.nan, "", "a", True, None, [], [1], ["a"], {}, {"a": 1}, {"a": []}, ...]
 
 
-@pytest.mark.parametrize("change", WRONG["steps"], ids=str)
-def test_a_value_of_a_wrong_type_in_a_step(capsys, stranger, change):
-    change_steps(stranger, lambda lines: [line | change for line in lines])
-    assert "checkpoint.npz: " in refused(capsys, ["nbv", "--resume", stranger], stranger)
+def replaced(data):
+    """The data with each of their values in turn replaced by each of VALUES; ... : left out."""
+    for value in VALUES:
+        if value is not ...:
+            yield value
+    items = data.items() if isinstance(data, dict) else enumerate(data)
+    for key, inner in items if isinstance(data, dict | list) else ():
+        for value in replaced(inner) if isinstance(inner, dict | list) else VALUES:
+            yield {**data, key: value} if isinstance(data, dict) else [*data[:key], value]
+        if isinstance(data, dict):
+            yield {one: data[one] for one in data if one != key}
 
 
-@pytest.mark.parametrize("change", WRONG["metrics"], ids=str)
+def test_no_value_of_a_wrong_type_in_a_step_is_read():
+    """What is read can be printed, drawn and continued."""
+    read = len(checked(Record, json.dumps(RECORD))["steps"]) - 2
+    for data in replaced(RECORD):
+        text = json.dumps(data, default=lambda _: "a")
+        try:
+            steps = checked(Record, text)["steps"]
+        except ValueError:
+            continue
+        read += 1
+        assert all(list(step_lines(step)) for step in steps)
+        if steps[0].get("certificate", {}).get("curve"):
+            curve_plot("a", steps[0]["certificate"])
+        predicted_psnr([step["prediction"] for step in steps if "prediction" in step])
+        json.dumps(alarms({"prior": 0.1}, steps[-1].get("indicators")))
+        text_of(steps)
+    assert 20 < read < 600
+
+
+METRICS = [
+    {"images": 0}, {"images": True}, {"all": {"psnr": "30"}}, {"views": [{"name": 1}]},
+    {"pictures": "no"}, {"test_views": {}}, {"held_out": None},
+]  # fmt: skip
+"""Values of a wrong type in metrics.json."""
+
+
+@pytest.mark.parametrize("change", METRICS, ids=str)
 def test_a_value_of_a_wrong_type_in_metrics(capsys, stranger, change):
     sound = {"images": 3, "all": {"count": 0}, "held_out": {"count": 0}, "views": []}
     write_json(stranger / "metrics.json", sound | change)
@@ -394,7 +444,7 @@ def test_a_scratch_folder_leaves_nothing(tmp_path):
 def test_a_device_is_not_replaced(tmp_path, make):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    for path in (pipe, Path("/dev/null")):
+    for path in (pipe, Path("/dev/null"), Path("/dev/stdout")):
         with pytest.raises(InputError, match="is a device or a pipe"):
             check_writable(path)
         with pytest.raises(InputError, match="is a device or a pipe"), atomic_path(path):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
 
@@ -61,7 +61,7 @@ class _Certificate(_Strict):
     fewer: float | None
     of_all: float
     nodes: int
-    stopped: str
+    stopped: Literal["gap", "nodes", "time"]
     prices: dict[str, float]
     curve: list[_Point] = []
 
