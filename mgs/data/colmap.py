@@ -170,11 +170,12 @@ def _opened(model: Path) -> tuple[Any, dict[int, str]]:
         if (model / file).is_file() and not _is_whole(model / file):
             raise InputError(f"{model / file}: is damaged or cut off; export the model again")
     with parsing(model, "COLMAP model", "export it again"), TemporaryDirectory() as scratch:
-        texts = {path.name: path.read_bytes() for path in model.glob("*.txt")}
-        plain = {name: text.removeprefix(codecs.BOM_UTF8) for name, text in texts.items()}
-        for name, text in plain.items() if plain != texts else ():
-            Path(scratch, name).write_bytes(text)  # pycolmap takes the mark for a word
-        reconstruction = pycolmap.Reconstruction(model if plain == texts else scratch)
+        texts = [path for path in model.glob("*.txt") if path.is_file()]
+        marked = any(_has_mark(path) for path in texts)  # pycolmap takes the mark for a word
+        for path in texts if marked else ():
+            text = path.read_bytes().removeprefix(codecs.BOM_UTF8)
+            Path(scratch, path.name).write_bytes(text)
+        reconstruction = pycolmap.Reconstruction(scratch if marked else model)
     names = {number: image.name for number, image in reconstruction.images.items()}
     if (model / "images.bin").is_file():
         return reconstruction, names
@@ -185,6 +186,12 @@ def _opened(model: Path) -> tuple[Any, dict[int, str]]:
             "read; the file is cut off or damaged, export it again"
         )
     return reconstruction, listed
+
+
+def _has_mark(path: Path) -> bool:
+    """Whether a text begins with the byte-order mark of UTF-8."""
+    with path.open("rb") as file:
+        return file.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8
 
 
 def _names_in_text(path: Path) -> dict[int, str]:
