@@ -7,7 +7,7 @@ import pytest
 
 from mgs.errors import InputError
 from mgs.fit import density, fitting
-from mgs.fit.density import Slopes, adapt
+from mgs.fit.density import Slopes, adapt, split
 from mgs.fit.fitting import fit_gaussians
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.rotation import rotmat_from_quat
@@ -56,6 +56,22 @@ def test_small_ones_are_copied_and_large_ones_divided(mixed):
     for name in ("quats", "logit_opacities", "sh"):
         assert np.array_equal(getattr(new[parts], name), getattr(parents, name))
     assert np.allclose(new[parts].log_scales, parents.log_scales - np.log(1.6), atol=1e-6)
+
+
+def test_halves_have_the_mean_and_nearly_the_covariance_of_the_whole():
+    """The third whose gradient is largest is divided along its longest axes; the faint go."""
+    model, gradient = surface_gaussians(300), np.random.default_rng(0).random(300)
+    model.log_scales[:] = np.log([0.2, 0.3, 0.1])
+    model.logit_opacities[:7], gradient[:7] = -6.0, 0.0
+    new, kept = split(model, slopes(gradient), np.random.default_rng(0))
+    assert np.array_equal(kept[kept >= 0], np.setdiff1d(np.arange(7, 300), ~kept[kept < 0]))
+    one, other = np.array_split(np.flatnonzero(kept < 0), 2)
+    assert {*~kept[one]} == {*~kept[other]} == {*np.argsort(-gradient)[:90]}
+    wholes, apart = model[~kept[one]], new.means[one] - new.means[other]
+    assert np.allclose((new.means[one] + new.means[other]) / 2, wholes.means, atol=1e-6)
+    local = rotmat_from_quat(wholes.quats).transpose(0, 2, 1) @ apart[..., None].astype(float) / 2
+    variances = local[..., 0] ** 2 + np.exp(2.0 * new.log_scales[one])
+    assert np.allclose(variances / [0.04, 0.09, 0.01], [1, 0.92, 1], atol=0.01)
 
 
 def test_the_parts_of_a_divided_gaussian_are_drawn_from_it():

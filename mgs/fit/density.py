@@ -41,6 +41,13 @@ ADAPTION_STEPS, ADAPTION_FROM, ADAPTION_UNTIL = 100, 500, 15_000
 """Steps between two calls of `adapt`, and the steps after and before which it is called; the last
 is half of all steps in a shorter fit."""
 
+GROWTH, APART, SHORTER = 0.3, 0.6, 0.75
+"""Share of the Gaussians that `split` divides, distance of a half from the middle and length of a
+half, over the length of the whole. Chosen constants."""
+
+SPLITS = 6
+"""Times that `split` is called, in the first half of the passes."""
+
 
 @dataclass(frozen=True)
 class Slopes:
@@ -107,6 +114,29 @@ def adapt(
     return new, kept
 
 
+def split(
+    model: Gaussians, found: Slopes, rng: np.random.Generator
+) -> tuple[Gaussians, np.ndarray]:
+    """Divide the GROWTH of all Gaussians whose gradient is largest along their longest axis, into
+    halves of nearly the same mean and covariance; remove the faint."""
+    most = min(round(GROWTH * len(model)), max(found.most - len(model), 0))
+    divided = np.sort(np.argsort(-found.gradient, kind="stable")[:most])
+    whole = np.delete(np.arange(len(model)), divided)
+    source = np.concatenate([whole, divided, divided])
+    new, parts = model[source], slice(len(whole), None)
+    longest = np.argmax(new.log_scales[parts], 1)[:, None]
+    length = np.take_along_axis(new.log_scales[parts], longest, 1)
+    side = np.where(np.arange(2 * most) < most, APART, -APART)[:, None]
+    offsets = np.zeros((2 * most, 3))
+    np.put_along_axis(offsets, longest, side * np.exp(length), 1)
+    new.means[parts] += _rotated(new.quats[parts], offsets)
+    shorter = length + np.log(SHORTER)
+    np.put_along_axis(new.log_scales[parts], longest, shorter, 1)
+    kept = np.where(np.arange(len(source)) < len(whole), source, ~source)
+    alive = new.opacities >= LEAST_OPACITY
+    return (new[alive], kept[alive]) if alive.any() else (new, kept)
+
+
 def _size(model: Gaussians) -> np.ndarray:
     """Largest standard deviation of each Gaussian, metres [N]."""
     return np.exp(model.log_scales.max(1).astype(np.float64))
@@ -130,9 +160,15 @@ def _adaption_times(passes: int, images: int) -> list[int]:
     ]
 
 
+def _split_times(passes: int) -> list[int]:
+    step = max(1, round(passes / 2 / (SPLITS + 1)))
+    return [step * k for k in range(1, SPLITS + 1) if step * k < passes]
+
+
 DENSITIES: dict[str, Density | None] = {
     "fixed": None,
     "adaptive": Density(adapt, _adaption_times),
+    "split": Density(split, lambda passes, _: _split_times(passes)),
 }
 """Density controls by name."""
 

@@ -60,9 +60,10 @@ class TrainSettings(BaseModel):
     means: Literal["frozen", "free"] = "frozen"
     """Whether means are frozen, as in the paper, or free."""
     density: str = "fixed"
-    """Density control of free means: fixed, or adaptive (add and remove as 3DGS)."""
+    """Density control of free means: fixed, split (divide the Gaussians that images pull at most),
+    or adaptive (add and remove as 3DGS)."""
     most_gaussians: Annotated[int, Field(ge=1, le=2**25)] = 200_000
-    """Number of Gaussians beyond which adaptive density adds none."""
+    """Number of Gaussians beyond which a density control adds none."""
     loss: str = "squared"
     """Loss: squared (difference of linear RGB), or l1-dssim (0.8 L1 + 0.2 D-SSIM of sRGB: 3DGS)."""
     optimiser: str = "natural"

@@ -31,9 +31,10 @@ GAUSSIANS = 10_000
 PIXELS = 100
 """Pixels of all images, in the masks, per Gaussian where no number is given. A chosen constant."""
 
-MOST_RANDOM = 0.5
+MOST_RANDOM = 0.1
 """Most random points per point that came with the cameras where no number is given and these are
-many: they hide what is behind them. A chosen constant."""
+many: they hide what is behind them, and a fit splits Gaussians where more are needed. A chosen
+constant."""
 
 FAR = 10.0
 """Radius of the random background, over that of the ball that the cameras look at."""

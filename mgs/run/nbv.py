@@ -248,7 +248,8 @@ def start_fit(
     colours of degree FREE_SH and a looser prior, else frozen. With adaptive density, settings and
     degree are by default those of 3DGS (`as_3dgs`). Photographs without masks are fitted whole,
     from the points that came with the cameras and random ones, unless a prior is given: a surface
-    of the object cannot explain what is around it. Arguments and errors as `start_run`.
+    of the object cannot explain what is around it. Their Gaussians are then split where images need
+    more, unless their number is given. Arguments and errors as `start_run`.
     """
     root, train = Path(dataset), dict(settings.pop("train", {}))
     data, folder = load_dataset(root), Path(prior) if prior is not None else root / "prior"
@@ -264,6 +265,8 @@ def start_fit(
         settings.setdefault("sh", MAX_SH_DEGREE)
     train.setdefault("means", "free" if kind in LOOSE else "frozen")
     loose = 1.0
+    if train["means"] == "free" and kind == "random" and not isinstance(gaussians, int):
+        train.setdefault("density", "split")
     if train["means"] == "free" and kind in LOOSE:
         loose = LOOSE[kind]
         train = FREE_TRAIN | train

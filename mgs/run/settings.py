@@ -122,7 +122,7 @@ class NbvSettings(ModelSettings, Mission):
             raise ValueError(
                 f"train.means {means}: {fixed[0]} has no information about means; leave out either"
             )
-        if density == "adaptive" and (means != "free" or self.budget > 0):
+        if density != "fixed" and (means != "free" or self.budget > 0):
             raise ValueError(
                 f"train.density {density}: needs free means and all images at once; "
                 "give `mgs fit --means free`"
