@@ -15,6 +15,7 @@ from mgs.camera import extent_of
 from mgs.data.dataset import FILES as PATHS
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, write_transforms
 from mgs.data.frames import Frame
+from mgs.data.structure import CLOUD
 from mgs.data.visibility import has_masks
 from mgs.errors import InputError
 from mgs.files import THERE, Ours, atomic_folder, reading, write_json
@@ -265,7 +266,8 @@ def start_fit(
         settings.setdefault("sh", MAX_SH_DEGREE)
     train.setdefault("means", "free" if kind in LOOSE else "frozen")
     loose = 1.0
-    if train["means"] == "free" and kind == "random" and not isinstance(gaussians, int):
+    few = (data.root / CLOUD).is_file() and not isinstance(gaussians, int)
+    if train["means"] == "free" and kind == "random" and few:
         train.setdefault("density", "split")
     if train["means"] == "free" and kind in LOOSE:
         loose = LOOSE[kind]
