@@ -250,11 +250,11 @@ def means_of(rows: Sequence[Row]) -> list[Row]:
     }
     means = []
     for group in grouped(rows, "views", "policy"):
-        of = [
-            row | {"lead": row["psnr"] - base[row["views"], row["scene"], row["draw"]]}
-            for row in group.pop("of")
-        ]
-        for key in ("psnr", "lead"):
+        of = group.pop("of")
+        for row in of:
+            against = base.get((row["views"], row["scene"], row["draw"]))
+            row["lead"] = None if against is None else row["psnr"] - against
+        for key in ("psnr", "lead") if all(row["lead"] is not None for row in of) else ("psnr",):
             draws = [_mean(draw["of"], key) for draw in grouped(of, "draw")]
             low, high = interval(draws) or (None, None)
             group |= {key: _mean(of, key), f"{key}_low": low, f"{key}_high": high}

@@ -83,6 +83,7 @@ def _noted(method, names):
 
 def test_a_split_becomes_test_views(scenes):
     source = read_source(scenes / "ball", test_split="test")
+    assert "--test-split test" in read_source(scenes / "ball").notes[-1]
     train, tests = source.set_apart(None)
     assert (len(train.shots), len(tests.shots)) == (12, 3)
     assert {shot.name for shot in tests.shots} == {f"test_r_{i}" for i in range(3)}

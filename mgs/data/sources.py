@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -103,6 +104,9 @@ def read_source(
         if test_split is not None:
             tests = checked(source, _split_apart(source, images, split, test_split))
             result = result.with_tests(tests)
+        elif (source / "transforms_test.json").is_file() and split == "train":
+            note = "its test split is left out; --test-split test makes it the test views"
+            result = replace(result, notes=(*result.notes, note))
     except OSError as error:
         raise InputError(
             f"{source}: a file of it cannot be read ({error.strerror or error}); correct its name"

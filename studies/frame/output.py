@@ -89,14 +89,16 @@ def scene_mean(key: str, form: str, ends: bool = True, **only: Any) -> Content:
 
 
 def write_table(work: Work, name: str, rows: Sequence[Row], text: str, **more: Any) -> list[Path]:
-    """Write NAME.csv of rows, NAME.md of a text, and NAME.json with both, the command, the machine
-    and more entries. Returns the paths."""
+    """Write NAME.csv of rows with command and commit, NAME.md of a text, and NAME.json with both,
+    the command, the machine and more entries. Returns the paths."""
     out, command = work.out, work.command
     record = {"command": command, "machine": processor(), "versions": versions(), **more}
     write_json(out / f"{name}.json", record | {"rows": rows, "markdown": text})
     write_text(out / f"{name}.md", f"{text}\n`{command}`\n")
-    with_command = [row if "command" in row else row | {"command": command} for row in rows]
-    return [write_csv(out / f"{name}.csv", with_command), out / f"{name}.json", out / f"{name}.md"]
+    origin = {"command": command, "commit": versions().get("commit", "")}
+    paths = [out / f"{name}{end}" for end in (".csv", ".json", ".md")]
+    write_csv(paths[0], [origin | row for row in rows])
+    return paths
 
 
 @dataclass(frozen=True)
