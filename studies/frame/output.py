@@ -97,7 +97,7 @@ def write_table(work: Work, name: str, rows: Sequence[Row], text: str, **more: A
     write_text(out / f"{name}.md", f"{text}\n`{command}`\n")
     origin = {"command": command, "commit": versions().get("commit", "")}
     paths = [out / f"{name}{end}" for end in (".csv", ".json", ".md")]
-    write_csv(paths[0], [origin | row for row in rows])
+    write_csv(paths[0], [row | origin | row for row in rows])
     return paths
 
 
