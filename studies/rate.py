@@ -156,8 +156,12 @@ def by_jpeg(root: Path, out: Path, dataset: str, prior: str, quality: int) -> di
 def picture(root: Path, out: Path, dataset: str, prior: str) -> dict[str, Any]:
     """Task: draw a test view after SENT bytes of one file each, with and without positions, beside
     the truth."""
-    run, view = fitted(root, out, dataset, prior), test_views_of(mgs.load_dataset(root / dataset))
-    frame = view.frames[0]
+    return draw_sent(fitted(root, out, dataset, prior), out)
+
+
+def draw_sent(run: Run, out: Path) -> dict[str, Any]:
+    """Draw OUT/sent.png of a run, as `picture`."""
+    frame = test_views_of(run.dataset).frames[0]
     truth, part = frame.target()[0][..., :3], crop(frame.mask())
     files = {name: compact_run(run, SENT[-1], shared=name == WITH).file for name in (WITH, ALONE)}
     shown = list[tuple[str, str, np.ndarray]]()
@@ -167,7 +171,7 @@ def picture(root: Path, out: Path, dataset: str, prior: str) -> dict[str, Any]:
             path.write_bytes(bytes(file)[:sent])
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", Notice)
-                model = load_gaussians(path, root / prior if name == WITH else None)
+                model = load_gaussians(path, run.settings.prior if name == WITH else None)
             rgb = render_view(model, frame.camera)[0]
             error = np.mean((srgb_from_linear(rgb) - srgb_from_linear(truth)) ** 2)
             title = f"{sent // 1000} kB, {8 * sent / LINK:.0f} s: {-10 * np.log10(error):.1f} dB"

@@ -28,7 +28,7 @@ from mgs.splat import jvp, render, vjp
 from mgs.splat_files import load_gaussians, upward
 
 pytest.importorskip("constriction")
-FILE = Path(__file__).parent / "corpus" / "compact.mgs"
+FILE = Path(__file__).parent / "corpus" / "MGS" / "one.mgs"
 
 
 def scattered(n: int, seed: int = 0, side: int = 64) -> np.ndarray:

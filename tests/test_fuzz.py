@@ -49,6 +49,7 @@ from mgs.reports.page import write_page
 from mgs.reports.runs import compare_runs
 from mgs.run.candidates import Site, read_poses, refusals
 from mgs.run.folder import open_run
+from mgs.splat_files import load_gaussians
 from mgs.splat_ply import read_ply, write_ply
 from mgs.synth.scene_file import load_scene_file
 from mgs.view.subject import read_subject
@@ -265,6 +266,7 @@ LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]]
     "EXR": ("a.exr", exr, read_exr),
     "PLY": ("a.ply", lambda path: write_ply(path, tiny.initial([])), read_ply),
     "compressed PLY": ("c.ply", compressed, read_ply),
+    "MGS": ("a.mgs", lambda path: shutil.copy(CORPUS / "MGS/one.mgs", path), load_gaussians),
     "cloud": ("cloud.ply", cloud, read_cloud),
     "GLB": ("a.glb", mesh, load_mesh),
     "OBJ": ("a.obj", trimesh.creation.icosphere(subdivisions=0).export, load_mesh),
