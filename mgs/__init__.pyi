@@ -44,6 +44,7 @@ from .run.nbv import resume_nbv as resume_nbv
 from .run.nbv import run_nbv as run_nbv
 from .run.nbv import scene_of as scene_of
 from .run.nbv import start_run as start_run
+from .run.policies import AOptimal as AOptimal
 from .run.policies import Cover as Cover
 from .run.policies import Coverage as Coverage
 from .run.policies import DOptimal as DOptimal
@@ -51,7 +52,6 @@ from .run.policies import Farthest as Farthest
 from .run.policies import FisherRF as FisherRF
 from .run.policies import Paper as Paper
 from .run.policies import Random as Random
-from .run.policies import TOptimal as TOptimal
 from .run.policies import Uniform as Uniform
 from .run.settings import Mission as Mission
 from .scene import Scene as Scene

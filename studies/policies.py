@@ -31,8 +31,8 @@ BLOCKS_AT_ONCE = 2048
 """Blocks whose determinants are computed together: 2 MB, which fit into a core's cache."""
 
 
-def a_optimal(F: Array) -> float:
-    """POp-GS's A-optimal (p = -1), 1/l sum F: growth of the trace of the inverse covariance."""
+def t_optimal(F: Array) -> float:
+    """T-optimality, 1/l sum F: growth of the trace of the information; POp-GS calls it A."""
     return float(F.mean(dtype=np.float64))
 
 
@@ -54,7 +54,7 @@ def predicted_variance(F: Array, H: Array, lam: Array, weight: Array) -> float:
     """1/l sum weight [1/(H+lam) - 1/(H+F+lam)], the decrease of the predicted variance of a set of
     views, per parameter (diagonal, linearised).
 
-    weight: mean information of these views [N,P]. With a weight of 1 it is T-optimality.
+    weight: mean information of these views [N,P]. With a weight of 1 it is A-optimality.
     """
     return float((weight * F / ((H + lam) * (H + F + lam))).mean(dtype=np.float64))
 
@@ -173,7 +173,7 @@ def _with_lambda(name: str, criterion: criteria.Score) -> Information:
 
 
 fisherrf_paper = _with_lambda("fisherrf (paper)", criteria.fisherrf)
-popgs_t = _with_lambda("popgs-t", criteria.t_optimal)
+popgs_t = _with_lambda("popgs-t", criteria.a_optimal)
 popgs_d = _with_lambda("popgs-d", criteria.d_optimal)
 
 

@@ -106,10 +106,10 @@ def d_optimal(F: Array, H: Array, lam: Array) -> float:
     return float(np.log1p(F / (H + lam)).mean(dtype=np.float64))
 
 
-def t_optimal(F: Array, H: Array, lam: Array) -> float:
+def a_optimal(F: Array, H: Array, lam: Array) -> float:
     """1/l sum [1/(H+lam) - 1/(H+F+lam)], the decrease of the average variance.
 
-    The paper calls this A-optimal; POp-GS (and here) T-optimal.
+    A-optimality, as in the paper and in textbooks; POp-GS calls it T-optimal.
     """
     return float((F / ((H + lam) * (H + F + lam))).mean(dtype=np.float64))
 

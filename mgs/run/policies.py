@@ -87,9 +87,9 @@ def DOptimal() -> Information:
     return Information("d-optimal", criteria.d_optimal)
 
 
-def TOptimal() -> Information:
-    """Decrease of the average variance (`criteria.t_optimal`)."""
-    return Information("t-optimal", criteria.t_optimal)
+def AOptimal() -> Information:
+    """Decrease of the average variance (`criteria.a_optimal`)."""
+    return Information("a-optimal", criteria.a_optimal)
 
 
 def FisherRF() -> Information:
@@ -223,7 +223,7 @@ POLICIES: dict[str, Policy] = {
         DIRECTIONAL_D,
         Paper(),
         DOptimal(),
-        TOptimal(),
+        AOptimal(),
         FisherRF(),
         Coverage(),
         Cover(),
