@@ -254,7 +254,7 @@ FILES: dict[tuple[Callable[[Path], object], str], list[tuple[str, Write]]] = {
         ("frame 0 lacks fl_x; correct the intrinsics", framed("a.png")),
     ],
     (load_gaussians, "a.ply"): [
-        ("no such file; give a PLY, GLB or SPZ of Gaussians", lambda path: None),
+        ("no such file; give a PLY", lambda path: None),
         ("not a readable 3DGS PLY", replaced(few, b"ply\n", b"solid ply\n")),
         ("property 'opacity' is missing", replaced(few, b"opacity", b"quality")),
         ("1 f_rest properties fit no SH degree", replaced(few, b"opacity", b"f_rest_0")),

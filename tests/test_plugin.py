@@ -196,7 +196,10 @@ def test_files_lie_beside_the_scene(ply, tmp_path):
 PLY = {"filename": "PLY"}
 BAD_FILES = [
     ({}, "mgs_splat: `filename` is missing or no string; name a 3DGS PLY"),
-    ({"filename": "nowhere.ply"}, "nowhere.ply: no such file; give a PLY, GLB or SPZ of Gaussians"),
+    (
+        {"filename": "nowhere.ply"},
+        "nowhere.ply: no such file; give a PLY, GLB, SPZ or MGS of Gaussians",
+    ),
     (PLY | {"depth": "false"}, "mgs_splat: depth 'false' must be a boolean"),
     (PLY | {"background": "white"}, "must be one or three numbers, linear RGB, up to 1,000,000"),
     (PLY | {"colour_space": "Lab"}, "colour_space 'Lab' is unknown; choose linear or srgb"),

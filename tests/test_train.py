@@ -187,7 +187,9 @@ def test_a_fit_whose_loss_rises_has_diverged(truth, cameras, targets):
 @pytest.mark.parametrize("views", [1, 3])
 def test_a_fit_that_leaves_the_numbers_returns_what_it_was_given(truth, cameras, targets, views):
     start = grey(truth)
-    found = fit_gaussians(start, cameras[:views], targets[:views], faster(1e40, optimiser="adam"))
+    rates = {kind: 1e40 * rate for kind, rate in TrainSettings().rates.items()}
+    beyond = TrainSettings(optimiser="adam").model_copy(update={"rates": rates})  # unchecked
+    found = fit_gaussians(start, cameras[:views], targets[:views], beyond)
     assert (found.stop_reason, found.passes) == (StopReason.DIVERGED, 1)
     assert np.isnan(found.losses[1])
     assert found.loss == found.losses[0]

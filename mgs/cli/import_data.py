@@ -52,7 +52,6 @@ def import_data(
     pose: str | None = None,
     exclude: list[str] | None = None,
     refine_poses: bool = False,
-    split: str = "train",
     test_split: str | None = None,
     force: bool = False,
 ) -> None:
@@ -81,7 +80,6 @@ def import_data(
     - exclude NAME: Leave this image out; repeat for more.
     - refine_poses: Adjust the poses that came with the images, also those of test views, to the
       points that pictures share; for poses that are a little wrong. Needs texture.
-    - split: Split of NeRF-synthetic data to import: train, val or test.
     - test_split: Split of NeRF-synthetic data that becomes the test views; publications take test.
     """
     from mgs.data.agreement import agreement
@@ -111,7 +109,6 @@ def import_data(
         shots = read_source(
             source,
             images,
-            split,
             keyframes=keyframes,
             unpack=unpacked,
             pose=pose,

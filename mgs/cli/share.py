@@ -46,7 +46,7 @@ def export(
       Those of a linear run are fitted once more, blended in sRGB.
     - sh: Raise the SH degree, for programs that read degree 3 only.
     - views: Views of nerfstudio and colmap: those taken, or all.
-    - bytes N|Nk|NM: Write the best model of at most so many bytes, as in 40k.
+    - most N|Nk|NM: Write the best model of at most so many bytes, as in 40k.
     - psnr: Write the smallest model of so many dB in the views taken.
     - shared_prior: With these: the reader has the run's prior, and no positions are written.
     - prior: Folder of the prior that an mgs file was written with, to read it.

@@ -72,10 +72,13 @@ RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
 """Recordings of robots: kind -> (whether a path is one, its reader)."""
 
 
+TRAINING = "transforms_train.json"
+"""The training split of NeRF-synthetic data."""
+
+
 def read_source(
     source: str | Path,
     images: Path | None = None,
-    split: str = "train",
     *,
     keyframes: str = "0.5s",
     unpack: Path | None = None,
@@ -85,11 +88,11 @@ def read_source(
 ) -> Source:
     """Recognise the format of a source, and read its cameras and file names.
 
-    source: a transforms.json or its folder; a folder with NeRF-synthetic's transforms_SPLIT.json;
+    source: a transforms.json or its folder; a folder with NeRF-synthetic's transforms_train.json;
     a folder with a COLMAP model in itself, sparse/ or sparse/N/; one of RECORDINGS; or a folder of
     photographs alone. images: the image folder, by default SOURCE/images, or that of the names in
-    transforms.json; of a bag the topic. split: train, val or test. test_split: the split that is
-    set apart as test views. keyframes: `Spacing` of a recording. unpack: folder for the images of a
+    transforms.json; of a bag the topic. test_split: the split of NeRF-synthetic data that is set
+    apart as test views. keyframes: `Spacing` of a recording. unpack: folder for the images of a
     bag and the matches of photographs, by default SOURCE.unpacked. pose: topic of a bag's poses.
     exclude: names of images to leave out. Raises InputError if no format is recognised, no image
     exists, a frame is listed twice, a camera model is not supported, photographs cannot be placed,
@@ -98,13 +101,11 @@ def read_source(
     source = Path(source)
     source.exists()  # an OSError of the source itself is not one of a file that it names
     try:
-        result = checked(
-            source, _recognised(source, images, split, keyframes, unpack, pose, exclude)
-        )
+        result = checked(source, _recognised(source, images, keyframes, unpack, pose, exclude))
         if test_split is not None:
-            tests = checked(source, _split_apart(source, images, split, test_split))
+            tests = checked(source, _split_apart(source, images, test_split))
             result = result.with_tests(tests)
-        elif (source / "transforms_test.json").is_file() and split == "train":
+        elif (source / "transforms_test.json").is_file():
             note = "its test split is left out; --test-split test makes it the test views"
             result = replace(result, notes=(*result.notes, note))
     except OSError as error:
@@ -119,7 +120,6 @@ def read_source(
 def _recognised(
     source: Path,
     images: Path | None,
-    split: str,
     keyframes: str,
     unpack: Path | None,
     pose: str | None,
@@ -134,7 +134,7 @@ def _recognised(
     if source.suffix.lower() in PICTURE_SUFFIXES and source.is_file():
         raise InputError(f"{source}: is one picture; give the folder of all photographs")
     path = source if source.is_file() else source / "transforms.json"
-    split_path = source / f"transforms_{split}.json"
+    split_path = source / TRAINING
     folder = unpack or source.with_name(f"{source.name}.unpacked")
     recording = next((kind for kind, (fits, _) in RECORDINGS.items() if fits(source)), None)
     if recording is not None:
@@ -152,17 +152,17 @@ def _recognised(
         return read_photographs(images or source, paths, folder / "matches", exclude)
     raise InputError(
         f"{source}: holds no photographs (PNG, JPEG, TIFF, WebP), transforms.json, "
-        f"transforms_{split}.json or COLMAP model (cameras, images and points3D, .bin or .txt, in "
+        f"{TRAINING} or COLMAP model (cameras, images and points3D, .bin or .txt, in "
         f"sparse/0, sparse or the folder itself), and is no {', '.join(RECORDINGS)}"
     )
 
 
-def _split_apart(source: Path, images: Path | None, split: str, test_split: str) -> Source:
+def _split_apart(source: Path, images: Path | None, test_split: str) -> Source:
     """The split of NeRF-synthetic data that becomes test views. Raises InputError where it is the
     training split, or does not exist."""
     path = source / f"transforms_{test_split}.json"
-    if test_split == split or not path.is_file():
-        fault = "is the training split" if test_split == split else f"there is no {path}"
+    if path.name == TRAINING or not path.is_file():
+        fault = "is the training split" if path.name == TRAINING else f"there is no {path}"
         raise InputError(f"--test-split {test_split}: {fault}; give another, or --test-every N")
     return _read_transforms(path, images)
 
