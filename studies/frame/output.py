@@ -146,7 +146,8 @@ def draw_panels(path: Path, panels: Sequence[Panel], rows: Sequence[Row], title:
         for axis, (panel, chosen) in zip(axes, drawn, strict=False):
             (_draw_lines if _numeric(panel, chosen) else _draw_names)(axis, panel, chosen)
             if panel.by and not shared:
-                axis.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
+                across = _legend_columns(_groups(panel, chosen))
+                axis.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=across)
                 title = title or panel.title
             else:
                 axis.set_title(panel.title)
@@ -207,10 +208,16 @@ def _groups(panel: Panel, rows: Sequence[Row]) -> list[Any]:
     return list(dict.fromkeys(row[panel.by] for row in rows)) if panel.by else [None]
 
 
+def _legend_columns(groups: Sequence[Any]) -> int:
+    """Columns of a legend that is no wider than its plot."""
+    return 1 if max(len(str(group)) for group in groups) > 15 else 2
+
+
 def _size(panel: Panel, rows: Sequence[Row]) -> tuple[float, float]:
     """Width and height of a plot with its legend, inches."""
     groups, names = len(_groups(panel, rows)), list(dict.fromkeys(row[panel.x] for row in rows))
-    legend = 0.17 * ((groups + 1) // 2) if panel.by else 0.0
+    across = _legend_columns(_groups(panel, rows))
+    legend = 0.17 * -(-groups // across) if panel.by else 0.0
     if _numeric(panel, rows):
         return WIDTH, HEIGHT + legend
     height = 0.8 + PER_NAME * len(names) * max(1.0, 0.6 * groups)
