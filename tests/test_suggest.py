@@ -86,6 +86,17 @@ def test_as_few_views_are_planned_as_have_a_share_of_what_all_would_give(run, si
     assert later.settings.budget == 6
 
 
+def test_candidates_of_one_pose_are_one_and_those_that_see_nothing_none(run, site):
+    ring = place_poses("ring", 3, 2.6, (25, 35), site)
+    away = replace(ring[0][1], world_to_camera=look_at([9, 0, 1], [18, 0, 1]))
+    result = suggest(open_run(run), [*ring, ("again", ring[1][1]), ("away", away)])
+    assert len(result.ranking) == 3
+    assert sorted(result.dropped.items()) == [
+        ("sees nothing of the object", 1),
+        ("the same as one before", 1),
+    ]
+
+
 def test_a_coarse_model_keeps_the_best(run, site, monkeypatch):
     opened, dome = open_run(run), place_poses("dome", 20, 2.6, (10, 80), site)
     thin, rows = coarse_prior(opened.prior, 100)

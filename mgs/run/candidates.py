@@ -221,8 +221,15 @@ def refusals(
         f"nearer to it than {safe_distance:.3g}": near,
         f"not between {low:g} and {high:g} degrees": beyond,
         "taken already": _are_taken(poses, taken, far),
+        "the same as one before": _are_repeated(poses),
     }
     return [next((why for why, hit in reasons.items() if hit[k]), "") for k in range(len(poses))]
+
+
+def _are_repeated(poses: Sequence[Named]) -> list[bool]:
+    """Whether an earlier candidate has the same pose."""
+    keys = [camera.world_to_camera.tobytes() for _, camera in poses]
+    return [keys.index(key) < k for k, key in enumerate(keys)]
 
 
 def _are_taken(
