@@ -176,7 +176,7 @@ def _opened(model: Path) -> tuple[Any, dict[int, str]]:
             text = path.read_bytes().removeprefix(codecs.BOM_UTF8)
             Path(scratch, path.name).write_bytes(text)
         reconstruction = pycolmap.Reconstruction(scratch if marked else model)
-    names = {number: image.name for number, image in reconstruction.images.items()}
+        names = {number: image.name for number, image in reconstruction.images.items()}
     if (model / "images.bin").is_file():
         return reconstruction, names
     listed = _names_in_text(model / "images.txt")  # pycolmap ends names at a space

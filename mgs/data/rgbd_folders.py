@@ -136,7 +136,7 @@ def read_open3d(folder: Path, spacing: Spacing) -> Source:
     path = folder / "trajectory.log"
     words = [word for line in rows(path, 3) for word in line]
     values = numbers(path, words)
-    if len(values) % 19:
+    if not len(values) or len(values) % 19:
         raise InputError(
             f"{path}: needs three numbers and a 4x4 matrix for each image; record it again"
         )
