@@ -191,7 +191,8 @@ def of_recording(path: Path) -> None:
     """Read the recording of which a file is one, as far as the sizes of its images."""
     alone, deep = path.suffix in (".bag", ".xml"), path.parent.name == "rtabmap_calib"
     root = path if alone else path.parents[deep]
-    for shot in read_source(root, unpack=root.parent / "unpacked").shots:
+    pose = "/slam/pose" if path.suffix == ".mcap" else None
+    for shot in read_source(root, unpack=root.parent / "unpacked", pose=pose).shots:
         image_size(shot.image)
 
 
