@@ -45,7 +45,7 @@ SCALES = (0.01, 0.03, 0.08, 0.2)
 """Scales of the steps (`mgs.compact.encode.Encoder.file`)."""
 
 QUALITIES = (50,)
-"""Of JPEG."""
+"""JPEG qualities, 0 to 100."""
 
 AUTO = "auto"
 """Automatic number of Gaussians."""

@@ -19,7 +19,7 @@ from mgs.data.dataset import load_dataset
 from mgs.images import read_depth
 
 RADIUS = 0.09
-"""Of a ball, metres."""
+"""Radius of a ball, metres."""
 
 rng = np.random.default_rng(5)
 BALLS = np.array([[x, y, z] for x in (-0.5, 0, 0.5) for y in (-0.4, 0.4) for z in (0.1, 0.7)])

@@ -323,7 +323,7 @@ def replaced(data):
 
 
 def test_no_value_of_a_wrong_type_in_a_step_is_read():
-    """What is read can be printed, drawn and continued."""
+    """Print, draw and continue whatever is read."""
     read = len(checked(Record, json.dumps(RECORD))["steps"]) - 2
     for data in replaced(RECORD):
         text = json.dumps(data, default=lambda _: "a")

@@ -157,7 +157,7 @@ POSES = {
     "camera": lambda bag, k, time, body: bag.stamped("/slam/pose", time, body @ MOUNT),
     "goal": lambda bag, k, time, body: k or bag.stamped("/goal_pose", 99.5, np.eye(4)),
 }
-"""What a robot may record of where it is, at each frame."""
+"""Writers of the pose topics of a robot, called at each frame."""
 
 
 def write_bag(

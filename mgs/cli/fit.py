@@ -77,7 +77,7 @@ def fit(
 
 
 def moves_in_words(moves: dict[str, dict[str, float]], unit: str) -> str:
-    """How far poses were moved, in the mean and most. moves: by frame, degrees and length."""
+    """Format the mean and largest move of poses. moves: by frame, degrees and length."""
     name = max(moves, key=lambda one: moves[one]["degrees"])
     degrees, length = (
         sum(move[key] for move in moves.values()) / len(moves) for key in ("degrees", "length")

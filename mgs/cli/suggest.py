@@ -57,7 +57,7 @@ class Candidates(BaseModel):
     certificate: SearchLimits = SearchLimits()
     """Limits of the search for a better set than the plan."""
     enough: Annotated[float, Field(gt=0, le=1)] | None = None
-    """With --views auto: share of the criterion's gain of all candidates. Default: 0.95."""
+    """Share of the criterion's gain of all candidates, with --views auto. Default: 0.95."""
 
     @field_validator("elevations")
     @classmethod

@@ -1,4 +1,4 @@
-"""Where bits buy most: steps of the coefficients by what errors cost, and the order of packets.
+"""Allocation of bits: steps of the coefficients by what errors cost, and order of the packets.
 
 Let h be the squared change of the images by a unit change of a coefficient. With steps c / sqrt(h)
 every rounding costs the same, c^2 / 12, which spends bits best (reverse water-filling, Cover and

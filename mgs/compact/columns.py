@@ -32,7 +32,7 @@ UNIT = 20
 
 @dataclass(frozen=True)
 class Start:
-    """What sender and receiver both make of a prior: where Gaussians start.
+    """Start of the Gaussians, which sender and receiver both compute from a prior.
 
     means: [N,3] metres, upright world. quats: [N,4] wxyz of any norm. layer: [N] 1 behind the
     surface, else 0. digest: hash of the samples. inset: depth below the mesh, metres.

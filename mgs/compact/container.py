@@ -53,7 +53,7 @@ Key = tuple[int, str, int]
 
 @dataclass(frozen=True)
 class Header:
-    """What all packets need. steps: [BANDS,C] codes, uint8; see `Header.step`. The rest as in
+    """Data that all packets need. steps: [BANDS,C] codes, uint8; see `Header.step`. The rest as in
     `HEAD`."""
 
     flags: int

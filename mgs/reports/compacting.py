@@ -27,8 +27,8 @@ VIEWS = 16
 """Most views, evenly spread over those taken, in which errors are weighed."""
 
 NOISES = (PRUNE_NOISE, 4 * PRUNE_NOISE)
-"""Where positions are sent, each Gaussian costs a byte or more: as many are removed as change the
-views taken by so much (`mgs.fit.pruning.prune`), whichever of these gives the better model."""
+"""Changes of the views taken that pruning may make (`mgs.fit.pruning.prune`) where positions are
+sent, since each Gaussian then costs a byte or more. The one with the better model is taken."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def encoders(
 
 
 def _start(run: Run, g: Gaussians) -> Start | None:
-    """Where the prior places the Gaussians of a run; None if they are elsewhere."""
+    """Anchors of a run's Gaussians on its prior; None if they are elsewhere."""
     prior, count = run.prior, len(run.prior.points)
     if prior.kind == "random" or len(g) != count + prior.backed:
         return None

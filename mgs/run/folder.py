@@ -245,7 +245,7 @@ class Run:
 
     @cached_property
     def poses_moved(self) -> dict[str, dict[str, float]]:
-        """How far each pose was moved by `refine_poses`, "degrees" and "length", by frame name."""
+        """Move of each pose by `refine_poses`, "degrees" and "length", by frame name."""
         path = self.settings.dataset / POSES
         if not self.settings.refine_poses:
             return {}

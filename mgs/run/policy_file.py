@@ -192,7 +192,7 @@ class Own:
         return value if name == "geometric" else partial(self._planned, name, value)
 
     def _planned(self, name: str, method: Callable[..., Any], *arguments: Any) -> Any:
-        """What a method of the object returns; of `plan` a list of views."""
+        """Call a method of the object; the result of `plan` becomes a list of views."""
         with _users_code(self.full, self.path):
             made = method(*arguments)
             return [int(view) for view in made] if name == "plan" else made

@@ -71,7 +71,7 @@ class Mission(BaseModel):
     budget: Annotated[int, Field(ge=0)] = 50
     """Most views to choose beyond the seed views. Default: 50, or all candidates if fewer."""
     enough: Annotated[float, Field(gt=0, le=1)] | None = None
-    """With an automatic number of views: share of the criterion's gain of all candidates. Default:
+    """Share of the criterion's gain of all candidates, with an automatic number of views. Default:
     0.95."""
     certificate: SearchLimits = SearchLimits()
     """Limits of the search for a better set than the plan."""
@@ -111,7 +111,7 @@ class NbvSettings(ModelSettings, Mission):
     refine_poses: bool = False
     """Refine the poses of all views before the fit, by the images."""
     pose_noise: PoseNoise = PoseNoise()
-    """How wrong poses that are refined may be."""
+    """Standard deviations of the poses that are refined."""
 
     @model_validator(mode="after")
     def _go_together(self) -> NbvSettings:
