@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from mgs.cli.nbv import resume_and_print, start_and_print
 from mgs.cli.options import Settings, merged, not_none, parse_gaussians, parse_settings, with_keys
 from mgs.run.settings import NbvSettings
-
-if TYPE_CHECKING:
-    pass
 
 
 @with_keys(
