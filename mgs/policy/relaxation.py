@@ -99,7 +99,7 @@ class Relaxation:
         """phi of each Gaussian without a candidate [N]."""
 
         def part(some: slice) -> Floats:
-            return self._phi(self.base[some], some)[0]
+            return self._value(self.base[some], np.linalg.inv(self.base[some]), some)
 
         return np.concatenate(in_parts(len(self.base), part))
 
@@ -110,7 +110,8 @@ class Relaxation:
         def part(some: slice) -> float:
             z = self.vectors(some)[:, taken]
             A = self.base[some] + z.transpose(0, 2, 1) @ z
-            return float((self._phi(A, some)[0] - self.before[some]).sum())
+            value = self._value(A, np.linalg.inv(A), some)
+            return float((value - self.before[some]).sum())
 
         return sum(in_parts(len(self.base), part))
 
@@ -202,12 +203,17 @@ class Relaxation:
         """phi at A [n,K,K]; P [n,K,K] with d phi = trace(P dA); and Q, R [n,K,K] with
         d^2 phi = -(z_u^T Q z_v) (z_u^T R z_v) for views u and v."""
         S = np.asarray(np.linalg.inv(A), np.float64)
+        value = self._value(A, S, some)
         if self.over is None:
-            value = self.scale * np.linalg.slogdet(A)[1]
             return value, self.scale * S, (S, self.scale * S)
-        M = self.over[some]
-        slope, value = self.scale * (S @ M @ S), -self.scale * np.einsum("nkl,nkl->n", S, M)
+        slope = self.scale * (S @ self.over[some] @ S)
         return value, slope, (S, 2 * slope)
+
+    def _value(self, A: Floats, S: Array, some: slice) -> Floats:
+        """phi at A [n,K,K], of inverse S [n,K,K]."""
+        if self.over is None:
+            return np.asarray(self.scale * np.linalg.slogdet(A)[1])
+        return np.asarray(-self.scale * np.einsum("nkl,nkl->n", S, self.over[some]))
 
 
 def _largest(prices: Floats, lo: Floats, hi: Floats, k: int) -> Floats:

@@ -56,7 +56,7 @@ class SearchLimits(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     nodes: Annotated[int, Field(ge=0)] | None = None
-    """Most nodes of branch and bound. Default: about ten seconds of them on a laptop."""
+    """Most nodes of branch and bound. Default: 40, or about a second of them."""
     seconds: Positive | None = None
     """Most seconds; results then depend on the machine. Default: no limit."""
 
