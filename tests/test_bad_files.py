@@ -27,7 +27,7 @@ from mgs.files import read_csv, read_json, read_toml, read_xml
 from mgs.images import read_exr, write_exr
 from mgs.prior.build import load_prior, prior_from_mesh
 from mgs.prior.settings import PriorSettings
-from mgs.splat_files import load_gaussians
+from mgs.splat_files import load_gaussians, write_gaussians
 from mgs.splat_ply import read_ply, write_compressed_ply
 from mgs.synth.rock import load_rock
 from mgs.synth.scene_file import Rock
@@ -74,13 +74,18 @@ def window(*corners: int) -> bytes:
     return b"dataWindow\0box2i\0" + struct.pack("<5i", 16, *corners)
 
 
-def endless_mesh(path: Path) -> None:
-    """A GLB file whose arrays are said to have 10^11 numbers."""
-    square(path)
+def endless_splats(path: Path) -> None:
+    write_gaussians(path, gaussians(0), "glb", np.eye(3))
+    endless_mesh(path, lambda path: path)
+
+
+def endless_mesh(path: Path, write: Write = square) -> None:
+    """A GLB file whose arrays are said to have 10^12 numbers."""
+    write(path)
     content, body = parts_of(path)
     for one in content["accessors"]:
         del one["bufferView"]
-        one["count"] = 10**11
+        one["count"] = 10**12
     path.write_bytes(glb(content, body))
 
 
@@ -101,6 +106,16 @@ def names_a_pipe(path: Path) -> None:
 def archive(path: Path) -> None:
     (path.parent / "inside").mkdir()
     shutil.make_archive(str(path.with_suffix("")), "zip", path.parent / "inside")
+
+
+def compressed_mesh(path: Path) -> None:
+    """Its positions are in a buffer that a decoder would fill."""
+    square(path)
+    content, body = parts_of(path)
+    view = content["bufferViews"][1]
+    view |= {"buffer": 1, "extensions": {"EXT_meshopt_compression": {"buffer": 0}}}
+    content["buffers"].append({"byteLength": 999})
+    path.write_bytes(glb(content, body))
 
 
 def corner(mode: int, **more: object) -> Write:
@@ -227,6 +242,9 @@ FILES: dict[tuple[Callable[[Path], object], str], list[tuple[str, Write]]] = {
     (read_mesh, "a.glb"): [
         ("has no faces", trimesh.PointCloud(np.eye(3)).export),
         ("not points or lines", corner(3)),
+        ("glTF extension EXT_meshopt_compression", compressed_mesh),
+        ("a skin or morph targets", corner(6, nodes=[{"mesh": 0, "skin": 0}])),
+        ("a skin or morph targets", corner(6, nodes=[{"mesh": 0, "weights": [0, 0.5]}])),
         *EXTENSIONS,
     ],
     (load_mesh, "a.glb"): [
@@ -276,6 +294,7 @@ FILES: dict[tuple[Callable[[Path], object], str], list[tuple[str, Write]]] = {
     (load_gaussians, "a.ksplat"): [("npx @playcanvas/splat-transform", holding(b"\0" * 64))],
     (load_gaussians, "a.glb"): [
         ("not a readable GLB", holding("glTF")),
+        ("GiB that are free", endless_splats),
         ("not a readable GLB", holding(glb([]))),
         ("no Gaussians in it", primitive()),
         ("not a readable GLB", primitive(**SPLATS)),

@@ -118,7 +118,7 @@ def test_a_single_triangle_and_a_fold_are_sampled(dataset, tmp_path):
 
 QUAD = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
-FLOAT, SHORT, USHORT, UINT = 5126, 5122, 5123, 5125
+FLOAT, BYTE, SHORT, USHORT, UINT = 5126, 5120, 5122, 5123, 5125
 RED, GREEN = (200, 60, 60), (60, 170, 60)
 
 
@@ -154,7 +154,7 @@ class Made:
         return len(self.json["bufferViews"]) - 1
 
     def add(self, values: np.ndarray, component: int = FLOAT, **more) -> int:
-        dtype = {FLOAT: "<f4", SHORT: "<i2", USHORT: "<u2", UINT: "<u4"}[component]
+        dtype = {FLOAT: "<f4", BYTE: "i1", SHORT: "<i2", USHORT: "<u2", UINT: "<u4"}[component]
         kind = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}[values[0].size]
         made = {"componentType": component, "count": len(values), "type": kind} | more
         if "sparse" not in more:
@@ -195,16 +195,20 @@ def sparse(path):
     return made.write(path, {"attributes": {"POSITION": few}, "mode": 6})
 
 
-def quantised(path):
+def quantised(path, component=SHORT, most=32767):
     """As gltfpack: whole numbers with padding, scaled and shifted by the node."""
     made = Made()
     rows = np.zeros((4, 4))
-    rows[:, :3] = np.round((QUAD - [0.5, 0.5, 0]) / 0.5 * 32767)
-    made.add(rows, SHORT, type="VEC3", normalized=True)
-    made.json["bufferViews"][0]["byteStride"] = 8
+    rows[:, :3] = np.round((QUAD - [0.5, 0.5, 0]) / 0.5 * most)
+    made.add(rows, component, type="VEC3", normalized=True)
+    made.json["bufferViews"][0]["byteStride"] = len(made.body) // 4
     made.json["nodes"][0] |= {"scale": [0.5] * 3, "translation": [0.5, 0.5, 0]}
     needs = {"extensionsRequired": ["KHR_mesh_quantization"]}
     return made.write(path, {"attributes": {"POSITION": 0}, "mode": 6}, **needs)
+
+
+def bytes_of_8_bits(path):
+    return quantised(path, BYTE, 127)
 
 
 def nested(path):
@@ -216,7 +220,10 @@ def nested(path):
     return made.write(path, primitive, nodes=[turn, back])
 
 
-@pytest.mark.parametrize("form", [plain, fan, strip_beside_a_line, sparse, quantised, nested])
+FORMS = [plain, fan, strip_beside_a_line, sparse, quantised, bytes_of_8_bits, nested]
+
+
+@pytest.mark.parametrize("form", FORMS)
 def test_a_square_in_every_form(tmp_path, form):
     mesh = load_mesh(form(tmp_path / "x.glb"))
     flipped = np.sign(mesh.vertices @ [1, 0, 0]).sum() < 0  # the nested one is turned to -x
@@ -289,6 +296,10 @@ def test_colours_of_a_material(tmp_path):
     product = load_mesh(coloured(path, factor=half, texture=image))
     expected = 255 * srgb_from_linear(linear_from_srgb(np.divide(RED, 255)) * half)
     np.testing.assert_allclose(colour_at(product, 0.8), expected, atol=0.51)
+    file = io.BytesIO()
+    Image.fromarray(np.full((8, 8), 40_000, np.uint16)).save(file, "PNG")
+    grey = load_mesh(coloured(path, texture=file.getvalue()))
+    np.testing.assert_allclose(colour_at(grey, 0.3), 40_000 / 257, atol=0.51)
     rows = np.tile(np.round(65535 * linear_from_srgb(np.divide(RED, 255))), (4, 1))
     vertices = load_mesh(coloured(path, colours=np.column_stack([rows, [65535] * 4])))
     np.testing.assert_allclose(colour_at(vertices, 0.3), RED, atol=0.51)

@@ -81,8 +81,10 @@ class Gltf:
         found = self.json["bufferViews"][view]
         index, start = found["buffer"], found.get("byteOffset", 0)
         if index not in self._buffers:
-            uri = self.json["buffers"][index].get("uri")
-            self._buffers[index] = self.binary if uri is None else self.file(uri)
+            buffer = self.json["buffers"][index]
+            if index > 0 and "uri" not in buffer:  # what a decoder would fill
+                raise self.unread(next(iter(found.get("extensions", {})), "of its buffer"))
+            self._buffers[index] = self.file(buffer["uri"]) if "uri" in buffer else self.binary
         data = self._buffers[index][start : start + found["byteLength"]]
         if start < 0 or len(data) != found["byteLength"]:
             raise ValueError("a buffer view lies outside its buffer")
@@ -136,6 +138,12 @@ class Gltf:
             seen.add(index)
             here = above @ node_matrix(node)
             if "mesh" in node:
+                mesh = meshes[node["mesh"]]
+                if "skin" in node or any(node.get("weights", mesh.get("weights", ()))):
+                    raise InputError(
+                        f"{self.path}: a skin or morph targets change its shape; apply them and "
+                        "export it again"
+                    )
                 for instance in self._instances(node):
                     yield node["mesh"], here @ instance
             waiting += [(child, here, depth + 1) for child in reversed(node.get("children", []))]

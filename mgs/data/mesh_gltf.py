@@ -156,4 +156,6 @@ def _image(gltf: Gltf, texture: int) -> Image.Image:
     data = gltf.bytes_of(one["bufferView"]) if "bufferView" in one else gltf.file(one["uri"])
     with Image.open(BytesIO(data)) as opened:
         check_pixels(gltf.path, *opened.size)
+        if opened.mode in ("I", "I;16"):  # which Pillow would cut at 255
+            return Image.fromarray(np.uint8(np.asarray(opened) / 257 + 0.5)).convert("RGB")
         return opened.convert("RGB")
