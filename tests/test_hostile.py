@@ -17,7 +17,7 @@ import pytest
 import synthetic
 import tiny
 from program import command, said
-from refusals import refused
+from refusals import listing, refused
 
 from mgs.cli.printing import step_lines
 from mgs.data.dataset import load_dataset
@@ -228,27 +228,41 @@ def test_two_commands_on_one_run(capsys, stranger, monkeypatch):
 
 
 LINKED = {
-    "eval": (".lock", "renders"),
-    "diagnose": ("diagnostics", "diagnostics/.lock"),
-    "simplify": (".lock",),
-    "nbv --resume": (".lock",),
-    "prior": ("dataset/prior", "dataset/.prior.part", "dataset/.prior.old"),
-    "survey": ("dataset/survey", "dataset/.survey.part"),
+    "eval {run}": (".lock", "renders"),
+    "diagnose {run} --force": ("diagnostics", "diagnostics/.lock"),
+    "simplify {run} --force": (".lock",),
+    "nbv --resume {run}": (".lock",),
+    "prior {data} --force": ("dataset/prior", "dataset/.prior.part", "dataset/.prior.old"),
+    "survey {data} --force": ("dataset/survey", "dataset/.survey.part"),
+    "fit {data} --prior {prior} --out {run}/fit": (".fit.part", ".fit.old"),
+    "synth-orbit {run}/new": ("new/.lock",),
+    "render {run} --out {run}/new --force": ("new/.lock",),
+    "import {data} --out {run}/new": ("new.unpacked", "new/.lock"),
+    "video {run} --seconds 0.1 --width 16 --force": ("video.mp4",),
+    "report {run} --html {run}/a.html --force": ("a.html",),
 }
+"""Command -> names below the run that are links; those of a file are replaced themselves."""
+LINKS = [(words, place) for words, places in LINKED.items() for place in places]
 
 
-@pytest.mark.parametrize(("name", "place"), [(n, one) for n in LINKED for one in LINKED[n]])
-def test_no_command_writes_through_a_link(stranger, dataset, tmp_path, name, place, capsys):
-    """The link leads to a folder, or for a lock to a file, that stays as it is."""
-    shutil.copytree(dataset, stranger / "dataset")
+@pytest.mark.parametrize(("words", "place"), LINKS)
+def test_no_link_is_written_through(stranger, dataset, prior, tmp_path, words, place, capsys):
+    """The link leads to a folder, or for a file to a file, that stays as it is."""
+    data = shutil.copytree(dataset, stranger / "dataset")
     outside, link = tmp_path / "outside", stranger / place
     outside.mkdir()
     (outside / "kf_0000.png").write_text("mine")
     link.parent.mkdir(exist_ok=True)
-    link.symlink_to(outside / "kf_0000.png" if place.endswith(".lock") else outside)
-    folder = stranger / "dataset" if name in ("prior", "survey") else stranger
-    more = ["--force"] if name in ("prior", "survey", "diagnose", "simplify") else []
-    line = refused(capsys, [*name.split(), folder, *more], outside)
+    whole = link.suffix in (".mp4", ".html")
+    link.symlink_to(outside / "kf_0000.png" if whole or link.name == ".lock" else outside)
+    given = words.format(run=stranger, data=data, prior=prior).split()
+    if whole:
+        before = listing(outside)
+        command(*given)
+        assert listing(outside) == before
+        assert not link.is_symlink()
+        return
+    line = refused(capsys, given, outside)
     assert f"{place}: leads out of" in line or f"{place}: is in the way" in line
 
 
@@ -342,10 +356,11 @@ def test_no_value_of_a_wrong_type_in_a_step_is_read():
 
 
 METRICS = [
-    {"images": 0}, {"images": True}, {"all": {"psnr": "30"}}, {"views": [{"name": 1}]},
+    {"images": 0}, {"images": True}, {"all": {"psnr": "30"}}, {"all": {"psnr": 1e300}},
+    {"views": [{"name": 1}]},
     {"pictures": "no"}, {"test_views": {}}, {"held_out": None},
 ]  # fmt: skip
-"""Values of a wrong type in metrics.json."""
+"""Values of a wrong type or size in metrics.json."""
 
 
 @pytest.mark.parametrize("change", METRICS, ids=str)

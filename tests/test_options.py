@@ -32,6 +32,8 @@ OPTIONS = {
         "{ply} --follow",
         "{run} --host 192.0.2.1",  # of an example network
     ],
+    "simplify {run}": ["--noise 1e300"],
+    "export {run} --out {out}.mgs": ["--psnr nan"],
     "report {run}": [
         "--figures eps",
         "--html {out}.html --figures pdf",
@@ -78,6 +80,7 @@ OPTIONS = {
         "--preset huge",
         "--orbit figure-eight",
         "--distances 1,far",
+        "--distances 1e-300",
         "--size 320",
         "--size 99999999x99999999",
         "--size 3²x24",

@@ -280,6 +280,10 @@ BAD = {
     "--origin 47,8": "origin '47,8': expected LATITUDE",
     "--set elevations=50,20": "elevations = [50, 20]: expected",
     "--dome 5 --set radius=nan": "radius = nan: ",
+    "--dome 5 --set radius=1e300": "radius = 1e+300: ",
+    "--dome 5 --set radius=1e-300": "radius = 1e-300: ",
+    "--set grid=1000000000": "grid 1,000,000,000: give at most 5,000",
+    "--views 2 --set certificate.seconds=inf": "certificate.seconds = inf: ",
     "--gaussians 9": "is a run with its model; leave out `gaussians`",
 }
 

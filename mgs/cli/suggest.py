@@ -45,7 +45,7 @@ class Candidates(BaseModel):
     """Candidates: this many poses on a ring."""
     grid: Annotated[int, Field(ge=1)] | None = None
     """Candidates: about this many poses of a cubic lattice."""
-    radius: Positive | None = None
+    radius: Annotated[float, Field(ge=1e-6, le=1e6)] | None = None
     """Radius of dome, ring or grid. Default: median distance of the images."""
     elevations: tuple[Degrees, Degrees] | None = None
     """Lowest and highest elevation, degrees. Default: 10,80 with dome, ring or grid, else any."""

@@ -74,7 +74,7 @@ def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float) -> Prun
     change never exceeds it. Nothing is fitted. gaussians: NumPy fields. Raises InputError as
     `render`, and if the noise is not positive.
     """
-    if not 0 < noise < np.inf:
+    if not 0 < noise < 1e9:
         raise InputError(f"prune: noise {noise} must be positive, linear RGB; correct `noise`")
     before, covered = _images(gaussians, cameras)
     kept, predicted, actual, allowed = np.arange(len(gaussians)), 0.0, 0.0, noise**2 * covered

@@ -62,7 +62,7 @@ def compact_run(
         return float(np.nanmean(quality(model, views)["psnr_corrected" if exposure else "psnr"]))
 
     before, results = measured(whole), list[tuple[Compact, float]]()
-    if psnr is not None and before <= psnr:
+    if psnr is not None and not psnr < before:
         raise InputError(
             f"psnr {psnr:g}: {run.folder} itself has {before:.2f} dB in the views it took; ask for "
             "less"

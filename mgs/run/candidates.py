@@ -165,7 +165,7 @@ def place_poses(
 def _lattice(count: int, radius: float, elevations: tuple[float, float]) -> NDArray[np.float64]:
     """About `count` points of a cubic lattice between two elevations and within a radius [M,3]."""
     low, high = np.sin(np.radians(elevations))
-    volume = 2 * np.pi / 3 * radius**3 * max(high - low, 1e-3)
+    volume = 2 * np.pi / 3 * radius**3 * max(high - low, 0.01)
     step = (volume / count) ** (1 / 3)
     line = step * np.arange(-math.ceil(radius / step), math.ceil(radius / step) + 1)
     points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)

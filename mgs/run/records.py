@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError, model_validator
 
 from mgs.errors import InputError
 from mgs.files import read_text
 from mgs.run.ending import RunEnd
+
+Number = Annotated[float, Field(ge=-1e30, le=1e30)]
+"""A number that can be squared and summed."""
 
 
 class _Strict(BaseModel):
@@ -32,11 +35,11 @@ class _End(_Strict):
     reason: RunEnd
     views: int
     name: str = ""
-    limit: float = 0.0
-    uncertainty: float = 0.0
-    psnr: float = 0.0
-    information_gain: float = 0.0
-    metres: float = 0.0
+    limit: Number = 0.0
+    uncertainty: Number = 0.0
+    psnr: Number = 0.0
+    information_gain: Number = 0.0
+    metres: Number = 0.0
     given_up: int = 0
 
 
@@ -44,10 +47,10 @@ class _Point(_Strict):
     """A row of `mgs.policy.certificate.curve`."""
 
     views: int
-    bound: float
-    plan: float
-    even: float
-    random: float
+    bound: Number
+    plan: Number
+    even: Number
+    random: Number
 
 
 class _Certificate(_Strict):
@@ -56,39 +59,39 @@ class _Certificate(_Strict):
     criterion: str
     views: int
     candidates: int
-    share: float
-    best: float
-    fewer: float | None
-    of_all: float
+    share: Number
+    best: Number
+    fewer: Number | None
+    of_all: Number
     nodes: int
     stopped: Literal["gap", "nodes", "time"]
-    prices: dict[str, float]
+    prices: dict[str, Number]
     curve: list[_Point] = []
 
 
 class _Line(_Strict, extra="allow"):
     """A line of steps.jsonl. All other keys are numbers, as PSNR."""
 
-    __pydantic_extra__: dict[str, float | None]
+    __pydantic_extra__: dict[str, Number | None]
     step: int
     images: int
-    coverage: float
+    coverage: Number
     seeds: list[int] | None = None
     seed_names: list[str] = []
     frame: int | None = None
     name: str | None
-    score: float | None
-    information_gain: float | None
-    uncertainty: float = 0.0
+    score: Number | None
+    information_gain: Number | None
+    uncertainty: Number = 0.0
     iterations: int = 0
-    loss: float = 0.0
-    residual: float = 0.0
+    loss: Number = 0.0
+    residual: Number = 0.0
     stop_reason: str = ""
-    exposure: dict[str, tuple[float, float, float]] = {}
-    prediction: dict[str, float] = {}
-    indicators: dict[str, float] = {}
+    exposure: dict[str, tuple[Number, Number, Number]] = {}
+    prediction: dict[str, Number] = {}
+    indicators: dict[str, Number] = {}
     warnings: list[str] = []
-    seconds: dict[str, float]
+    seconds: dict[str, Number]
     ended: _End = Field(None)  # type: ignore[assignment]  # absent, never null
     certificate: _Certificate = Field(None)  # type: ignore[assignment]
 
@@ -137,21 +140,21 @@ class Record(_Strict, extra="forbid"):
 
 
 class _View(_Strict, extra="allow"):
-    __pydantic_extra__: dict[str, float | None]
+    __pydantic_extra__: dict[str, Number | None]
     name: str
     trained: bool
-    psnr: float | None
-    ssim: float | None
+    psnr: Number | None
+    ssim: Number | None
 
 
 class Metrics(_Strict):
     """metrics.json (`mgs.evaluation.evaluate_model`, `mgs.reports.evaluation.evaluate_run`)."""
 
     images: PositiveInt
-    all: dict[str, float | None]
-    held_out: dict[str, float | None]
+    all: dict[str, Number | None]
+    held_out: dict[str, Number | None]
     views: list[_View]
-    test: dict[str, float | None] = {}
+    test: dict[str, Number | None] = {}
     test_views: list[_View] = []
     pictures: bool = True
     of: str = ""

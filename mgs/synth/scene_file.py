@@ -11,7 +11,7 @@ from mgs.errors import InputError
 from mgs.files import read_json, read_toml
 from mgs.resources import scene_path
 
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(ge=1e-6, le=1e6)]
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
