@@ -7,7 +7,7 @@ VENV  := .venv
 BIN   := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test docs setup lock clean
+.PHONY: demo test docs results results-quick setup lock clean
 .DEFAULT_GOAL := demo
 
 demo: setup
@@ -23,6 +23,13 @@ test: setup
 docs: setup
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "wrote site/: open site/index.html (searching it needs a server: $(BIN)/python -m http.server --directory site)"
+
+# Every number and picture of the pages anew: hours, and a repeated call continues. results-quick: two studies of one rock.
+results: setup
+	@$(BIN)/python -m studies.all out/results
+
+results-quick: setup
+	@$(BIN)/python -m studies.all out/results-quick --quick
 
 setup: $(STAMP)
 

@@ -268,10 +268,11 @@ def _mean(rows: Sequence[Row], key: str) -> float:
     return float(np.mean([row[key] for row in rows]))
 
 
-def text_of(work: Work, means: Sequence[Row]) -> str:
+def tables(rows: Sequence[Row]) -> str:
     """Table of policies, and that of PUBLISHED."""
     columns: dict[str, Content] = {"views": "views", "policy": "policy"}
-    columns |= {f"{scene.name} (dB)": f"psnr {scene.name}:.2f" for scene in work.size.scenes}
+    scenes = dict.fromkeys(row["scene"] for row in rows)
+    columns |= {f"{scene} (dB)": f"psnr {scene}:.2f" for scene in scenes}
     columns |= {
         "mean (dB)": "psnr:.2f",
         "over random (dB)": lambda row: with_interval(row, "lead"),
@@ -281,7 +282,7 @@ def text_of(work: Work, means: Sequence[Row]) -> str:
     published: dict[str, Content] = {
         "published": "policy", "mean of 8 scenes (dB)": "psnr:.2f", "GPU s a choice": "seconds:.3g",
     }  # fmt: skip
-    return f"{table(columns, means)}\n{table(published, PUBLISHED)}"
+    return f"{table(columns, means_of(rows))}\n{table(published, PUBLISHED)}"
 
 
 def write(work: Work) -> list[Path]:
@@ -303,7 +304,7 @@ def write(work: Work) -> list[Path]:
     ]
     draw_panels(work.out / f"{NAME}.png", panels, ordered)
     size = replace(work.size, scenes=())
-    paths = write_table(work, NAME, rows, text_of(work, means), size=asdict(size), means=means)
+    paths = write_table(work, NAME, rows, tables(rows), size=asdict(size), means=means)
     return [*paths, work.out / f"{NAME}.png"]
 
 

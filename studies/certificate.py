@@ -258,9 +258,9 @@ def _of_part(part: str, cells: Sequence[Cell]) -> list[Cell]:
     return [cell for cell in cells if cell.about.get("part") == part]
 
 
-def text_of(rows: Sequence[Row], losses: Sequence[Row], size: CertificateSize) -> str:
+def tables(rows: Sequence[Row], losses: Sequence[Row] = ()) -> str:
     """Tables of plans, bounds, correlation and losses: means over scenes, 95 % intervals."""
-    names = ("plan", "greedy", "farthest", "random, mean", f"random, best of {size.sets}")
+    names = ("plan", "greedy", "farthest", "random, mean", "random, best")
     keys = ("plan", "greedy", "farthest", "random", "random_best")
     of_sets: dict[str, Content] = {"policy": "policy", "views": "views:d"}
     of_sets |= {name: scene_mean(key, ".3f") for name, key in zip(names, keys, strict=True)}
@@ -270,8 +270,10 @@ def text_of(rows: Sequence[Row], losses: Sequence[Row], size: CertificateSize) -
         "plan / relaxation": scene_mean("relaxed", ".3f"),
         "one view less / plan": scene_mean("fewer", ".3f"),
     }
-    fits = f"rank correlation, {size.batches * size.batch} sets of {size.views}"
-    of_ranks: dict[str, Content] = {"policy": "policy", fits: scene_mean("correlation", ".2f")}
+    of_ranks: dict[str, Content] = {
+        "policy": "policy",
+        "rank correlation with PSNR": scene_mean("correlation", ".2f"),
+    }
     of_losses: dict[str, Content] = {
         "policy": "policy",
         "share of all": "share:.2f",
@@ -280,9 +282,10 @@ def text_of(rows: Sequence[Row], losses: Sequence[Row], size: CertificateSize) -
         "dB lost, others": scene_mean("loss", ".2f", part="growing"),
     }
     every, ends = grouped(rows, "policy", "views"), grouped(losses, "policy", "share")
-    last = [line for line in every if line["views"] == max(size.counts)]
+    most = max(line["views"] for line in every)
+    last = [line for line in every if line["views"] == most]
     made = ((of_sets, every), (of_plans, every), (of_ranks, last), (of_losses, ends))
-    return "\n".join(table(*one) for one in made)
+    return "\n".join(table(*one) for one in made if one[1])
 
 
 def curve_of(results: Results, cells: Sequence[Cell]) -> list[Row]:
@@ -313,7 +316,7 @@ def write(work: Work) -> list[Path]:
         make(work.results, work.cells) for make in (rows_of, losses_of, curve_of)
     )
     draw(work.out / "certificate.png", curve)
-    text = text_of(rows, losses, work.size)
+    text = tables(rows, losses)
     paths = write_table(work, "certificate", rows, text, rocks=len(work.size.rocks))
     for name, of in (("curve", curve), ("losses", losses)):
         paths.append(write_csv(work.out / f"certificate-{name}.csv", of))

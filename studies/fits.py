@@ -153,7 +153,7 @@ def rows_of(work: Work) -> list[Row]:
     return rows
 
 
-def text_of(rows: Sequence[Row]) -> str:
+def tables(rows: Sequence[Row]) -> str:
     """Table of the changes, means over scenes with 95 % intervals; of the default its PSNR."""
     pools = list(dict.fromkeys(row["pool"] for row in rows))
     columns: dict[str, Any] = {"changed": "variant"}
@@ -174,7 +174,7 @@ def write(work: Work) -> list[Path]:
     changed = [row for row in rows if row["variant"] != DEFAULT]
     path = work.out / "fits.png"
     draw_panels(path, [Panel("variant", "test_change", "", y_label, "pool")], changed)
-    return [*write_table(work, "fits", rows, text_of(rows)), path]
+    return [*write_table(work, "fits", rows, tables(rows)), path]
 
 
 STUDY = Study(

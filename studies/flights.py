@@ -202,7 +202,7 @@ COLUMNS: dict[str, Content] = {
 }
 
 
-def text_of(rows: Sequence[Row]) -> str:
+def tables(rows: Sequence[Row]) -> str:
     """A line for each pool, length and policy: means over scenes with 95 % intervals."""
     limited = [row for row in rows if row["length"] is not None]
     lines = grouped(limited, "pool", "length", "policy")
@@ -229,7 +229,7 @@ def write(work: Work) -> list[Path]:
     """Write flights.csv, .json, .md and .png."""
     rows = rows_of(work.results, work.cells)
     draw(work.out / "flights.png", rows)
-    paths = write_table(work, "flights", rows, text_of(rows), rocks=len(work.size.rocks))
+    paths = write_table(work, "flights", rows, tables(rows), rocks=len(work.size.rocks))
     return [*paths, work.out / "flights.png"]
 
 

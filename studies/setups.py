@@ -64,8 +64,8 @@ RANDOM, ORACLE = "random", "oracle"
 MEAN = "mean"
 """Name of the mean over the set-ups, beside their names."""
 
-ENDS = {"worst": 0.0, "median": 0.5, "best": 1.0}
-"""Quantiles of the leads over every rock in every set-up."""
+ENDS = "worst, median"
+"""Name of the column of the leads over every rock in every set-up."""
 
 MEASURES = {
     "test": "test views",
@@ -402,15 +402,15 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     draw_matrix(path, Panel("setup", "gain", "set-up", "", "policy", title=title), means)
 
 
-def text_of(rows: Sequence[Row], leads: Sequence[Row]) -> str:
-    """Tables with a line for each policy and a column for each set-up: gains over `random` by each
-    of MEASURES, the leader's lead, and share of the oracle's gain."""
+def tables(rows: Sequence[Row]) -> str:
+    """Tables with a line for each policy and a column for each set-up: the leader's lead, gains
+    over `random` by each of MEASURES, and share of the oracle's gain."""
     setups, policies = _setups(rows), _policies(rows)
     rocks = {row["rock"] for row in rows if row["policy"] == ORACLE}
     tried = [row for row in rows if row["rock"] in rocks]
     groups = grouped(rows, "rock", "setup")
     cells = [{row["policy"]: row["test"] for row in group["of"]} for group in groups]
-    known = {(lead["setup"], lead["policy"]): lead for lead in leads if lead["measure"] == "test"}
+    leads = {(one["setup"], one["policy"]): one for one in leads_of(rows, LEADER, "test")}
 
     def matrix(
         title: str,
@@ -430,29 +430,28 @@ def text_of(rows: Sequence[Row], leads: Sequence[Row]) -> str:
         return cell
 
     def ahead(setup: str, policy: str) -> str:
-        lead = known.get((setup, policy), {})
+        lead = leads.get((setup, policy), {})
+        if setup == ENDS:
+            apart = [of[LEADER] - of[policy] for of in cells if {LEADER, policy} <= set(of)]
+            return f"{np.min(apart):+.2f}, {np.median(apart):+.2f}" if apart else "–"
+        if setup != MEAN:
+            return format(lead["lead"], "+.2f") if lead else "–"
         return with_interval(lead, "lead") + (" *" if (lead.get("p_holm") or 1) < 0.05 else "")
-
-    def extremes(end: str, policy: str) -> str:
-        apart = [value[LEADER] - value[policy] for value in cells if {LEADER, policy} <= set(value)]
-        return format(np.quantile(apart, ENDS[end]), "+.2f") if apart else "–"
 
     def share(setup: str, policy: str) -> str:
         of, won = (by_scene(tried, setup, p, "test_gain") for p in (policy, ORACLE))
         total = sum(won.values())
         return f"{sum(of.values()) / total:.0%}" if of and total > 0 else "–"
 
-    tables = [
+    others = [p for p in policies if p not in (LEADER, ORACLE)]
+    parts = [matrix(f"{LEADER} over it (dB)", ahead, others, (*setups, ENDS))]
+    parts += [
         matrix(f"{title}, over random (dB)", gain(key), policies) for key, title in MEASURES.items()
     ]
-    others = [p for p in policies if p not in (LEADER, ORACLE)]
-    tables.append(matrix(f"{LEADER} over it (dB)", ahead, others))
-    ends = f"{LEADER} over it, over rocks and set-ups (dB)"
-    tables.append(matrix(ends, extremes, others, tuple(ENDS)))
     if ORACLE in policies:
         shown = [p for p in policies if p != RANDOM]
-        tables.append(matrix("share of the oracle's gain", share, shown))
-    return "\n".join(tables)
+        parts.append(matrix("share of the oracle's gain", share, shown))
+    return "\n".join(parts)
 
 
 def write(work: Work, name: str = "setups", cells: Sequence[Cell] | None = None) -> list[Path]:
@@ -464,8 +463,7 @@ def write(work: Work, name: str = "setups", cells: Sequence[Cell] | None = None)
     rows = rows_of(results, done)
     leads = [lead for key in MEASURES for lead in leads_of(rows, LEADER, key)]
     draw(work.out / f"{name}.png", rows)
-    text = text_of(rows, leads)
-    paths = write_table(work, name, rows, text, rocks=len(work.size.rocks))
+    paths = write_table(work, name, rows, tables(rows), rocks=len(work.size.rocks))
     return [*paths, work.out / f"{name}.png", write_csv(work.out / f"{name}-leads.csv", leads)]
 
 

@@ -1,7 +1,8 @@
 """Hooks of `mkdocs build`.
 
 They add the changelog, point links to source files to the API, replace the mark `<!-- commands -->`
-by what `mgs COMMAND --help` says, and refuse a site that loads something from a network.
+by what `mgs COMMAND --help` says and marks of tables by tables of the studies' rows, and refuse a
+site that loads something from a network.
 """
 
 from __future__ import annotations
@@ -17,11 +18,17 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 from mgs.cli.app import app
+from studies.frame.output import tables_of
 
 CHANGELOG = Path(__file__).parent.parent / "CHANGELOG.md"
 
 SOURCE = re.compile(r"\]\(\.\./mgs/(\w+)/(\w+)\.py\)")
 """Link from a page in docs/ to a module, which the site replaces by its part of the API."""
+
+RESULTS = Path(__file__).parent.parent / "docs/results"
+
+TABLE = re.compile(r"<!-- table (\d+) of ([\w/-]+)\.csv -->")
+"""Mark of a table: its number among those that a study makes of the rows of a file in RESULTS."""
 
 LOADED = re.compile(
     r"""<(script|img|iframe|source)\b[^>]* src="?(https?:)?//"""
@@ -40,7 +47,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Replace the mark of the commands and links to source files."""
+    """Replace the marks of tables and of the commands, and links to source files."""
+    markdown = TABLE.sub(lambda m: tables_of(RESULTS / f"{m[2]}.csv")[int(m[1]) - 1], markdown)
     markdown = SOURCE.sub(r"](api/\1.md#mgs.\1.\2)", markdown)
     mark = "<!-- commands -->"
     return markdown.replace(mark, command_reference()) if mark in markdown else markdown

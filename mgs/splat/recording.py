@@ -24,12 +24,23 @@ def one_at_a_time(function: Function) -> Function:
     While Dr.Jit 1.5 replays a recording, it holds a lock and calls Python. If another thread then
     calls Dr.Jit, it waits for that lock while the first waits for Python: a deadlock. This lock
     covers everything from the start to the end of a drawing.
+
+    Ctrl-C within a call that Dr.Jit makes to Python comes out of it as a RuntimeError, and is
+    raised as KeyboardInterrupt again.
     """
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         with _one_at_a_time:
-            return function(*args, **kwargs)
+            try:
+                return function(*args, **kwargs)
+            except RuntimeError as error:
+                cause: BaseException | None = error
+                while cause is not None:
+                    if isinstance(cause, KeyboardInterrupt):
+                        raise KeyboardInterrupt from error
+                    cause = cause.__cause__
+                raise
 
     return cast(Function, call)
 

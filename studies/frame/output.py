@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import csv
+import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -99,6 +103,26 @@ def write_table(work: Work, name: str, rows: Sequence[Row], text: str, **more: A
     paths = [out / f"{name}{end}" for end in (".csv", ".json", ".md")]
     write_csv(paths[0], [row | origin | row for row in rows])
     return paths
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Read the rows that `write_table` wrote as CSV. Numbers are numbers; an empty cell is None."""
+    with open(path, newline="", encoding="utf-8") as file:
+        return [{key: _value(text) for key, text in row.items()} for row in csv.DictReader(file)]
+
+
+def _value(text: str) -> Any:
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return text or None
+
+
+def tables_of(path: Path) -> list[str]:
+    """Markdown tables of a study's NAME.csv, by `tables` of its module. A page takes its tables
+    from these when the site is built."""
+    tables = import_module(f"studies.{path.stem}").tables(read_rows(path))
+    return re.findall(r"^\|.*?(?=\n\n|\n*\Z)", tables, re.MULTILINE | re.DOTALL)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -15,6 +16,7 @@ from mgs.errors import InputError
 from mgs.gaussians import ARRAYS, SH_MAX, Gaussians
 from mgs.splat import ESTIMATORS, ListCache, fisher, jvp, reference, render
 from mgs.splat.constants import NEAR
+from mgs.splat.recording import frozen
 
 from .scenes import (
     SIZE,
@@ -279,3 +281,18 @@ def test_no_variant_is_named_in_the_code():
     for path in files:
         found = re.search(variants, path.read_text())
         assert found is None, f"{path} names {found.group()}"
+
+
+def test_an_interruption_within_drjit_stays_one():
+    """Dr.Jit reports it as a RuntimeError where it arrives in Python that Dr.Jit calls."""
+
+    class Interrupting:
+        DRJIT_STRUCT: ClassVar = {"x": mi.Float}
+
+        @property
+        def x(self):
+            raise KeyboardInterrupt
+
+    double = frozen(lambda x: ())(lambda x: x)
+    with pytest.raises(KeyboardInterrupt):
+        double(Interrupting())

@@ -1,0 +1,90 @@
+"""Every study of the pages, one after another: `python -m studies.all OUT` (`make results`).
+
+Each works in its own folder of OUT, and a rerun continues. What docs/results shows of a study is
+replaced when the study is done; pages take their tables from there when the site is built. With
+--quick, two studies run for one rock, and their rows are compared with those of docs/results.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from pathlib import Path
+
+from studies.frame.claim import Row
+from studies.frame.output import read_rows
+
+RESULTS = Path(__file__).parent.parent / "docs/results"
+
+STAGES = {
+    "fits": ("fits", "--rocks", "8"),
+    "certificate": ("certificate", "--rocks", "12"),
+    "setups": ("setups", "--rocks", "8"),
+    "rate": ("rate", "--rocks", "6"),
+    "table1": ("table1",),
+    "flights": ("flights", "--rocks", "12"),
+    "survey": ("survey", "--rocks", "8"),
+    "parsimony": ("parsimony",),
+    "chart": ("chart",),
+    "stress": ("stress",),
+    "table1-paper": ("table1", "--scale", "paper", "--batch", "5"),
+}
+"""Studies and their arguments by folder. `studies.blender` and `studies.photographs` need the data
+of others and are run by hand."""
+
+QUICK = {name: (name, "--rocks", "1") for name in ("fits", "certificate")}
+
+ENOUGH = 0.01
+"""Largest difference of a number, in its unit: processors of another type round differently."""
+
+
+def run(out: Path, quick: bool) -> int:
+    """Run the stages; the exit code of the first that fails, or of the comparison."""
+    code = 0
+    for name, (study, *arguments) in (QUICK if quick else STAGES).items():
+        command = [sys.executable, "-m", f"studies.{study}", str(out / name), *arguments]
+        print(f"python -m studies.{study} {out / name} {' '.join(arguments)}", flush=True)
+        if failed := subprocess.run(command, check=False).returncode:
+            return failed
+        if not quick:
+            for path in sorted((RESULTS / name).iterdir()):
+                shutil.copyfile(out / name / path.name, path)  # what pages show, no more
+            continue
+        rows, differences = compared(out / name / f"{study}.csv", RESULTS / name / f"{study}.csv")
+        print(f"{rows} rows in docs/results, largest difference {max(differences, default=0):.2g}")
+        code |= not rows or max(differences, default=0) > ENOUGH
+    return code
+
+
+def compared(path: Path, usual: Path) -> tuple[int, list[float]]:
+    """Number of rows of a file that another has too, by their words; differences of numbers."""
+    others = {words(row): row for row in read_rows(usual)}
+    pairs = [(row, others[words(row)]) for row in read_rows(path) if words(row) in others]
+    return len(pairs), [
+        abs(value - other[key])
+        for row, other in pairs
+        for key, value in row.items()
+        if isinstance(value, float) and other[key] is not None
+    ]
+
+
+def words(row: Row) -> frozenset[tuple[str, object]]:
+    """What names a row: its words and whole numbers, without its origin."""
+    origin = ("command", "commit")
+    return frozenset((k, v) for k, v in row.items() if isinstance(v, str | int) and k not in origin)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Program; the exit code."""
+    parser = ArgumentParser(prog="python -m studies.all", description=__doc__)
+    parser.add_argument("out", type=Path, help="Folder of all studies; run again to continue.")
+    parser.add_argument("--quick", action="store_true", help="One rock, compared; minutes.")
+    options = parser.parse_args(arguments)
+    return run(options.out, options.quick)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
