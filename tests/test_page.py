@@ -10,9 +10,10 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
+import synthetic
 import tiny
 from browser import opened
-from program import change_steps, command
+from program import change_settings, change_steps, command
 from program import steps as read_steps
 from refusals import refused
 
@@ -95,6 +96,20 @@ def test_the_page_says_what_the_files_say(page, runs):
         assert data["pictures"][picture["name"]].startswith("data:image/webp;base64,")
     trained = {view["name"] for view in shown}
     assert not trained & {view["view"] for view in data["compared"]}
+
+
+def test_the_page_of_a_fit_without_masks_speaks_of_photographs(page, runs, tmp_path):
+    root = tmp_path / "fit"
+    shutil.copytree(runs[0].parent, root)
+    change_settings(root / "d-optimal", dataset=str(root / "data"), budget=0)
+    synthetic.edit(root / "data", lambda data: [f.pop("mask_path") for f in data["frames"]])
+    write_page(tmp_path / "fit.html", [root / "d-optimal"])
+    parsed, masked = read_page(tmp_path / "fit.html"), read_page(page)
+    assert "Run of mgs fit on" in parsed.text
+    assert "The truth is the photograph." in parsed.text
+    assert "rock in front of black" not in json.dumps(parsed.data)
+    assert "Runs of mgs nbv on" in masked.text
+    assert "The truth is the rock alone in front of black." in masked.text
 
 
 def test_links_lead_to_the_files(page):

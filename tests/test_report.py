@@ -324,6 +324,14 @@ def test_every_policy_has_a_colour_and_a_marker_of_its_own():
     assert len(set(colours)) == len(set(markers)) == len({SYMBOLS[one] for one in markers})
 
 
+@pytest.mark.parametrize(("inside", "shown"), [(20.0, ""), (25.0, "_mask")])
+def test_values_in_masks_stand_only_where_there_are_masks(inside, shown):
+    ends = {"": 20.0, "_mask": inside, "_corrected": 21.0, "_mask_corrected": inside + 1}
+    row = {f"test.psnr{end}": value for end, value in ends.items()} | {"exposure": True}
+    expected = dict.fromkeys(["test.psnr", f"test.psnr{shown}", f"test.psnr{shown}_corrected"])
+    assert tables.table_columns([row]) == list(expected)
+
+
 @pytest.mark.parametrize("tested", [True, False])
 def test_a_long_name_cuts_no_number_and_is_not_cut(tested):
     name = "random (a [second] run in a folder with a long name" + "x" * 80 + ")"

@@ -52,10 +52,11 @@ def settings_table(keys: Sequence[tuple[str, str, str]]) -> Table:
 
 def print_quality(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print the rows of `mgs.reports.tables.comparison_rows` as a table, for 80 columns."""
-    from mgs.reports.tables import has_held_out, table_cell
+    from mgs.reports.tables import has_held_out, is_masked, table_cell
 
     tested, new = any("test.psnr" in row for row in rows), has_held_out(rows)
     metrics = [key for key in SHOWN[tested] if new or not key.startswith("held_out.")]
+    metrics = [key for key in metrics if is_masked(rows) or "mask" not in key]
     keys = ["images", *metrics, "coverage"]
     caption = "n: images; PSNR in dB, coverage in %"
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=caption)

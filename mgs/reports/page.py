@@ -75,6 +75,8 @@ def write_page(
         title=", ".join(runs),
         dataset=next(iter(runs.values())).dataset.root.resolve().name,
         labels=list(runs),
+        command="nbv" if any(run.settings.budget for run in runs.values()) else "fit",
+        outlined=next(iter(runs.values())).dataset.outlined,
         notes={label: notes(run) for label, run in runs.items()},
         summary=summary_rows(runs),
         settings=setting_rows(runs),
@@ -168,9 +170,10 @@ def _view(label: str, run: Run, k: int, frame: Frame) -> dict[str, Any]:
     facts = [("view", view), ("taken as", role)]
     # The numbers are known after the last of the seeds.
     facts += step_facts(step) if k >= seeds - 1 else [("images", str(k + 1))]
+    black = ", the rock in front of black" if frame.mask_path or frame.rock_path else ""
     own, where, bright = f"{view}/{label}", f"seen from {view}", "bright where little is known"
     pictures = [
-        (f"truth/{view}", "truth", f"Truth: the image of {view}, the rock in front of black."),
+        (f"truth/{view}", "truth", f"Truth: the image of {view}{black}."),
         (f"render/{own}", f"render{quality}", f"Render of the last model at {view}{quality}."),
         (f"error/{own}", "error", f"Absolute difference of truth and render at {view}{quality}."),
     ]

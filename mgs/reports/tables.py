@@ -17,6 +17,7 @@ COLUMNS = {
     "images": "images",
     "test.psnr": "PSNR, test views (dB)",
     "test.ssim": "SSIM, test views",
+    "test.psnr_corrected": "PSNR, test views, exposure fitted (dB)",
     "test.psnr_mask": "masked PSNR, test views (dB)",
     "test.ssim_mask": "masked SSIM, test views",
     "test.psnr_mask_corrected": "masked PSNR, test views, exposure fitted (dB)",
@@ -24,6 +25,7 @@ COLUMNS = {
     "all.ssim": "SSIM, all views",
     "held_out.psnr": "PSNR, held-out views (dB)",
     "held_out.ssim": "SSIM, held-out views",
+    "held_out.psnr_corrected": "PSNR, held-out views, exposure fitted (dB)",
     "held_out.psnr_mask": "masked PSNR, held-out views (dB)",
     "held_out.ssim_mask": "masked SSIM, held-out views",
     "held_out.psnr_mask_corrected": "masked PSNR, held-out views, exposure fitted (dB)",
@@ -76,12 +78,20 @@ def metrics_row(label: str, metrics: Mapping[str, Any]) -> dict[str, Any]:
 
 def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Keys of COLUMNS of which some row has a value, in order."""
-    exposure = any(row.get("exposure") for row in rows)
+    exposure, masked = any(row.get("exposure") for row in rows), is_masked(rows)
     return [
         key
         for key in COLUMNS
-        if any(row.get(key) is not None for row in rows) and (exposure or "corrected" not in key)
+        if any(row.get(key) is not None for row in rows)
+        and (masked or "mask" not in key)
+        and ("corrected" not in key or (exposure and masked == ("mask" in key)))
     ]
+
+
+def is_masked(rows: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether values in masks differ from those of whole images in some row."""
+    sets = [f"{views}.psnr" for views in ("test", "held_out")]
+    return any(row.get(key) != row.get(f"{key}_mask") for row in rows for key in sets)
 
 
 def has_held_out(rows: Sequence[Mapping[str, Any]]) -> bool:
