@@ -83,13 +83,28 @@ def coarse_arena():
 
 
 @pytest.fixture(scope="module")
+def coarse_rocks(coarse_arena):
+    """Procedural rocks of few triangles and texels, on a coarse ground."""
+    from mgs.synth import rendering
+
+    make_rock = rendering.make_rock
+
+    def coarse(rock, rng):
+        return make_rock(rock.model_copy(update={"detail": rock.size / 30}), rng)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(rendering, "make_rock", coarse)
+        yield
+
+
+@pytest.fixture(scope="module")
 def coarse_priors():
     """Surfaces of few cells, which are most of a prior's cost: for tests that do not look at it."""
     from mgs.prior import hull, surface
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(hull, "COARSE", 14)
-        patched.setattr(surface, "POISSON_DEPTHS", (5, 5))
+        patched.setattr(surface, "POISSON_DEPTHS", (4, 4))
         yield
 
 

@@ -29,7 +29,6 @@ from mgs.run.policies import POLICIES
 from mgs.splat import ESTIMATORS, constants
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE
 from mgs.splat_ply import write_ply
-from mgs.synth import rendering
 from mgs.synth.scene_file import SceneFile
 from studies.frame.program import study_of
 
@@ -185,14 +184,8 @@ def data(tmp_path_factory, coarse_priors):
 
 
 @pytest.fixture
-def quick(monkeypatch, coarse_arena, coarse_priors, short_fits):
+def quick(coarse_rocks, coarse_priors, short_fits):
     """Coarse rocks and priors, and short fits."""
-    make_rock = rendering.make_rock
-
-    def coarse(rock, rng):
-        return make_rock(rock.model_copy(update={"detail": rock.size / 30}), rng)
-
-    monkeypatch.setattr(rendering, "make_rock", coarse)
 
 
 @pytest.fixture

@@ -197,7 +197,7 @@ def test_lambda_of_each_kind():
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory, coarse_priors):
+def run(tmp_path_factory):
     root = tmp_path_factory.mktemp("refit")
     synthetic.write_dataset(root / "data/test", synthetic.orbit_cameras(3, 48, 36, altitude=2.0))
     data = synthetic.write_dataset(root / "data", synthetic.orbit_cameras(12, 48, 36))

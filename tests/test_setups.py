@@ -36,7 +36,7 @@ TABLE = table1.TableSize(
     IMAGES, 200, 2, policies=("d-optimal", "random"), slow={}, draws=2, fewer=1, passes_3dgs=3
 )
 
-pytestmark = pytest.mark.usefixtures("ellipsoids")
+pytestmark = pytest.mark.usefixtures("ellipsoids", "coarse_priors")
 
 
 def done(capsys, *arguments, **changes):
