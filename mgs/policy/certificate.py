@@ -101,16 +101,16 @@ def best_set(
     node fixes some views as taken and some as left out. The node with the largest bound is next,
     and branches on the view whose weight is nearest to 1/2. Raises InputError as `upper_bound`.
     """
-    k, until, stopped = len(plan), time.monotonic() + seconds, "gap"
+    k, until, reason = len(plan), time.monotonic() + seconds, "gap"
     root = upper_bound(criterion, k, seconds=seconds)
     gains = {tuple(sorted(plan)): criterion.gain(plan)}
     lo, hi = np.zeros(len(root.weights)), np.ones(len(root.weights))
     above = min(root.value, *(added_bound(criterion, some, k) for some in ((), plan)))
     heap = [(-above, 0, lo, hi, root.weights)]
-    closed, pushed, nodes = 0.0, 0, 0
+    closed, count, nodes = 0.0, 0, 0
     while heap and -heap[0][0] > (enough := max(gains.values()) / (1 - gap)):
         if nodes == most or time.monotonic() > until:
-            stopped = "nodes" if nodes == most else "time"
+            reason = "nodes" if nodes == most else "time"
             break
         parent, _, lo, hi, x = heapq.heappop(heap)
         nodes += 1
@@ -124,8 +124,8 @@ def best_set(
         if above <= (enough := max(gains.values()) / (1 - gap)):
             closed = max(closed, above)
             continue
-        lo, hi, lost = _fixed(bound, lo, hi, k, enough)
-        closed, free = max(closed, lost), np.flatnonzero(hi > lo)
+        lo, hi, ceiling = _fixed(bound, lo, hi, k, enough)
+        closed, free = max(closed, ceiling), np.flatnonzero(hi > lo)
         if not len(free):
             closed = max(closed, _noted(gains, criterion, np.flatnonzero(lo)))
             continue
@@ -135,12 +135,12 @@ def best_set(
             low, high = lo.copy(), hi.copy()
             low[split] = high[split] = choice
             if low.sum() <= k <= high.sum():
-                pushed += 1
+                count += 1
                 start = _moved(x, low, high, k)
-                heapq.heappush(heap, (-above, pushed, low, high, start))
+                heapq.heappush(heap, (-above, count, low, high, start))
     best = max(gains, key=lambda views: gains[views])
     bound_of_all = max([gains[best], closed, *(-node[0] for node in heap)])
-    return Best(list(best), gains[best], bound_of_all, nodes, root.prices, stopped)
+    return Best(list(best), gains[best], bound_of_all, nodes, root.prices, reason)
 
 
 def _noted(
@@ -176,14 +176,14 @@ def _fixed(
     largest of these bounds."""
     free = np.flatnonzero(hi > lo)
     order = free[np.argsort(-bound.prices[free], kind="stable")]
-    room, lo, hi, lost = k - int(lo.sum()), lo.copy(), hi.copy(), 0.0
+    room, lo, hi, ceiling = k - int(lo.sum()), lo.copy(), hi.copy(), 0.0
     if 0 < room < len(free):
         prices, inside = bound.prices[order], np.arange(len(free)) < room
         other = bound.value - np.where(inside, prices - prices[room], prices[room - 1] - prices)
         sure = other <= enough
         lo[order[sure & inside]], hi[order[sure & ~inside]] = 1, 0
-        lost = float(other[sure].max(initial=0.0))
-    return lo, hi, lost
+        ceiling = float(other[sure].max(initial=0.0))
+    return lo, hi, ceiling
 
 
 @dataclass(frozen=True)

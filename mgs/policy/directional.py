@@ -157,9 +157,9 @@ def _gains(
     """`gains` of some of the Gaussians. prior: Lambda [K,K]."""
     S = np.linalg.inv(prior + information(points, taken, degree))
     y, W = basis(points, candidates, degree), candidates.seen.T.astype(np.float64)
-    moved = y @ S
-    explained = W * (moved * y).sum(2)
+    Sy = y @ S
+    leverages = W * (Sy * y).sum(2)
     if dome is None:
-        return np.asarray(1.5 * np.log1p(explained).sum(0))
+        return np.asarray(1.5 * np.log1p(leverages).sum(0))
     M = information(points, dome, degree)
-    return np.asarray((W * ((moved @ M) * moved).sum(2) / (1 + explained)).sum(0))
+    return np.asarray((W * ((Sy @ M) * Sy).sum(2) / (1 + leverages)).sum(0))

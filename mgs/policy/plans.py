@@ -21,23 +21,23 @@ def planned_views(gains: PoolGains, candidates: Sequence[int], count: int) -> li
 
     gains: after the views taken; changed. candidates: poses, more than `count`.
     """
-    chosen: list[int] = []
+    views: list[int] = []
     for _ in range(count):
-        free = [view for view in candidates if view not in chosen]
-        chosen.append(free[int(gains.of_poses(free).argmax())])
-        gains.take(chosen[-1:])
+        free = [view for view in candidates if view not in views]
+        views.append(free[int(gains.of_poses(free).argmax())])
+        gains.take(views[-1:])
     improved = True
     while improved:
         improved = False
-        for k, view in enumerate(chosen):
+        for k, view in enumerate(views):
             gains.drop(view)
-            free = [view] + [other for other in candidates if other not in chosen]
-            found = gains.of_poses(free)
-            best = int(found.argmax())
-            if found[best] > BETTER * found[0]:
-                chosen[k], improved = free[best], True
-            gains.take([chosen[k]])
-    return chosen
+            free = [view] + [other for other in candidates if other not in views]
+            values = gains.of_poses(free)
+            best = int(values.argmax())
+            if values[best] > BETTER * values[0]:
+                views[k], improved = free[best], True
+            gains.take([views[k]])
+    return views
 
 
 def planned_path(
@@ -50,14 +50,14 @@ def planned_path(
     """
     paths = [(0.0, gains)]
     for _ in range(count):
-        found: dict[tuple[frozenset[int], int], tuple[float, int, PoolGains]] = {}
+        longer: dict[tuple[frozenset[int], int], tuple[float, int, PoolGains]] = {}
         for total, path in paths:
             near = reach(path.taken)
             for view, gain in zip(near, path.of_poses(near), strict=True):
                 key = frozenset([*path.taken, view]), view
                 better = total + float(gain), view, path
-                found[key] = max(found.get(key, better), better, key=lambda one: one[0])
-        best = sorted(found.values(), key=lambda one: one[0], reverse=True)[:WIDTH]
+                longer[key] = max(longer.get(key, better), better, key=lambda one: one[0])
+        best = sorted(longer.values(), key=lambda one: one[0], reverse=True)[:WIDTH]
         if not best:
             break
         paths = [(total, path.copy()) for total, _, path in best]

@@ -76,8 +76,8 @@ class PoolGains:
             dr.opaque(mi.Float64, variance[a] if a == b else 0.0, len(points)) for a, b in upper
         ]
         y = self._harmonics(self.of, self.by)
-        moved = [float(v) * value for v, value in zip(variance, y, strict=True)]
-        self.g, self.M, self.q = _dot(moved, y), None, None
+        Sy = [float(v) * value for v, value in zip(variance, y, strict=True)]
+        self.g, self.M, self.q = _dot(Sy, y), None, None
         if dome is not None:
 
             def part(some: slice) -> NDArray[np.float64]:
@@ -85,7 +85,7 @@ class PoolGains:
 
             M = np.concatenate(in_parts(len(points), part))
             self.M = [mi.Float64(padded(M[:, a, b], np.float64)) for a, b in upper]
-            self.q = _dot(_times([_at(entry, self.of) for entry in self.M], moved), moved)
+            self.q = _dot(_times([_at(entry, self.of) for entry in self.M], Sy), Sy)
         dr.eval(self.S, self.M, self.g, self.q)
 
     def copy(self) -> PoolGains:
@@ -98,11 +98,11 @@ class PoolGains:
     def of_poses(self, poses: Sequence[int]) -> NDArray[np.float64]:
         """Gain of each of these poses [C]."""
         weights = mi.Float64(self.weights)
-        explained = weights * self.g
+        leverages = weights * self.g
         if self.q is None:
-            of_pairs = 1.5 * np.log1p(explained)
+            of_pairs = 1.5 * np.log1p(leverages)
         else:
-            of_pairs = weights * self.q / (1 + explained)
+            of_pairs = weights * self.q / (1 + leverages)
         sums = np.bincount(np.asarray(self.by), np.asarray(of_pairs), len(self.pool.positions))
         return np.asarray(sums[list(poses)], np.float64)
 

@@ -37,10 +37,10 @@ def farthest_pose(candidates: Array, taken: Array, centre: Array) -> Array:
 
 def spread(candidates: Array, taken: Array, centre: Array) -> list[int]:
     """Order in which `farthest_pose` takes all candidates [C,3] after the cameras taken [T,3]."""
-    order, left = list[int](), list(range(len(candidates)))
-    while left:
+    order, rest = list[int](), list(range(len(candidates)))
+    while rest:
         so_far = np.concatenate([taken, candidates[order]])
-        order.append(left.pop(int(farthest_pose(candidates[left], so_far, centre).argmax())))
+        order.append(rest.pop(int(farthest_pose(candidates[rest], so_far, centre).argmax())))
     return order
 
 

@@ -143,11 +143,11 @@ class Relaxation:
 
         def part(some: slice) -> Floats:
             z, A = self._at(x, some)
-            explained = np.einsum("nvk,nvk->nv", z @ np.linalg.inv(A), z)
+            leverages = np.einsum("nvk,nvk->nv", z @ np.linalg.inv(A), z)
             if self.over is None:
-                return np.asarray(self.scale * np.log1p(explained).sum(0))
+                return np.asarray(self.scale * np.log1p(leverages).sum(0))
             slope = self._phi(A, some)[1]
-            return np.asarray((np.einsum("nvk,nvk->nv", z @ slope, z) / (1 + explained)).sum(0))
+            return np.asarray((np.einsum("nvk,nvk->nv", z @ slope, z) / (1 + leverages)).sum(0))
 
         return np.where(x > 0, 0.0, sum(in_parts(len(self.base), part)))
 
@@ -167,17 +167,17 @@ class Relaxation:
         if len(self.base) > 2 * len(self.coarse.base):
             x = self.coarse.bound(x, box, tolerance, until).weights
         k, best, lower = round(float(x.sum())), None, -np.inf
-        (value, slope), stopped = self.tangent(x), "steps"
+        (value, slope), reason = self.tangent(x), "steps"
         for _ in range(STEPS):
             above = value + float(slope @ (_largest(slope, *box, k) - x))
             if best is None or above < best.value:
-                best = Bound(above, x, slope, 0.0, stopped)
+                best = Bound(above, x, slope, 0.0, reason)
             lower = max(lower, value)
             if best.value - lower <= tolerance * best.value or best.value <= enough:
-                stopped = "gap"
+                reason = "gap"
                 break
             if time.monotonic() > until:
-                stopped = "time"
+                reason = "time"
                 break
             d = _newton_step(self.coarse.curvature(x), slope, x, *box)
             t, ascent = 1.0, float(slope @ d)
@@ -187,7 +187,7 @@ class Relaxation:
                 new, after = self.tangent(x + t * d)
             x, value, slope = x + t * d, new, after
         assert best is not None
-        return best._replace(gap=(best.value - lower) / max(best.value, 1e-300), stopped=stopped)
+        return best._replace(gap=(best.value - lower) / max(best.value, 1e-300), stopped=reason)
 
     def _taken(self, views: Iterable[int]) -> Floats:
         x = np.zeros(self.candidates)
@@ -279,13 +279,13 @@ def directional(
         return np.concatenate(in_parts(len(means), part))
 
     base = np.diag(precision(degree, tau, lam)) + summed(taken)
-    made = Relaxation(len(centres), vectors, base, scale=1.5)
+    relaxation = Relaxation(len(centres), vectors, base, scale=1.5)
     if dome is not None:
-        made = Relaxation(len(centres), vectors, base, summed(dome))
+        relaxation = Relaxation(len(centres), vectors, base, summed(dome))
     if 8 * base.shape[1] * candidates.seen.size > VIEW_BYTES:
-        return made
+        return relaxation
     z = np.concatenate(in_parts(len(means), vectors))
-    return replace(made, vectors=lambda some: z[some])
+    return replace(relaxation, vectors=lambda some: z[some])
 
 
 def d_optimal(F: Array, H: Array, lam: Array) -> Relaxation:
@@ -300,16 +300,16 @@ def d_optimal(F: Array, H: Array, lam: Array) -> Relaxation:
     return Relaxation(len(F), vectors, base, scale=1 / base.size)
 
 
-def checked(seen: Array) -> None:
+def checked(per_view: Array) -> None:
     """Raise InputError where candidates have no number, or none of them sees anything."""
-    check_finite(seen)
-    if not len(seen) or not np.any(seen):
-        raise InputError(f"certificate: none of the {len(seen)} candidates sees the object")
+    check_finite(per_view)
+    if not len(per_view) or not np.any(per_view):
+        raise InputError(f"certificate: none of the {len(per_view)} candidates sees the object")
 
 
-def check_finite(seen: Array) -> None:
+def check_finite(per_view: Array) -> None:
     """Raise InputError where a candidate's information is not finite."""
-    bad = [v for v, of_view in enumerate(seen) if not np.isfinite(of_view).all()]
+    bad = [v for v, of_view in enumerate(per_view) if not np.isfinite(of_view).all()]
     if bad:
         raise InputError(f"certificate: candidate {bad[0]} has information that is not finite")
 
@@ -350,9 +350,9 @@ class Coverage:
     @cached_property
     def shares(self) -> tuple[Floats, Floats]:
         """Different shares of what is missing, at most 1 [n,C], and their numbers of Gaussians."""
-        missing = np.asarray(self.lam - self.H, np.float64)
-        some = (missing >= 0).all(axis=1) & observed(self.H + self.F.sum(axis=0), self.lam)
-        share = (self.F[:, some] / np.maximum(missing[some], 1e-300)).max(axis=2)
+        deficit = np.asarray(self.lam - self.H, np.float64)
+        some = (deficit >= 0).all(axis=1) & observed(self.H + self.F.sum(axis=0), self.lam)
+        share = (self.F[:, some] / np.maximum(deficit[some], 1e-300)).max(axis=2)
         rows, counts = np.unique(np.minimum(share.T, 1), axis=0, return_counts=True)
         return rows, counts.astype(np.float64)
 
@@ -385,7 +385,7 @@ class Coverage:
         size = round(float(x.sum()))
         most = np.sort(rows * box[1], axis=1)[:, -size:].sum(axis=1)
         rows, counts = rows[most >= 1 - 1e-6], counts[most >= 1 - 1e-6]
-        slopes, heights, best, lower, stopped = [], [], None, 0.0, "steps"
+        slopes, heights, best, lower, reason = [], [], None, 0.0, "steps"
         for _ in range(CUTS):
             share = rows @ x
             lower = max(lower, value := float(counts @ np.minimum(share, 1)))
@@ -404,15 +404,15 @@ class Coverage:
             prices, x = mean @ slopes, solved.x[:-1]
             above = float(mean @ heights + prices @ _largest(prices, *box, size))
             if best is None or above < best.value:
-                best = Bound(above, x, prices, 0.0, stopped)
+                best = Bound(above, x, prices, 0.0, reason)
             if best.value - lower <= tolerance * best.value or best.value <= enough:
-                stopped = "gap"
+                reason = "gap"
                 break
             if time.monotonic() > until:
-                stopped = "time"
+                reason = "time"
                 break
         assert best is not None
-        return best._replace(gap=(best.value - lower) / max(best.value, 1e-300), stopped=stopped)
+        return best._replace(gap=(best.value - lower) / max(best.value, 1e-300), stopped=reason)
 
 
 Criterion = Relaxation | Coverage

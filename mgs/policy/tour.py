@@ -110,9 +110,9 @@ def insertions(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Least metres that each stop adds to a tour [C], and the index in the tour that it takes."""
     before, after, new = list(tour[:-1]), list(tour[1:]), list(stops)
-    added = matrix[np.ix_(new, before)] + matrix[np.ix_(new, after)] - matrix[before, after]
-    place = added.argmin(axis=1)
-    return np.maximum(added[np.arange(len(new)), place], 0.0), place + 1
+    extra = matrix[np.ix_(new, before)] + matrix[np.ix_(new, after)] - matrix[before, after]
+    place = extra.argmin(axis=1)
+    return np.maximum(extra[np.arange(len(new)), place], 0.0), place + 1
 
 
 def two_opt(matrix: Array, tour: Sequence[int]) -> list[int]:
@@ -131,10 +131,10 @@ def two_opt(matrix: Array, tour: Sequence[int]) -> list[int]:
 
 def flying_order(matrix: Array, start: int, stops: Sequence[int], home: int) -> list[int]:
     """Stops in the order of a short tour from `start` to `home`: nearest next, then 2-opt."""
-    tour, left = [start], list(stops)
-    while left:
-        nearest = min(left, key=lambda stop: (matrix[tour[-1], stop], stop))
-        left.remove(nearest)
+    tour, rest = [start], list(stops)
+    while rest:
+        nearest = min(rest, key=lambda stop: (matrix[tour[-1], stop], stop))
+        rest.remove(nearest)
         tour.append(nearest)
     return two_opt(matrix, [*tour, home])[1:-1]
 
@@ -147,19 +147,19 @@ def grown(
     The stop that is picked joins at its cheapest place, then 2-opt shortens the tour. The cost of a
     stop is the share of the limits that it adds, and `per_stop`.
     """
-    way, left, total = list(tour), list(free), 0.0
-    while left:
+    way, rest, total = list(tour), list(free), 0.0
+    while rest:
         metres, stops = tour_length(legs, way), len(way) - 2
-        added, places = insertions(legs, way, left)
-        shares = share(metres + added, stops + 1)
+        extra, places = insertions(legs, way, rest)
+        shares = share(metres + extra, stops + 1)
         fits = np.flatnonzero(shares <= 1 + ROUNDING)
         if not len(fits):
             break
         cost = shares[fits] - share(np.array(metres), stops) + per_stop
-        stop, gain = pick([left[k] for k in fits], cost)
-        way.insert(int(places[left.index(stop)]), stop)
+        stop, gain = pick([rest[k] for k in fits], cost)
+        way.insert(int(places[rest.index(stop)]), stop)
         way, total = two_opt(legs, way), total + gain
-        left.remove(stop)
+        rest.remove(stop)
     return way, total
 
 
@@ -177,12 +177,12 @@ def planned_tour(
     them, as long as that raises the total gain. gains: after the views taken; changed.
     """
 
-    def of(held: PoolGains) -> Pick:
+    def of(state: PoolGains) -> Pick:
         def pick(stops: list[int], cost: NDArray[np.float64]) -> tuple[int, float]:
-            found = held.of_poses(stops)
-            best = int((found / cost).argmax())
-            held.take([stops[best]])
-            return stops[best], float(found[best])
+            values = state.of_poses(stops)
+            best = int((values / cost).argmax())
+            state.take([stops[best]])
+            return stops[best], float(values[best])
 
         return pick
 
@@ -194,14 +194,14 @@ def planned_tour(
             dropped = tour[first:-1][:width]
             if len(dropped) < width:
                 continue
-            held, lost = gains.copy(), 0.0
+            state, loss = gains.copy(), 0.0
             for stop in dropped:
-                held.drop(stop)
-                lost += float(held.of_poses([stop])[0])
+                state.drop(stop)
+                loss += float(state.of_poses([stop])[0])
             rest = two_opt(legs, [stop for stop in tour[:-1] if stop not in dropped] + tour[-1:])
             others = [stop for stop in free if stop not in rest and stop != dropped[0]]
-            new, won = grown(legs, rest, others, of(held), share, per_stop)
-            new, more = grown(legs, new, dropped[:1], of(held), share, per_stop)
-            if won + more > BETTER * lost:
-                tour, gains, improved = new, held, True
+            new, won = grown(legs, rest, others, of(state), share, per_stop)
+            new, more = grown(legs, new, dropped[:1], of(state), share, per_stop)
+            if won + more > BETTER * loss:
+                tour, gains, improved = new, state, True
     return tour

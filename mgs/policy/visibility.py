@@ -57,7 +57,7 @@ class Visibility:
         self.positions = np.array([camera.position for camera in cameras])
         self.seen, self.pool, self.dome = cache(self._seen), cache(self._pool), cache(self._dome)
         self.planned, self.path = cache(self._planned), cache(self._path)
-        self.held: dict[Model, PoolGains] = {}
+        self.states: dict[Model, PoolGains] = {}
         # A copy, because the kernel returns part of a larger array.
         self.information = kept_within(
             IMAGE_BYTES, lambda frame: np.array(exact(cameras[frame])), lambda F: F.nbytes
@@ -77,30 +77,30 @@ class Visibility:
         into the memory, they are computed from scratch.
         """
         model = degree, tau, over_dome
-        held = self.held.get(model)
-        if held is None or held.taken != list(taken[: len(held.taken)]):
-            held = self.plan_gains(model)
-            if held is None:
+        state = self.states.get(model)
+        if state is None or state.taken != list(taken[: len(state.taken)]):
+            state = self.plan_gains(model)
+            if state is None:
                 pool, dome = self.pool(), self.dome() if over_dome else None
                 before, after = (
                     Views(pool.positions[list(some)], pool.seen[list(some)])
                     for some in (taken, candidates)
                 )
                 return gains(self.points, self.lam, degree, tau, before, after, dome)
-            self.held[model] = held
-        held.take(taken[len(held.taken) :])
-        return held.of_poses(candidates)
+            self.states[model] = state
+        state.take(taken[len(state.taken) :])
+        return state.of_poses(candidates)
 
     def _planned(
         self, taken: tuple[int, ...], candidates: tuple[int, ...], count: int, model: Model
     ) -> Sequence[int]:
         """Candidates to take next, as a set of at most `count` (`planned_views`); all where there
         are no `plan_gains`."""
-        held = self.plan_gains(model) if count < len(candidates) else None
-        if held is None:
+        state = self.plan_gains(model) if count < len(candidates) else None
+        if state is None:
             return candidates
-        held.take(taken)
-        return planned_views(held, candidates, count)
+        state.take(taken)
+        return planned_views(state, candidates, count)
 
     def _path(
         self,
@@ -114,15 +114,15 @@ class Visibility:
         before (`planned_path`); none where there are no `plan_gains`."""
 
         def reach(views: Sequence[int]) -> list[int]:
-            left = [i for i in candidates if i not in views]
-            near = nearest_poses(self.positions[left], self.positions[views[-1]], nearest)
-            return [left[k] for k in near]
+            rest = [i for i in candidates if i not in views]
+            near = nearest_poses(self.positions[rest], self.positions[views[-1]], nearest)
+            return [rest[k] for k in near]
 
-        held = self.plan_gains(model, FEW)
-        if held is None:
+        state = self.plan_gains(model, FEW)
+        if state is None:
             return []
-        held.take(taken)
-        return planned_path(held, reach, count)
+        state.take(taken)
+        return planned_path(state, reach, count)
 
     def plan_gains(self, model: Model, most: int | None = None) -> PoolGains | None:
         """Gains of all cameras for about `most` of the Gaussians, by default all, before any view

@@ -93,8 +93,8 @@ class Prior:
     def with_up(self, up: Sequence[float]) -> Prior:
         """The prior turned so that this direction in the dataset's files is +Z."""
         old, new = self.world, World(unit_up(up))
-        turned = self.moved(lambda points: new.enter(old.leave(points)))
-        return replace(turned, numbers=self.numbers | {"up": list(new.up)})
+        prior = self.moved(lambda points: new.enter(old.leave(points)))
+        return replace(prior, numbers=self.numbers | {"up": list(new.up)})
 
     def moved(self, change: Callable[[np.ndarray], np.ndarray]) -> Prior:
         """The prior with `change` applied to its vertices, points and normals [N,3]."""
@@ -111,7 +111,7 @@ def build_prior(
     source: str | None = None,
     points: Path | None = None,
     shown: Sequence[Frame] | None = None,
-    **given: Any,
+    **fields: Any,
 ) -> Prior:
     """Build the prior of a dataset, as in `build_prior("demo/dataset", gaussians=2000)`.
 
@@ -124,10 +124,10 @@ def build_prior(
     Raises InputError if the dataset lacks the source, or no surface is found that a frame sees.
     """
     dataset = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
-    asked = replace(settings or PriorSettings(), **given)
+    settings = replace(settings or PriorSettings(), **fields)
     if source == "random" and shown is not None:
-        return _random_prior(dataset, asked, shown)
-    return prior_and_cloud(dataset, asked, on_stage, source=source, points=points)[0]
+        return _random_prior(dataset, settings, shown)
+    return prior_and_cloud(dataset, settings, on_stage, source=source, points=points)[0]
 
 
 def prior_and_cloud(
@@ -144,16 +144,16 @@ def prior_and_cloud(
     `scattered`, `segment_dataset`, `poisson_mesh` and `sample_surface`, and if no frame sees the
     mesh; NoSurface, which holds the cloud, if points give no surface.
     """
-    chosen = source_of(dataset, source, points)
-    if chosen == "random":
+    kind = source_of(dataset, source, points)
+    if kind == "random":
         return _random_prior(dataset, settings, dataset.frames), None
-    if chosen != "depth":
+    if kind != "depth":
         check_photographs(dataset.frames, of_object=True)
         check_masks(dataset.frames)
-    if chosen == "depth":
+    if kind == "depth":
         surface = _depth_surface(dataset, settings, on_stage)
     else:
-        surface = surface_of(dataset, chosen, settings, on_stage, points)
+        surface = surface_of(dataset, kind, settings, on_stage, points)
     mesh, segmented, cell = surface.mesh, surface.segmented, surface.cell
     on_stage("surface samples")
     residual, noise, plane = 0.0, 0.0, None
@@ -166,10 +166,10 @@ def prior_and_cloud(
     cameras = [frame.camera for frame in dataset.frames]
     middle = mesh.vertices.mean(0)
     pixels = [np.linalg.norm(camera.position - middle) / camera.K[0, 0] for camera in cameras]
-    pixel = cell if chosen == "depth" else float(np.median(pixels))
-    closest = PIXELS_PER_SAMPLE if chosen == "depth" else PIXELS_OF_PHOTOGRAPHS
+    pixel = cell if kind == "depth" else float(np.median(pixels))
+    closest = PIXELS_PER_SAMPLE if kind == "depth" else PIXELS_OF_PHOTOGRAPHS
     samples, normals, spacing, sampled = _samples(mesh, settings, cameras, pixel, closest)
-    numbers = {"from": chosen, "frames": len(dataset.frames), **surface.numbers}
+    numbers = {"from": kind, "frames": len(dataset.frames), **surface.numbers}
     if segmented is not None and plane is not None:
         numbers |= {
             "plane_inliers": int(segmented.ground.sum()),
@@ -180,7 +180,7 @@ def prior_and_cloud(
     numbers |= {"fit_rms": residual, "depth_tolerance": tolerance, **sampled}
     numbers |= _place(dataset) | {"settings": asdict(settings)}
     truth = dataset.root / "rock.glb"
-    if truth.is_file() and chosen == "depth" and segmented is not None:
+    if truth.is_file() and kind == "depth" and segmented is not None:
         on_stage("distance to the true rock")
         numbers["truth"] = error_to_truth(
             samples, spacing, mesh, truth, dataset, segmented, settings.seed
@@ -251,8 +251,8 @@ def _samples(
     resolved = None
     if settings.resolved_by_cameras:
         resolved = resolution(mesh, cameras, closest_pixels)
-    asked, share = settings.gaussians, settings.backing
-    total = asked if isinstance(asked, int) else None
+    gaussians, share = settings.gaussians, settings.backing
+    total = gaussians if isinstance(gaussians, int) else None
     if resolved and resolved.samples * (1 + share) > MOST_GAUSSIANS:
         total = MOST_GAUSSIANS
     count = None if total is None else total - round(total * share / (1 + share))
@@ -305,14 +305,14 @@ def prior_from_mesh(
             "give a number or a spacing"
         )
     points, normals, spacing, sampled = _samples(mesh, settings, cameras)
-    used = {key: getattr(settings, key) for key in ("gaussians", "spacing", "seed", "backing")}
+    values = {key: getattr(settings, key) for key in ("gaussians", "spacing", "seed", "backing")}
     numbers = {
         "from": "mesh",
         "mesh": where,
         "depth_tolerance": spacing,
         **sampled,
         **_place(dataset or Dataset(Path(), ())),
-        "settings": used,
+        "settings": values,
     }
     prior = Prior(mesh, points, normals, spacing, spacing, numbers, sampled["backed"])
     return prior.moved(_as_in_files)
@@ -327,10 +327,10 @@ def outline_error(mesh: Mesh, frames: Sequence[Frame]) -> float:
     for frame in frames:
         if frame.mask_path is None and frame.rock_path is None:
             continue
-        mask, drawn = frame.mask(), depth(frame.camera) > 0
-        wrong = drawn & ~binary_dilation(mask, iterations=2)
-        wrong |= binary_erosion(mask, iterations=2, border_value=1) & ~drawn
-        errors.append(float(wrong.sum() / max((mask | drawn).sum(), 1)))
+        mask, silhouette = frame.mask(), depth(frame.camera) > 0
+        wrong = silhouette & ~binary_dilation(mask, iterations=2)
+        wrong |= binary_erosion(mask, iterations=2, border_value=1) & ~silhouette
+        errors.append(float(wrong.sum() / max((mask | silhouette).sum(), 1)))
     return float(np.median(errors)) if errors else math.nan
 
 

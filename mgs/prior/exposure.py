@@ -47,9 +47,9 @@ def solve_gains(colours: np.ndarray, weights: np.ndarray) -> np.ndarray:
     the weighted mean colours, minimises the sum over pairs of n_ij (l_i - l_j - d_ij)^2 /
     RATIO_STD^2 plus the sum over images of l_i^2 / GAIN_STD^2.
     """
-    known = (np.nan_to_num(colours, nan=np.inf) <= SATURATED).all(axis=2)
-    weights = np.where(known, weights, 0.0)
-    values = np.where(known[..., None], colours, 0.0) * weights[..., None]
+    valid = (np.nan_to_num(colours, nan=np.inf) <= SATURATED).all(axis=2)
+    weights = np.where(valid, weights, 0.0)
+    values = np.where(valid[..., None], colours, 0.0) * weights[..., None]
     shared = weights @ weights.T
     # Of the colours of i, over the samples that it shares with j.
     sums = np.stack([values[..., c] @ weights.T for c in range(3)], -1)
@@ -59,8 +59,8 @@ def solve_gains(colours: np.ndarray, weights: np.ndarray) -> np.ndarray:
     precision = np.where(lit, shared, 0) / RATIO_STD**2
     ratio = np.log(np.maximum(means, DARK) / np.maximum(means.swapaxes(0, 1), DARK))
     matrix = np.diag(precision.sum(axis=1) + GAIN_STD**-2) - precision
-    found = np.linalg.solve(matrix, (precision[..., None] * ratio).sum(axis=1))
-    return np.exp(found - found.mean(axis=0))
+    log_gains = np.linalg.solve(matrix, (precision[..., None] * ratio).sum(axis=1))
+    return np.exp(log_gains - log_gains.mean(axis=0))
 
 
 def without_gain(target: np.ndarray, gain: np.ndarray) -> np.ndarray:
@@ -77,7 +77,7 @@ def exposure_of(prior: Prior) -> Callable[[Sequence[Frame]], np.ndarray]:
     count = prior.numbers.get("triangulated", len(prior.points))
     some = slice(None, count, max(1, -(-count // SAMPLES)))
     points, normals = prior.points[some], prior.normals[some]
-    depth, known = depth_of(prior), dict[str, tuple[np.ndarray, np.ndarray]]()
+    depth, cache = depth_of(prior), dict[str, tuple[np.ndarray, np.ndarray]]()
 
     def shown(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
         colours = np.full((len(points), 3), np.nan)
@@ -89,9 +89,9 @@ def exposure_of(prior: Prior) -> Callable[[Sequence[Frame]], np.ndarray]:
 
     def gains(frames: Sequence[Frame]) -> np.ndarray:
         for frame in frames:
-            if frame.name not in known:
-                known[frame.name] = shown(frame)
-        colours, weights = zip(*(known[frame.name] for frame in frames), strict=True)
+            if frame.name not in cache:
+                cache[frame.name] = shown(frame)
+        colours, weights = zip(*(cache[frame.name] for frame in frames), strict=True)
         return solve_gains(np.stack(colours), np.stack(weights))
 
     return gains

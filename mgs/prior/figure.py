@@ -54,8 +54,8 @@ class _View:
         """
         points = self.picture(points)
         if len(points) > MAX_DOTS:
-            chosen = np.random.default_rng(0).choice(len(points), MAX_DOTS, replace=False)
-            points, colour = points[chosen], colour[chosen]
+            subset = np.random.default_rng(0).choice(len(points), MAX_DOTS, replace=False)
+            points, colour = points[subset], colour[subset]
         order = np.argsort(points[:, 2])
         x, y = points[order, :2].T
         cmap = "viridis" if colour.ndim == 1 else None
@@ -95,20 +95,20 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
         axes[-1].set_title(f"{samples}\nspacing {spacing}")
 
 
-def draw_refused(path: str | Path, points: np.ndarray, kept: np.ndarray) -> None:
+def draw_refused(path: str | Path, points: np.ndarray, rock: np.ndarray) -> None:
     """Write the figure of a cloud [P,3] without surface, from the side and from above, as a PNG.
 
-    kept: [P] bool, taken for the object, blue. Raises InputError if it cannot be written.
+    rock: [P] bool, taken for the object, blue. Raises InputError if it cannot be written.
     """
-    object_points = points[kept] if kept.any() else points
+    object_points = points[rock] if rock.any() else points
     middle = np.median(object_points, axis=0)
     reach = 1.5 * float(np.quantile(np.linalg.norm(object_points - middle, axis=1), 0.95))
-    tint = np.where(kept[:, None], BLUE, TAN)
+    tint = np.where(rock[:, None], BLUE, TAN)
     oblique = _oblique(UP)
     above = np.stack([oblique[0], np.cross(UP, oblique[0]), UP])
     with drawing(path, 7, 4.2, FRAMED, dpi=100) as figure:
         views = {"from the side": oblique, "from above": above}
-        taken = f"{int(kept.sum()):,} taken for the object (blue)"
+        taken = f"{int(rock.sum()):,} taken for the object (blue)"
         for axis, (name, axes) in zip(figure.subplots(1, 2), views.items(), strict=True):
             _View(axes, middle, reach).dots(axis, points, tint, 2, 1.5)
             axis.set_title(f"{name}: {len(points):,} points,\n{taken}")
@@ -120,15 +120,15 @@ def _cloud_panels(axes, view: _View, segmented: SegmentedCloud) -> None:
     cloud, rock, ground = segmented.cloud.points, segmented.rock_points, segmented.ground
     if segmented.plane is None:
         height = cloud[:, 2] - np.min(rock[:, 2])
-        other, named = cKDTree(rock).query(cloud)[0] > 0, "not the object's"
+        other, label = cKDTree(rock).query(cloud)[0] > 0, "not the object's"
     else:
         height = segmented.plane.height(cloud)
-        other, named = ground, f"ground plane: {int(ground.sum()):,} inliers"
+        other, label = ground, f"ground plane: {int(ground.sum()):,} inliers"
     near = np.linalg.norm(cloud - view.centre, axis=1) < 4 * view.reach
     tint = np.where(other[near][:, None], TAN, BLUE)
     panels = [
         (f"cloud: {len(cloud):,} points\ncoloured by height", cloud[near], height[near], 2.2),
-        (f"{named} (tan)\nthe rest in blue", cloud[near], tint, 2.2),
+        (f"{label} (tan)\nthe rest in blue", cloud[near], tint, 2.2),
         (f"rock cluster: {len(rock):,} points", rock, rock[:, 2], 1.0),
     ]
     for axis, (title, points, colour, zoom) in zip(axes, panels, strict=True):

@@ -140,11 +140,11 @@ class _View:
         padded[: len(points)] = np.where(inside[:, None], pixels - 0.5, 0)
         at = padded.reshape(-1, ROW, 2)  # OpenCV takes images of up to 32,767 rows
         remap: Any = cv2.remap  # its stub takes no None
-        found = [
+        parts = [
             remap(self.distance, part, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             for part in np.array_split(at, -(-len(at) // ROW))
         ]
-        value = np.concatenate(found).ravel()[: len(points)] * (z / self.camera.K[0, 0])
+        value = np.concatenate(parts).ravel()[: len(points)] * (z / self.camera.K[0, 0])
         return np.where(inside, value, np.inf)
 
 
@@ -195,12 +195,12 @@ def _inside(views: Sequence[_View], points: np.ndarray, reach: float) -> np.ndar
     """Least value of points [N,3] over the views, clipped to +-reach, float32 [N]; -reach if fewer
     than LEAST_VIEWS have the point in their image."""
     least, count = np.full(len(points), np.inf), np.zeros(len(points), int)
-    left = np.arange(len(points))
+    active = np.arange(len(points))
     for view in views:
-        value = view(points[left])
-        count[left] += np.isfinite(value)
-        least[left] = np.minimum(least[left], value)
-        left = left[least[left] > -reach]  # what is carved deeper is far from the surface
+        value = view(points[active])
+        count[active] += np.isfinite(value)
+        least[active] = np.minimum(least[active], value)
+        active = active[least[active] > -reach]  # what is carved deeper is far from the surface
     outside = (least <= -reach) | (count < min(LEAST_VIEWS, len(views)))
     return np.where(outside, -reach, np.minimum(least, reach)).astype(np.float32)
 
@@ -212,9 +212,9 @@ def _odd_one(views: Sequence[_View], points: np.ndarray) -> tuple[int, float, fl
     points: [N,3], of the coarse grid.
     """
     values = np.stack([view(points) for view in views])
-    carved, seen = values <= 0, np.isfinite(values).sum(axis=0)
-    above = carved.sum(axis=0) - np.maximum(FEW * seen, 1)
-    above[seen < min(LEAST_VIEWS, len(views))] = len(views)
+    carved, count = values <= 0, np.isfinite(values).sum(axis=0)
+    above = carved.sum(axis=0) - np.maximum(FEW * count, 1)
+    above[count < min(LEAST_VIEWS, len(views))] = len(views)
     share = carved[:, above <= max(above.min(), 0)].mean(axis=1)
     return int(share.argmax()), float(share.max()), float(np.median(share))
 

@@ -47,7 +47,7 @@ ONE_SIDED = 0.5
 """Least length of the mean normal of points seen from one side."""
 
 
-def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = None) -> str:
+def source_of(dataset: Dataset, source: str | None = None, points: Path | None = None) -> str:
     """Source of a dataset's prior: the one asked for, else the first of depth, points, hull and
     random.
 
@@ -61,14 +61,14 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
         "random": True,
     }
     there = [name for name, is_there in has.items() if is_there]
-    if asked is None:
-        asked = "points" if points is not None else there[0]
-    if asked in there:
-        return asked
-    if asked not in (None, *SOURCES):
-        raise InputError(f"source {asked!r}: is unknown; choose one of {', '.join(SOURCES)}")
+    if source is None:
+        source = "points" if points is not None else there[0]
+    if source in there:
+        return source
+    if source not in (None, *SOURCES):
+        raise InputError(f"source {source!r}: is unknown; choose one of {', '.join(SOURCES)}")
     lacks = {"depth": "no depth images", "points": f"no points ({CLOUD})", "hull": "no masks"}
-    missing = lacks.get(asked, "no mesh of its own")
+    lack = lacks.get(source, "no mesh of its own")
     ways = {
         "depth": "import data with depth",
         "hull": "import with `masks`, then take the source hull",
@@ -77,7 +77,7 @@ def source_of(dataset: Dataset, asked: str | None = None, points: Path | None = 
     }
     cures = [f"take the source {name}" for name in there if name != "random"]
     cures += [way for name, way in ways.items() if name not in there]
-    raise InputError(f"{dataset.root}: has {missing}; {', or '.join(cures)}")
+    raise InputError(f"{dataset.root}: has {lack}; {', or '.join(cures)}")
 
 
 def check_photographs(frames: Sequence[Frame], of_object: bool) -> None:
@@ -91,10 +91,10 @@ def check_photographs(frames: Sequence[Frame], of_object: bool) -> None:
     if not of_object:
         return
     point = focus(frames).point[None]
-    seen = [bool(in_image(frame.camera, *frame.camera.project(point))[0]) for frame in frames]
-    if np.mean(seen) < LEAST_OVERLAP:
+    inside = [bool(in_image(frame.camera, *frame.camera.project(point))[0]) for frame in frames]
+    if np.mean(inside) < LEAST_OVERLAP:
         raise InputError(
-            f"prior: the photographs do not overlap: of {len(frames)} cameras only {sum(seen)} "
+            f"prior: the photographs do not overlap: of {len(frames)} cameras only {sum(inside)} "
             "have in their image what all look at; walk around the object, or check the poses"
         )
 
@@ -131,9 +131,9 @@ def surface_of(
     except NoSurface:
         raise
     except InputError as error:
-        points_kept = segmented.cloud.points
-        kept = cKDTree(segmented.rock_points).query(points_kept)[0] == 0
-        raise NoSurface(str(error), points_kept, kept) from None
+        cloud_points = segmented.cloud.points
+        inside = cKDTree(segmented.rock_points).query(cloud_points)[0] == 0
+        raise NoSurface(str(error), cloud_points, inside) from None
     numbers = {
         "points": len(cloud.points),
         "points_kept": len(segmented.cloud.points),
@@ -191,5 +191,5 @@ def _thinned(mesh: Mesh, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     sums = [np.bincount(index, column, len(points)) for column in mesh.vertex_normals.T]
     normals = np.stack(sums, 1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    kept = length[:, 0] > 1e-6
-    return points[kept], (normals / np.maximum(length, 1e-12))[kept]
+    valid = length[:, 0] > 1e-6
+    return points[valid], (normals / np.maximum(length, 1e-12))[valid]

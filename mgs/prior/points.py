@@ -82,14 +82,14 @@ def spacing_of(points: np.ndarray) -> float:
 
 def reliable(cloud: SparseCloud) -> np.ndarray:
     """Mask [N] of the points that are well triangulated, as far as known."""
-    kept = np.ones(len(cloud.points), bool)
+    good = np.ones(len(cloud.points), bool)
     if cloud.track is not None:
-        kept &= cloud.track >= LEAST_TRACK
+        good &= cloud.track >= LEAST_TRACK
     if cloud.error is not None:
         middle = np.median(cloud.error)
         sigma = SIGMA_FROM_MAD * np.median(np.abs(cloud.error - middle))
-        kept &= cloud.error <= middle + ERROR_LIMIT * sigma
-    return kept if kept.sum() >= LEAST_POINTS else np.ones(len(kept), bool)
+        good &= cloud.error <= middle + ERROR_LIMIT * sigma
+    return good if good.sum() >= LEAST_POINTS else np.ones(len(good), bool)
 
 
 def on_surface(points: np.ndarray) -> np.ndarray:
@@ -129,9 +129,9 @@ def main_cluster(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, in
     pieces, piece = connected_components(touching, directed=False)
     joined = np.where(labels >= 0, piece[labels], -1)
     total = np.bincount(joined[joined >= 0], weight[joined >= 0], pieces)
-    chosen = joined == total.argmax()
-    near = cKDTree(points[chosen]).query(points)[0] < JOINED * spacing_of(points)
-    return chosen | (near & (joined < 0)), int(pieces)
+    main = joined == total.argmax()
+    near = cKDTree(points[main]).query(points)[0] < JOINED * spacing_of(points)
+    return main | (near & (joined < 0)), int(pieces)
 
 
 def segment_points(
@@ -150,26 +150,26 @@ def segment_points(
     plane, ground, clusters = None, np.zeros(len(points), bool), 0
     if has_masks(frames):
         share, count = mask_share(points, frames, MASK_SLACK)
-        kept = (share >= MASK_SHARE) & (count >= LEAST_TRACK)
+        inside = (share >= MASK_SHARE) & (count >= LEAST_TRACK)
         where = "inside the masks; give masks and poses that fit, or take the source hull"
     else:
         on_stage("ground plane and clusters")
         plane = _plane_or_none(cloud, frames, settings)
         if plane is not None:
             ground = np.abs(plane.height(points)) <= plane.tolerance
-        kept, clusters = _cluster_looked_at(cloud, frames, plane)
+        inside, clusters = _cluster_looked_at(cloud, frames, plane)
         where = "above the ground" if plane else "near what the cameras look at"
         where = f"in one cluster {where}; give masks of the object"
-    if kept.sum() >= LEAST_POINTS:
-        kept[kept] = on_surface(points[kept])
-    if kept.sum() < LEAST_POINTS:
+    if inside.sum() >= LEAST_POINTS:
+        inside[inside] = on_surface(points[inside])
+    if inside.sum() < LEAST_POINTS:
         raise NoSurface(
-            f"{dataset.root}: only {kept.sum()} of {len(sparse.points)} points lie {where}",
+            f"{dataset.root}: only {inside.sum()} of {len(sparse.points)} points lie {where}",
             points,
-            kept,
+            inside,
         )
-    rock = points[kept]
-    normals = estimate_normals(rock, views[kept])
+    rock = points[inside]
+    normals = estimate_normals(rock, views[inside])
     return SegmentedCloud(cloud, plane, ground, rock, normals, 0.0, clusters)
 
 
@@ -199,13 +199,13 @@ def _cluster_looked_at(
     target = focus(frames)
     away = np.linalg.norm(cloud.points - target.point, axis=1) / target.distance
     height = np.ones(len(away)) if plane is None else plane.height(cloud.points)
-    kept = (away < REACH) & (height > (0 if plane is None else plane.tolerance))
+    near = (away < REACH) & (height > (0 if plane is None else plane.tolerance))
     weight = height * (1 - np.minimum(away / REACH, 1))
-    inside, clusters = main_cluster(cloud.points[kept], weight[kept])
+    inside, clusters = main_cluster(cloud.points[near], weight[near])
     if plane is not None and inside.sum() >= LEAST_POINTS:
-        inside = _grown(cloud.points[kept], inside)
-    kept[kept] = inside
-    return kept, clusters
+        inside = _grown(cloud.points[near], inside)
+    near[near] = inside
+    return near, clusters
 
 
 def _grown(points: np.ndarray, inside: np.ndarray) -> np.ndarray:
@@ -214,5 +214,5 @@ def _grown(points: np.ndarray, inside: np.ndarray) -> np.ndarray:
 
     eps = GROWN * float(np.ptp(points[inside], axis=0).max())
     labels = DBSCAN(eps=eps, min_samples=GROWN_NEIGHBOURS).fit_predict(points)
-    found = labels[inside & (labels >= 0)]
-    return inside | (labels == np.bincount(found).argmax()) if len(found) else inside
+    own = labels[inside & (labels >= 0)]
+    return inside | (labels == np.bincount(own).argmax()) if len(own) else inside

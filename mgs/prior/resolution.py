@@ -64,12 +64,12 @@ def resolution(
         facing = np.einsum("fk,fk->f", crosses, camera.position - middles) > 0
         size = z / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
         pixel = np.where(inside & facing & (size < pixel), size, pixel)
-    known = np.isfinite(pixel) & (areas > 0)
-    if not known.any():
+    in_view = np.isfinite(pixel) & (areas > 0)
+    if not in_view.any():
         raise InputError(
             "prior: no frame has the mesh in its image, so nothing says how many Gaussians; "
             "give `gaussians`"
         )
-    area = float(areas[known].sum())
-    typical = float(np.sqrt(area / (areas[known] / pixel[known] ** 2).sum()))
+    area = float(areas[in_view].sum())
+    typical = float(np.sqrt(area / (areas[in_view] / pixel[in_view] ** 2).sum()))
     return Resolution(typical, pixels * typical, area)

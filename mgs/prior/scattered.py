@@ -59,13 +59,13 @@ def scattered(
 
     shown = dataset.frames if shown is None else shown
     settings.refuse_shaping("a random start has no surface")
-    asked, rng = settings.gaussians, generator(settings.seed, "prior/random")
+    gaussians, rng = settings.gaussians, generator(settings.seed, "prior/random")
     pixels = sum(int(frame.mask().sum()) for frame in shown)
     count = min(max(pixels // PIXELS, GAUSSIANS), MOST_GAUSSIANS)
-    count = asked if isinstance(asked, int) else count
-    given, views_of_given = _triangulated(dataset, shown, count, rng)
-    if len(given) and not isinstance(asked, int):
-        count = min(count, max(round((1 + MOST_RANDOM) * len(given)), GAUSSIANS))
+    count = gaussians if isinstance(gaussians, int) else count
+    cloud, views_of_cloud = _triangulated(dataset, shown, count, rng)
+    if len(cloud) and not isinstance(gaussians, int):
+        count = min(count, max(round((1 + MOST_RANDOM) * len(cloud)), GAUSSIANS))
     middle = focus(dataset.frames).point
     reach = [
         np.linalg.norm(frame.camera.position - middle)
@@ -73,8 +73,8 @@ def scattered(
         for frame in dataset.frames
     ]
     radius, masked = float(np.median(reach)), has_masks(shown)
-    kept, drawn = [given], 0
-    while sum(map(len, kept)) < count and drawn < DRAWS * count:
+    parts, tries = [cloud], 0
+    while sum(map(len, parts)) < count and tries < DRAWS * count:
         directions = rng.normal(size=(count, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         distance = rng.random(count) ** (1 / 3)
@@ -82,23 +82,23 @@ def scattered(
             distance = np.where(rng.random(count) < 0.5, distance, FAR ** rng.random(count))
         points = middle + radius * distance[:, None] * directions
         share, views = mask_share(points, shown)
-        kept.append(points[(views > 0) & (share >= MASK_SHARE)])
-        drawn += count
-    points = np.concatenate(kept)[:count]
-    if len(points) < count and len(given) and not masked:
+        parts.append(points[(views > 0) & (share >= MASK_SHARE)])
+        tries += count
+    points = np.concatenate(parts)[:count]
+    if len(points) < count and len(cloud) and not masked:
         count = len(points)  # few places near what the cameras look at are in a picture
     if len(points) < count:
         raise InputError(
-            f"{dataset.root}: only {len(points)} of {drawn} random points lie inside all masks; "
+            f"{dataset.root}: only {len(points)} of {tries} random points lie inside all masks; "
             "poses and masks do not fit, correct or remove frames"
         )
     outwards = points - middle
     normals = outwards / np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-9)
-    normals[: len(given)] = views_of_given
+    normals[: len(cloud)] = views_of_cloud
     spacing = float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
     ball = trimesh.creation.icosphere(3, radius)
     mesh = Mesh(ball.vertices + middle, ball.faces, np.ones(len(ball.faces), bool))
-    numbers: dict[str, Any] = {"n": count, "triangulated": len(given), "spacing": spacing}
+    numbers: dict[str, Any] = {"n": count, "triangulated": len(cloud), "spacing": spacing}
     numbers |= {
         "radius": radius,
         "depth_tolerance": 2 * radius,
@@ -118,7 +118,7 @@ def _triangulated(
         return np.zeros((0, 3)), np.zeros((0, 3))
     cloud = read_cloud(dataset.root / CLOUD).upright(dataset.world)
     share, count = mask_share(cloud.points, shown)
-    kept = np.flatnonzero(reliable(cloud) & (count > 0) & (share >= MASK_SHARE))
-    kept = np.sort(rng.permutation(kept)[:most])
+    indices = np.flatnonzero(reliable(cloud) & (count > 0) & (share >= MASK_SHARE))
+    indices = np.sort(rng.permutation(indices)[:most])
     views = views_of(cloud, [frame.camera for frame in dataset.frames])
-    return cloud.points[kept], views[kept]
+    return cloud.points[indices], views[indices]

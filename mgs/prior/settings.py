@@ -38,8 +38,8 @@ class PriorSettings:
     @property
     def resolved_by_cameras(self) -> bool:
         """Whether the cameras decide the number of Gaussians."""
-        given = (self.gaussians, self.spacing, self.density)
-        return self.gaussians == "auto" or given == (None, None, None)
+        values = (self.gaussians, self.spacing, self.density)
+        return self.gaussians == "auto" or values == (None, None, None)
 
     def refuse_shaping(self, why: str) -> None:
         """Raise InputError if a Poisson depth is set, which needs a cloud.

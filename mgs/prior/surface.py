@@ -97,8 +97,8 @@ def _supported(solid: Any, points: np.ndarray) -> Any:
     owner = np.repeat(np.arange(len(pieces)), [len(each) for each in corners])
     nearest = owner[cKDTree(np.concatenate(corners)).query(points)[1]]
     share = np.bincount(nearest, minlength=len(pieces)) / len(points)
-    chosen = [piece for piece, part in zip(pieces, share, strict=True) if part >= SUPPORT]
-    return manifold3d.Manifold.compose(chosen)
+    main = [piece for piece, part in zip(pieces, share, strict=True) if part >= SUPPORT]
+    return manifold3d.Manifold.compose(main)
 
 
 def intersection(a: Mesh, b: Mesh) -> Mesh:
@@ -121,9 +121,9 @@ def _to_solid(vertices: np.ndarray, faces: np.ndarray) -> Any:
 
 
 def _from_solid(solid: Any) -> Mesh:
-    cut = solid.to_mesh64()
-    vertices = np.asarray(cut.vert_properties)[:, :3]
-    faces = np.asarray(cut.tri_verts).astype(np.int64)
+    mesh = solid.to_mesh64()
+    vertices = np.asarray(mesh.vert_properties)[:, :3]
+    faces = np.asarray(mesh.tri_verts).astype(np.int64)
     return Mesh(vertices, faces, np.ones(len(faces), bool))
 
 
@@ -144,9 +144,9 @@ def _closed_solid(
         depth = int(np.clip(np.ceil(np.log2(cells)), *POISSON_DEPTHS))
     both = points, normals
     if plane is not None:
-        mirrored = points - 2 * plane.height(points)[:, None] * plane.normal
-        turned = normals - 2 * (normals @ plane.normal)[:, None] * plane.normal
-        both = np.concatenate([points, mirrored]), np.concatenate([normals, turned])
+        points_below = points - 2 * plane.height(points)[:, None] * plane.normal
+        normals_below = normals - 2 * (normals @ plane.normal)[:, None] * plane.normal
+        both = np.concatenate([points, points_below]), np.concatenate([normals, normals_below])
     tries = [(p, n, scale, finer) for p, n in ((points, normals), both) for scale, finer in CUBES]
     for p, n, scale, finer in tries:
         meshes = pymeshlab.MeshSet()
@@ -218,11 +218,11 @@ def spread_first(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
 
 def _checked_count(samples: float) -> int:
     """Rounded number of samples. Raises InputError if below 2, or beyond the machine's memory."""
-    needed = Decimal(samples) * SAMPLE_BYTES
+    need = Decimal(samples) * SAMPLE_BYTES
     there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    if needed > there:
+    if need > there:
         raise InputError(
-            f"prior: N = {Decimal(samples):.4g} samples take about {needed / 10**9:.3g} GB of "
+            f"prior: N = {Decimal(samples):.4g} samples take about {need / 10**9:.3g} GB of "
             f"memory, and this machine has {there / 1e9:.3g} GB; "
             "ask for fewer Gaussians (or a larger `spacing`)"
         )
@@ -244,9 +244,9 @@ def _blue_noise(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
     best = np.arange(len(points))
     for _ in range(12):
         radius = (low + high) / 2
-        kept = _independent(pairs[distance < radius], len(points))
-        if len(kept) >= count:
-            best, low = kept, radius
+        subset = _independent(pairs[distance < radius], len(points))
+        if len(subset) >= count:
+            best, low = subset, radius
         else:
             high = radius
         if len(best) <= 1.002 * count:
@@ -262,13 +262,13 @@ def _independent(pairs: np.ndarray, n: int) -> np.ndarray:
     numbers are dropped.
     """
     low, high = pairs.min(1), pairs.max(1)
-    undecided, kept = np.ones(n, bool), np.zeros(n, bool)
+    undecided, members = np.ones(n, bool), np.zeros(n, bool)
     while undecided.any():
-        chosen = undecided.copy()
-        chosen[high] = False
-        kept |= chosen
-        undecided &= ~chosen
-        undecided[high[chosen[low]]] = False
+        new = undecided.copy()
+        new[high] = False
+        members |= new
+        undecided &= ~new
+        undecided[high[new[low]]] = False
         active = undecided[low] & undecided[high]
         low, high = low[active], high[active]
-    return np.flatnonzero(kept)
+    return np.flatnonzero(members)

@@ -41,9 +41,9 @@ def error_to_truth(
     """
     import trimesh
 
-    known = read_mesh(truth)
-    vertices = dataset.world.enter(known.vertices)
-    true = trimesh.Trimesh(vertices, known.faces, process=False)
+    rock = read_mesh(truth)
+    vertices = dataset.world.enter(rock.vertices)
+    true = trimesh.Trimesh(vertices, rock.faces, process=False)
     sample_seed = derive_seed(seed, "prior/truth")
     surface, face = trimesh.sample.sample_surface(true, TRUTH_SAMPLES, seed=sample_seed)
     surface, normals = np.asarray(surface), true.face_normals[face]

@@ -82,13 +82,13 @@ def noisy_depth(
     rows, columns = np.clip(rows, 0, h - 1).astype(int), np.clip(columns, 0, w - 1).astype(int)
     z = depth[rows, columns]
     axial = AXIAL_FLOOR + AXIAL_GROWTH * (z - AXIAL_START) ** 2
-    measured = z + scale * axial * rng.standard_normal((h, w))
+    noisy = z + scale * axial * rng.standard_normal((h, w))
     quantum = np.maximum(scale * QUANTUM * z * z, 1e-9)
-    measured = quantum * np.round(measured / quantum)
+    noisy = quantum * np.round(noisy / quantum)
     start = np.pi / 2 - min(scale, 1.0) * (np.pi / 2 - DROP_OUT[0])
     end = np.pi / 2 - min(scale, 1.0) * (np.pi / 2 - DROP_OUT[1])
-    lost = rng.random((h, w)) < (angle - start) / (end - start)
-    return np.where((z > 0) & (depth > 0) & ~lost & (measured > 0), measured, 0.0)
+    dropout = rng.random((h, w)) < (angle - start) / (end - start)
+    return np.where((z > 0) & (depth > 0) & ~dropout & (noisy > 0), noisy, 0.0)
 
 
 def depth_noise(depth: np.ndarray) -> float:

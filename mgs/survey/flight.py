@@ -152,10 +152,10 @@ def survey_numbers(dataset: Dataset, survey: Survey, settings: SurveySettings) -
     each; error: `trajectory_error` of each of the STAGES.
     """
     error, returns, possible = [], 0, 0
-    for frame, measured in zip(dataset.frames, survey.depths, strict=True):
+    for frame, depth in zip(dataset.frames, survey.depths, strict=True):
         true = frame.depth()
-        error.append((measured - true)[(measured > 0) & frame.mask()])
-        returns += int((measured > 0).sum())
+        error.append((depth - true)[(depth > 0) & frame.mask()])
+        returns += int((depth > 0).sum())
         possible += int((true > 0).sum())
     return {
         "frames": len(dataset.frames),

@@ -48,10 +48,10 @@ def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
     """
     frames = []
     for frame, pose, depth in zip(dataset.frames, survey.optimised, survey.depths, strict=True):
-        measured = out / "depth" / f"{frame.name}.exr"
-        write_exr(measured, {"Z": depth})
+        path = out / "depth" / f"{frame.name}.exr"
+        write_exr(path, {"Z": depth})
         camera = replace(frame.camera, world_to_camera=np.linalg.inv(pose))
-        frames.append(replace(_copied(out, frame), camera=camera, depth_path=measured))
+        frames.append(replace(_copied(out, frame), camera=camera, depth_path=path))
     truth = dataset.root / "rock.glb"
     if truth.is_file():
         copy_file(truth, out / "rock.glb")
@@ -127,13 +127,13 @@ def _errors(axis, survey: Survey, numbers: dict[str, Any]) -> None:
 
 def _depth_error(axis, dataset: Dataset, survey: Survey, numbers: dict[str, Any]) -> None:
     """Measured minus true depth of the first frame, as an image."""
-    measured, true = survey.depths[0], dataset.frames[0].depth()
-    error = np.where((measured > 0) & (true > 0), 1e3 * (measured - true), np.nan)
+    depth, true = survey.depths[0], dataset.frames[0].depth()
+    error = np.where((depth > 0) & (true > 0), 1e3 * (depth - true), np.nan)
     limit = max(3e3 * numbers["depth_error_on_rock"], 1.0)
     axis.set_facecolor("0.85")
     axis.grid(visible=False)
     axis.spines[:].set_visible(False)
     picture = axis.imshow(error, cmap="RdBu", vmin=-limit, vmax=limit, interpolation="nearest")
     axis.figure.colorbar(picture, ax=axis, shrink=0.7, label="mm; blue: too far")
-    lost = f"{numbers['returns_lost']:.0%} of all returns lost"
-    axis.set(title=f"depth error of frame 0; grey: no return\n{lost}", xticks=[], yticks=[])
+    loss = f"{numbers['returns_lost']:.0%} of all returns lost"
+    axis.set(title=f"depth error of frame 0; grey: no return\n{loss}", xticks=[], yticks=[])

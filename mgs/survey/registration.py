@@ -126,8 +126,8 @@ def register(
             max_iterations=60,
         )
         guess = result.T_target_source
-    moved = source.points()[:, :3] @ guess[:3, :3].T + guess[:3, 3]
-    distance = cKDTree(target.points()[:, :3]).query(moved)[0]
+    points = source.points()[:, :3] @ guess[:3, :3].T + guess[:3, 3]
+    distance = cKDTree(target.points()[:, :3]).query(points)[0]
     return Edge(i, j, guess, float((distance < 2 * grid).mean()))
 
 
@@ -188,14 +188,14 @@ def drifting_odometry(truth: np.ndarray, drift: float, rng: np.random.Generator)
     drift: factor on all errors; 0 gives the true steps.
     """
     steps = np.linalg.inv(truth[:-1]) @ truth[1:]
-    measured = steps.copy()
+    odometry = steps.copy()
     vertical = truth[1:, 2, :3]  # the world's +Z in the axes of the later camera
     turn = DRIFT_YAW * vertical + DRIFT_TURN * rng.standard_normal((len(steps), 3))
-    measured[:, :3, :3] = steps[:, :3, :3] @ Rotation.from_rotvec(drift * turn).as_matrix()
+    odometry[:, :3, :3] = steps[:, :3, :3] @ Rotation.from_rotvec(drift * turn).as_matrix()
     length = np.linalg.norm(steps[:, :3, 3], axis=1, keepdims=True)
     shake = DRIFT_SHAKE * length * rng.standard_normal((len(steps), 3))
-    measured[:, :3, 3] = (1 + drift * DRIFT_SCALE) * steps[:, :3, 3] + drift * shake
-    return measured
+    odometry[:, :3, 3] = (1 + drift * DRIFT_SCALE) * steps[:, :3, 3] + drift * shake
+    return odometry
 
 
 def chain(first: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -216,13 +216,13 @@ def step_deviation(step: np.ndarray, drift: float) -> tuple[float, float]:
     return drift * (DRIFT_YAW + DRIFT_TURN), drift * (DRIFT_SCALE + DRIFT_SHAKE) * length
 
 
-def agrees(measured: np.ndarray, odometry: np.ndarray, drift: float, grid: float) -> bool:
+def agrees(step: np.ndarray, odometry: np.ndarray, drift: float, grid: float) -> bool:
     """Whether a measured step [4,4] is within TRUST standard deviations of odometry's [4,4].
 
     The limits are widened by the error of a measurement: half a degree, and one cell of the
     registration's grid, `grid` metres.
     """
-    difference = np.linalg.inv(odometry) @ measured
+    difference = np.linalg.inv(odometry) @ step
     turn = np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1))
     turn_deviation, shift_deviation = step_deviation(odometry, drift)
     turn_limit = TRUST * turn_deviation + np.radians(0.5)

@@ -100,13 +100,13 @@ def make_stones(
         stone = (fine if size > 0.15 else coarse)[rng.integers(8)]
         turn = rng.uniform(0, 2 * np.pi)
         c, s = np.cos(turn), np.sin(turn)
-        turned = stone.vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-        vertices.append(turned * size + [*position, height])
+        corners = stone.vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        vertices.append(corners * size + [*position, height])
         faces.append(stone.faces + offset)
         tone = np.asarray(settings.colour) * rng.uniform(0.35, 1.1)
         grey = tone + (tone.mean() - tone) * rng.uniform(0, 0.8)
-        colours.append(np.broadcast_to(grey, (len(turned), 3)))
-        offset += len(turned)
+        colours.append(np.broadcast_to(grey, (len(corners), 3)))
+        offset += len(corners)
     mesh = trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
     mesh.vertex_attributes["color"] = np.concatenate(colours).astype(np.float32)
     return mesh

@@ -187,11 +187,11 @@ def _check_cost(out: Path, preset: RenderPreset, test_views: int, spp: int) -> N
     views, pixels = preset.frames + test_views, preset.width * preset.height
     what = f"{views:,} views of {preset.width}x{preset.height} with {spp:,} samples per pixel"
     instead = "lower `frames`, `test_views`, `size` or `spp`"
-    needed = views * pixels * PIXEL_BYTES
+    disk = views * pixels * PIXEL_BYTES
     free = shutil.disk_usage(next(p for p in out.resolve().parents if p.exists())).free
-    if pixels * whole_grid(GUIDES_PER_SAMPLE * spp) >= MOST_SAMPLES or needed > free:
+    if pixels * whole_grid(GUIDES_PER_SAMPLE * spp) >= MOST_SAMPLES or disk > free:
         raise InputError(
-            f"synth-orbit: {what} take {needed / 2**30:,.1f} GiB on disk; {free / 2**30:,.1f} GiB "
+            f"synth-orbit: {what} take {disk / 2**30:,.1f} GiB on disk; {free / 2**30:,.1f} GiB "
             f"and {MOST_SAMPLES // GUIDES_PER_SAMPLE:,} samples per view are possible; {instead}"
         )
     memory = views * VIEW_BYTES + pixels * IMAGE_BYTES
@@ -255,15 +255,15 @@ class Photographer:
 
     def develop(self, frame: Frame, traced: Traced) -> None:
         """Denoise a traced frame and write its files."""
-        rendered = traced.developed()
+        image = traced.developed()
         assert frame.depth_path
         assert frame.mask_path
         assert frame.rock_path
-        write_exr(frame.depth_path, {"Z": rendered.depth})
-        write_png(frame.mask_path, rendered.mask)
+        write_exr(frame.depth_path, {"Z": image.depth})
+        write_png(frame.mask_path, image.mask)
         gain = [self.exposure, self.exposure, self.exposure, 1]
-        write_rock_image(frame.rock_path, rendered.rock * gain)
-        write_png(frame.image_path, rendered.rgb * self.exposure)
+        write_rock_image(frame.rock_path, image.rock * gain)
+        write_png(frame.image_path, image.rgb * self.exposure)
 
 
 def _write_survey(
@@ -341,9 +341,9 @@ def _meter(
     reports; that is judged in final quality, since the noise of few samples makes too many pixels
     bright. Raises InputError if a camera does not see the rock, or its brightness is not finite.
     """
-    chosen = np.unique(np.linspace(0, len(cameras), 4, endpoint=False).astype(int))
+    indices = np.unique(np.linspace(0, len(cameras), 4, endpoint=False).astype(int))
     means, values = [], []
-    for index in chosen:
+    for index in indices:
         meter_seed = derive_seed(seed, f"meter {index}")
         rgb, _, _ = scene.light(cameras[index], 2, meter_seed)
         depth, mask = scene.cast(cameras[index])
@@ -363,9 +363,9 @@ def _meter(
     if np.quantile(np.concatenate(values), 1 - MAX_CLIPPED) * target <= 1:
         return target
     values = []
-    for index in chosen:
-        rendered = scene.render(cameras[index], spp, derive_seed(seed, f"meter {index}"), denoise)
-        values.append(rendered.rgb.max(-1)[rendered.depth > 0])
+    for index in indices:
+        image = scene.render(cameras[index], spp, derive_seed(seed, f"meter {index}"), denoise)
+        values.append(image.rgb.max(-1)[image.depth > 0])
     exposure = 1 / float(np.quantile(np.concatenate(values), 1 - MAX_CLIPPED))
     if exposure >= target:
         return target

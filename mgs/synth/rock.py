@@ -120,8 +120,8 @@ def _body(settings: Rock, noise: Noise) -> trimesh.Trimesh:
         inside = np.linalg.norm(local, axis=-1) - 1
         for normal in noise.rng.standard_normal((settings.facets, 3)):
             along = local @ (normal / np.linalg.norm(normal)).astype(np.float32)
-            cut = along - noise.rng.uniform(0.62, 0.92)
-            inside = _smooth_max(inside, cut, 0.05)
+            plane = along - noise.rng.uniform(0.62, 0.92)
+            inside = _smooth_max(inside, plane, 0.05)
         distance = -_smooth_max(-distance, -inside * min(lobe.radii), 0.12)
     distance = gaussian_filter(distance, 0.7)
     if distance.min() >= 0:  # nothing is inside
@@ -179,10 +179,10 @@ def _bake(
     across = int(np.ceil(np.sqrt(len(cells))))
     # The right angle of a cell's first triangle is at its origin; the second is turned by 180°.
     j, i = (a.ravel() for a in np.mgrid[:CELL, :CELL])
-    turned = i + j > CELL - 1
-    u, v = (np.where(turned, CELL - 1 - a, a) / (CELL - 2) for a in (i, j))
+    second = i + j > CELL - 1
+    u, v = (np.where(second, CELL - 1 - a, a) / (CELL - 2) for a in (i, j))
     weights = np.stack([1 - u - v, u, v], -1).astype(np.float32)
-    face = np.minimum(2 * cells[:, None] + turned, n_faces - 1)
+    face = np.minimum(2 * cells[:, None] + second, n_faces - 1)
 
     def at_texels(values: np.ndarray) -> np.ndarray:
         w = weights.reshape(*weights.shape, *[1] * (values.ndim - 1))

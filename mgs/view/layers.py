@@ -66,20 +66,20 @@ def kernel_image(
     """
     scalars = {layer: subject.scalars[layer]} if layer in subject.scalars else {}
     maps = view_maps(subject.model, camera, scalars)
-    seen = maps["A"] >= VISIBLE
-    depth = np.where(seen, maps["Z"], FAR).astype(np.float32)
+    opaque = maps["A"] >= VISIBLE
+    depth = np.where(opaque, maps["Z"], FAR).astype(np.float32)
     if layer == "colour":
         return np.round(255 * picture(maps)).astype(np.uint8), depth, (0.0, 1.0)
     if layer == "alpha":
         grey = np.round(255 * np.clip(maps["A"], 0, 1)).astype(np.uint8)
         return np.stack([grey] * 3, axis=-1), depth, (0.0, 1.0)
     low, high = scale(subject, layer)
-    if layer == "depth" and seen.any():
-        low, high = float(depth[seen].min()), float(depth[seen].max())
+    if layer == "depth" and opaque.any():
+        low, high = float(depth[opaque].min()), float(depth[opaque].max())
     channel = "Z" if layer == "depth" else layer
     image = painted(maps[channel], PANELS[channel][1], low, high)
     lengths = subject.scale if layer == "depth" else 1.0
-    return image * seen[..., None].astype(np.uint8), depth, (low / lengths, high / lengths)
+    return image * opaque[..., None].astype(np.uint8), depth, (low / lengths, high / lengths)
 
 
 def scale(subject: Subject, layer: str) -> tuple[float, float]:
