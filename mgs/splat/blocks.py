@@ -115,16 +115,16 @@ def footprints(splats: Splats) -> Footprints:
     """Footprints of splats. Each ends where alpha = ALPHA_MIN."""
     # alpha >= ALPHA_MIN where xi^2 + eta^2 <= log2 o - log2 ALPHA_MIN = q.
     level = splats.log2_opacity + LOG2_INV_ALPHA_MIN
-    drawn = splats.visible & (level > 0)
+    visible = splats.visible & (level > 0)
     shape = splats.mean_x, splats.mean_y, splats.depth, splats.shear, splats.white_x, splats.white_y
-    return Footprints(*shape, level=dr.select(drawn, level + SLACK, -1))
+    return Footprints(*shape, level=dr.select(visible, level + SLACK, -1))
 
 
 RESHAPED, REORDERED = 1, 2
 """Results of `changes`."""
 
 
-def changes(built: Footprints, splats: Splats) -> Any:
+def changes(old: Footprints, splats: Splats) -> Any:
     """Compare splats with those for which lists were built, UInt32 [N].
 
     0: the footprint is the same, or drawn in neither. RESHAPED: the footprint changed, so lists
@@ -132,12 +132,12 @@ def changes(built: Footprints, splats: Splats) -> Any:
     """
     now = footprints(splats)
     # Any number of a drawn footprint differs, bit for bit.
-    other = (built.mean_x != now.mean_x) | (built.mean_y != now.mean_y) | (built.shear != now.shear)
-    other |= (built.white_x != now.white_x) | (built.white_y != now.white_y)
-    other |= built.level != now.level
-    other &= (built.level > 0) | (now.level > 0)
+    other = (old.mean_x != now.mean_x) | (old.mean_y != now.mean_y) | (old.shear != now.shear)
+    other |= (old.white_x != now.white_x) | (old.white_y != now.white_y)
+    other |= old.level != now.level
+    other &= (old.level > 0) | (now.level > 0)
     reshaped = mi.UInt32(dr.select(other, RESHAPED, 0))
-    return dr.select(built.depth == now.depth, reshaped, REORDERED)
+    return dr.select(old.depth == now.depth, reshaped, REORDERED)
 
 
 def depth_order(depth: Any) -> Any:
@@ -371,11 +371,11 @@ def _run_numbers(start: Any, length: Any, count: int) -> Any:
     if count == 0:
         return mi.UInt32()
     # Mark the first number of each run with the run's index; a running maximum fills the rest.
-    begun = dr.zeros(mi.UInt32, count)
+    marks = dr.zeros(mi.UInt32, count)
     dr.scatter(
-        begun, dr.arange(mi.UInt32, len(start)), start, length > 0, mode=dr.ReduceMode.NoConflicts
+        marks, dr.arange(mi.UInt32, len(start)), start, length > 0, mode=dr.ReduceMode.NoConflicts
     )
-    return dr.block_prefix_reduce(dr.ReduceOp.Max, begun, count, exclusive=False)
+    return dr.block_prefix_reduce(dr.ReduceOp.Max, marks, count, exclusive=False)
 
 
 def _blocks_of_row(
@@ -431,19 +431,19 @@ def _by_block(owner: Any, number: Any, numbers: int) -> tuple[Any, Any, Any, Any
         return dr.zeros(mi.UInt32, _room(count)), pair, start, end
     # slot: of each sorted pair. at: its number. Beyond `count` there is only padding.
     slot, at = _permutation(number, numbers), dr.arange(mi.UInt32, _room(count))
-    used, last = at < dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, count - 1)
-    slot = dr.gather(mi.UInt32, slot, at, used)
-    dr.scatter(pair, at, slot, used, mode=dr.ReduceMode.NoConflicts)
+    valid, last = at < dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, count - 1)
+    slot = dr.gather(mi.UInt32, slot, at, valid)
+    dr.scatter(pair, at, slot, valid, mode=dr.ReduceMode.NoConflicts)
     dr.eval(pair)  # three kernels, since one with all random addresses is slower
-    splat = dr.gather(mi.UInt32, owner, slot, used)
+    splat = dr.gather(mi.UInt32, owner, slot, valid)
     dr.eval(splat)
-    number = dr.gather(mi.UInt32, number, slot, used)
+    number = dr.gather(mi.UInt32, number, slot, valid)
     dr.eval(number)
     # A list starts where the block differs from the pair before, and ends where from the next.
     previous = dr.gather(mi.UInt32, number, dr.maximum(at, 1) - 1)
     following = dr.gather(mi.UInt32, number, dr.minimum(at + 1, last))
-    is_first = used & ((at == 0) | (previous != number))
-    is_last = used & ((at == last) | (following != number))
+    is_first = valid & ((at == 0) | (previous != number))
+    is_last = valid & ((at == last) | (following != number))
     dr.scatter(start, at, number, is_first, mode=dr.ReduceMode.NoConflicts)
     dr.scatter(end, at + 1, number, is_last, mode=dr.ReduceMode.NoConflicts)
     return splat, pair, start, end

@@ -226,8 +226,8 @@ def _sums(
     weight = dr.opaque(mi.Float, alpha_weight) if alpha_weight else None
     roots = None if weights is None else by_block(lists, camera, np.sqrt(weights))
     surround = dr.detach(as_colour(background))
-    placed = kernels.fisher(lists, packed, surround, cross, moving, weight, roots)
-    sums = sums_by_splat(lists, placed, count)
+    totals = kernels.fisher(lists, packed, surround, cross, moving, weight, roots)
+    sums = sums_by_splat(lists, totals, count)
     if chosen is not None:
         # Rows of the chosen ones: sums were taken with all Gaussians in place.
         index = mi.UInt32(padded(chosen, np.uint32))

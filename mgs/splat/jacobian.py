@@ -39,10 +39,10 @@ def jvp(
     InputError as `render`, and for a tangent of an unknown name, of a wrong shape or not finite.
     """
     model = as_drjit(gaussians)
-    given = {name: _checked_tangent(model, name, tangent) for name, tangent in tangents.items()}
+    tensors = {name: _checked_tangent(model, name, tangent) for name, tangent in tangents.items()}
     with dr.resume_grad():
         copy = model.map(lambda v: dr.copy(dr.detach(v)))
-        for name, tangent in given.items():
+        for name, tangent in tensors.items():
             dr.enable_grad(getattr(copy, name))
             dr.set_grad(getattr(copy, name), tangent)
         image = render(copy, _untraced(camera), dr.detach(as_colour(background)), cache)
@@ -106,8 +106,8 @@ def vjp(
         model = as_drjit(gaussians).map(dr.detach)
         values = {name: dr.copy(getattr(model, name)) for name in by}
         dr.enable_grad(list(values.values()))
-        drawn = replace(model, **values)
-        rgb = render(drawn, _untraced(camera), dr.detach(as_colour(background)), cache).rgb
+        variables = replace(model, **values)
+        rgb = render(variables, _untraced(camera), dr.detach(as_colour(background)), cache).rgb
         z = cotangent(dr.detach(rgb)) if callable(cotangent) else cotangent
         z = dr.detach(z) if dr.is_array_v(z) else mi.TensorXf(padded(z))
         if tuple(z.shape) != tuple(rgb.shape):

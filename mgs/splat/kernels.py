@@ -291,8 +291,8 @@ def adjoint(
             sums[4:] = [a + b for a, b in zip(sums[4:], moments, strict=True)]
         return new, alive, sums[:count]
 
-    stored = walk_and_store(lists, packed, lane, pixels, visit, count)
-    return sums_by_place(lists, stored, count, mi.Float)
+    by_pair = walk_and_store(lists, packed, lane, pixels, visit, count)
+    return sums_by_place(lists, by_pair, count, mi.Float)
 
 
 def splat_gradient(sums: list[Any], splats: Splats) -> Splats:
@@ -454,8 +454,8 @@ def fisher(
         return new, alive, sums
 
     pixels = [[t, *c] for t, c in zip(T, behind, strict=True)]
-    stored = walk_and_store(lists, packed, lane, pixels, visit, count)
-    return sums_by_place(lists, stored, count, mi.Float64)
+    by_pair = walk_and_store(lists, packed, lane, pixels, visit, count)
+    return sums_by_place(lists, by_pair, count, mi.Float64)
 
 
 @frozen(recorded_sizes)
@@ -485,5 +485,5 @@ def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
         return new, alive, [total]
 
     pixels = [[t, *c] for t, c in zip(T, behind, strict=True)]
-    stored = walk_and_store(lists, packed, lane, pixels, visit, 1)
-    return sums_by_place(lists, stored, 1, mi.Float64)
+    by_pair = walk_and_store(lists, packed, lane, pixels, visit, 1)
+    return sums_by_place(lists, by_pair, 1, mi.Float64)

@@ -192,7 +192,7 @@ class Information:
         covariance, at the cost of one `solve`.
         """
         rng, (n, size) = np.random.default_rng(seed), self.blocks.shape[:2]
-        drawn = []
+        draws = []
         for _ in range(count):
             # b = lam^1/2 n + J^T W^1/2 e has the covariance H + lam, so (H + lam)^-1 b its inverse.
             b = rng.standard_normal((n, size)) * np.sqrt(lam)
@@ -201,8 +201,8 @@ class Information:
                 b += self._transposed(noise if root is None else noise * root, camera)
             moves = self._by_name(pixel_noise * self.solve(b, lam, tolerance))
             old = {name: np.asarray(getattr(self.gaussians, name)) for name in moves}
-            drawn.append(replace(self.gaussians, **{k: old[k] + moves[k] for k in old}))
-        return drawn
+            draws.append(replace(self.gaussians, **{k: old[k] + moves[k] for k in old}))
+        return draws
 
     def _by_name(self, vector: np.ndarray) -> dict[str, np.ndarray]:
         """Parts of a vector [N,P] by parameter, float32 of its shape."""

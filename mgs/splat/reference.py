@@ -216,8 +216,8 @@ def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 def _moved(gaussians: Gaussians, name: str, step: np.ndarray) -> Gaussians:
     """A float64 copy with `step` added to one parameter of every Gaussian."""
-    moved = gaussians.map(lambda array: np.array(array, np.float64))
-    return replace(moved, **{name: getattr(moved, name) + step})
+    copy = gaussians.map(lambda array: np.array(array, np.float64))
+    return replace(copy, **{name: getattr(copy, name) + step})
 
 
 def _projection_jacobian(
@@ -278,25 +278,25 @@ def jacobian(
     d_means2d, d_cov2d, d_colours, d_log = _projection_jacobian(gaussians, camera, means == "free")
     J = np.zeros((len(pixels), 3 + extra, n, 3 * K + 1 + d_cov2d.shape[1]))
     for i, j in enumerate(order):
-        drawn = np.flatnonzero(alpha[:, i])  # on other pixels the splat changes nothing
+        under = np.flatnonzero(alpha[:, i])  # on other pixels the splat changes nothing
         # Colours: w Y_k, 0 where clamped at 0.
         for c in np.flatnonzero(projected.colours[j] > 0):
-            J[drawn, c, j, c : 3 * K : 3] = weights[drawn, i, None] * basis[j]
+            J[under, c, j, c : 3 * K : 3] = weights[under, i, None] * basis[j]
         # D = c T - S / (1 - alpha).
-        D = colours[j] * T[drawn, i, None] - behind[drawn, i] / (1 - alpha[drawn, i, None])
-        dalpha = np.where(clipped[drawn, i], 0.0, alpha[drawn, i])
+        D = colours[j] * T[under, i, None] - behind[under, i] / (1 - alpha[under, i, None])
+        dalpha = np.where(clipped[under, i], 0.0, alpha[under, i])
         # ln alpha = ln o - d^T Sigma^-1 d / 2 with d = pixel - mean: with e = Sigma^-1 d its
         # derivative is e.d(mean) + e^T d(Sigma) e / 2, plus that of ln compensation.
-        e = (pixels[drawn] - projected.means2d[j]) @ np.linalg.inv(projected.cov2d[j])
+        e = (pixels[under] - projected.means2d[j]) @ np.linalg.inv(projected.cov2d[j])
         dlog = [
             e @ d_mean + ((e @ d_cov) * e).sum(1) / 2 + d
             for d_mean, d_cov, d in zip(d_means2d[j], d_cov2d[j], d_log[j], strict=True)
         ]
         # d ln alpha / d logit = 1 - o.
         dlog.insert(7, np.full(len(e), transparency[j]))
-        J[drawn, :, j, 3 * K :] = D[:, :, None] * (dalpha[:, None] * np.stack(dlog, 1))[:, None, :]
+        J[under, :, j, 3 * K :] = D[:, :, None] * (dalpha[:, None] * np.stack(dlog, 1))[:, None, :]
         # Means also change the colour, through its direction: w dc.
-        J[drawn, :3, j, 3 * K + 8 :] += weights[drawn, i, None, None] * d_colours[j, 7:].T
+        J[under, :3, j, 3 * K + 8 :] += weights[under, i, None, None] * d_colours[j, 7:].T
     return J
 
 

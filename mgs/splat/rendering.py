@@ -125,17 +125,17 @@ class ListCache:
     def _keep(self, key: bytes, lists: BlockLists) -> None:
         """Hold new lists, then drop those used longest ago or the new ones (see the class)."""
         self._lists[key] = lists
-        clock, used = self._clock, self._used
+        clock, uses = self._clock, self._used
         while len(self._lists) > 1 and self.nbytes > self.budget:
             # The oldest leaves if the new one was used less than half as long ago.
             oldest = next(other for other in self._lists if other != key)
-            if key in used and 2 * (clock - used[key]) < clock - used[oldest]:
+            if key in uses and 2 * (clock - uses[key]) < clock - uses[oldest]:
                 del self._lists[oldest]
             else:
                 del self._lists[key]
                 break
-        if len(used) > REMEMBERED:
-            self._used = {other: used[other] for other in self._lists if other in used}
+        if len(uses) > REMEMBERED:
+            self._used = {other: uses[other] for other in self._lists if other in uses}
 
 
 def as_colour(background: Any) -> Any:
@@ -223,8 +223,8 @@ class _Rasterise(dr.CustomOp):
         for array, value in zip(d_out, (mi.Vector4f(r, g, b, alpha), *depth), strict=True):
             dr.scatter(array, value, self.places, mode=dr.ReduceMode.NoConflicts)
         how = self.means, self.channels
-        placed = kernels.adjoint(self.lists, self.packed, self.out, d_out, *how)
-        sums = sums_by_splat(self.lists, placed, kernels.ADJOINT_SUMS[self.means])
+        totals = kernels.adjoint(self.lists, self.packed, self.out, d_out, *how)
+        sums = sums_by_splat(self.lists, totals, kernels.ADJOINT_SUMS[self.means])
         self.set_grad_in("splats", kernels.splat_gradient(sums, self.splats))
 
 

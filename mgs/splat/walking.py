@@ -231,7 +231,7 @@ def block_rows(lane: Lane, s: Splats) -> list[Row]:
             for j in rows:
                 ratio[j] = ratio[j + way] * turn
         ratios[side] = ratio
-    made = []
+    block = []
     left, right = range(centre_column - 1, -1, -1), range(centre_column + 1, lane.columns)
     for j in range(lane.rows):
         # Central pixel of the row: log2 alpha = log2 o - eta^2 - xi^2.
@@ -248,8 +248,8 @@ def block_rows(lane: Lane, s: Splats) -> list[Row]:
             for i in columns:
                 raw[i] = raw[i + side] * ratio
                 ratio = ratio * bend
-        made.append(Row(eta, xi, raw))
-    return made
+        block.append(Row(eta, xi, raw))
+    return block
 
 
 def blend(raw: Any, T: Any) -> tuple[Any, Any, Any, Any]:
@@ -307,20 +307,20 @@ def walk(
 
     pixels: state of each of a lane's pixels, lists with T of `blend` first.
     start(pair, splat): called once per pair (UInt32, index in the lists).
-    draw(started, raw, xi, eta, pixel) -> pixel: draws the splat on one pixel, given the result of
+    draw(of_splat, raw, xi, eta, pixel) -> pixel: draws the splat on one pixel, given the result of
         `start`.
 
     Returns the final state. The numbers of a pixel stay together in the list, because the compiler
     keeps that order and finishes each pixel before the next one needs registers.
     """
 
-    def visit(i: Any, drawn: list[tuple[Any, Splats, list[Row]]], pixels: Any) -> Any:
+    def visit(i: Any, pairs: list[tuple[Any, Splats, list[Row]]], pixels: Any) -> Any:
         # Pixel by pixel, all splats of this iteration, so that a pixel's state is read once.
-        started = [(start(pair, splat), rows) for pair, splat, rows in drawn]
+        splats = [(start(pair, splat), rows) for pair, splat, rows in pairs]
         new: list[list[Any]] = []
         most: Any = None  # largest transmittance so far; that of a finished pixel is negative
         for number, pixel in enumerate(pixels):
-            for of_splat, rows in started:
+            for of_splat, rows in splats:
                 row, x = rows[number // lane.columns], number % lane.columns
                 # Compiled after the pixels before it (`computed_after`).
                 raw = computed_after(row.raw_alpha[x], [] if most is None else [mi.Float(most)])
@@ -352,21 +352,21 @@ def walk_and_store(
     order and makes one addition to zeros.
     """
     packets, whole = packet_count(count), lane.columns * lane.rows == PIXELS
-    stored = (dr.empty if whole else dr.zeros)(mi.Float, len(lists.splat) * 4 * packets)
+    by_pair = (dr.empty if whole else dr.zeros)(mi.Float, len(lists.splat) * 4 * packets)
 
     def store(pair: Any, sums: list[Any]) -> None:
-        padded = sums + [mi.Float(0)] * (-len(sums) % 4)
+        values = sums + [mi.Float(0)] * (-len(sums) % 4)
         for i in range(packets):
-            packet, at = mi.Vector4f(*padded[4 * i : 4 * i + 4]), pair * packets + i
+            packet, at = mi.Vector4f(*values[4 * i : 4 * i + 4]), pair * packets + i
             if whole:
-                dr.scatter(stored, packet, at, mode=dr.ReduceMode.NoConflicts)
+                dr.scatter(by_pair, packet, at, mode=dr.ReduceMode.NoConflicts)
             else:
-                dr.scatter_reduce(dr.ReduceOp.Add, stored, packet, at, mode=dr.ReduceMode.Local)
+                dr.scatter_reduce(dr.ReduceOp.Add, by_pair, packet, at, mode=dr.ReduceMode.Local)
 
     def visit_and_store(
-        pair: Any, drawn: list[tuple[Any, Splats, list[Row]]], pixels: Any
+        pair: Any, pairs: list[tuple[Any, Splats, list[Row]]], pixels: Any
     ) -> tuple[Any, Any]:
-        ((_, splat, rows),) = drawn
+        ((_, splat, rows),) = pairs
         pixels, alive, sums = visit(splat, rows, pixels)
         store(pair, sums)
         return pixels, alive
@@ -376,10 +376,10 @@ def walk_and_store(
         store(pair, [mi.Float(0)] * count)
         return (pair + 1,)
 
-    left, _ = _walk_until_done(lists, packed, lane, pixels, visit_and_store, 1)
+    rest, _ = _walk_until_done(lists, packed, lane, pixels, visit_and_store, 1)
     if whole:
-        dr.while_loop((left,), lambda pair: pair < lane.end, store_zeros)
-    return stored
+        dr.while_loop((rest,), lambda pair: pair < lane.end, store_zeros)
+    return by_pair
 
 
 def pair_at(
@@ -410,14 +410,14 @@ def _walk_until_done(
 ) -> tuple[Any, list[list[Any]]]:
     """The loop of `walk`. Returns the pair after the last visited one, and the pixels' state.
 
-    visit(pair, drawn, pixels) -> (pixels, alive), with `drawn` the results of `pair_at` for
+    visit(pair, pairs, pixels) -> (pixels, alive), with `pairs` the results of `pair_at` for
     `together` pairs from that one on.
     """
 
     def body(i: Any, pixels: Any, alive: Any) -> Any:
         # A lane ends with its list, or with its last unfinished pixel.
-        drawn = [pair_at(lists, packed, lane, i, k) for k in range(together)]
-        pixels, alive = visit(i, drawn, pixels)
+        pairs = [pair_at(lists, packed, lane, i, k) for k in range(together)]
+        pixels, alive = visit(i, pairs, pixels)
         return i + together, pixels, (i + together < lane.end) & alive
 
     start = mi.UInt32(lane.start)
@@ -436,13 +436,13 @@ AT_ONCE = 4
 several can be under way at once."""
 
 
-def sums_by_place(lists: BlockLists, stored: Any, count: int, real: Any) -> Any:
+def sums_by_place(lists: BlockLists, by_pair: Any, count: int, real: Any) -> Any:
     """Add the results of `walk_and_store` for the pairs of each splat, in the order of their slots
     and in double, so reruns are bitwise equal.
 
     Returns [N * packets * 4] of type `real` (Float or Float64), by place.
     """
-    dr.eval(stored)
+    dr.eval(by_pair)
     # Slots of one splat are consecutive, so a lane adds those of one splat, in their order.
     packets, end = packet_count(count), lists.slot_end
 
@@ -450,28 +450,28 @@ def sums_by_place(lists: BlockLists, stored: Any, count: int, real: Any) -> Any:
         # Reads of slots beyond the end are masked to 0.
         for slot in (first + k for k in range(AT_ONCE)):
             pair = dr.gather(mi.UInt32, lists.pair, slot, slot < end) * packets
-            parts = [dr.gather(mi.Vector4f, stored, pair + i, slot < end) for i in range(packets)]
+            parts = [dr.gather(mi.Vector4f, by_pair, pair + i, slot < end) for i in range(packets)]
             totals = [total + mi.Vector4d(part) for total, part in zip(totals, parts, strict=True)]
         return first + AT_ONCE, totals
 
     start = (mi.UInt32(lists.slot_start), [mi.Vector4d(0)] * packets)
     _, totals = dr.while_loop(start, lambda first, totals: first < end, body)
     place = dr.arange(mi.UInt32, len(lists.place))
-    summed = dr.empty(real, len(lists.place) * 4 * packets)
+    sums = dr.empty(real, len(lists.place) * 4 * packets)
     vector = mi.Vector4f if real is mi.Float else mi.Vector4d
     for i, total in enumerate(totals):
         # Sums in double, rounded once.
-        kept = vector(*(without_denormals(x) for x in total))
-        dr.scatter(summed, kept, place * packets + i, mode=dr.ReduceMode.NoConflicts)
-    return summed
+        single = vector(*(without_denormals(x) for x in total))
+        dr.scatter(sums, single, place * packets + i, mode=dr.ReduceMode.NoConflicts)
+    return sums
 
 
-def sums_by_splat(lists: BlockLists, placed: Any, count: int) -> list[Any]:
-    """Result of `sums_by_place` as `count` arrays [N], in the order of the Gaussians. Evaluated,
+def sums_by_splat(lists: BlockLists, totals: Any, count: int) -> list[Any]:
+    """Result of `sums_totals` as `count` arrays [N], in the order of the Gaussians. Evaluated,
     because two kernels are faster than one that waits for these random reads."""
-    packets, vector = packet_count(count), mi.Vector4f if type(placed) is mi.Float else mi.Vector4d
+    packets, vector = packet_count(count), mi.Vector4f if type(totals) is mi.Float else mi.Vector4d
     sums = [
-        x for i in range(packets) for x in dr.gather(vector, placed, lists.place * packets + i)
+        x for i in range(packets) for x in dr.gather(vector, totals, lists.place * packets + i)
     ][:count]
     dr.eval(sums)
     return sums
