@@ -44,9 +44,9 @@ def read_compact(path: Path, prior: Prior | None = None) -> Gaussians:
     start, needs a prior, or was made with another one.
     """
     header, packets = split(read_bytes(path, "file", MOST_BYTES), path)
-    if lost := header.packets - len(packets):
+    if losses := header.packets - len(packets):
         notice = (
-            f"{path}: {lost} of {header.packets} packets are missing or damaged; the rest is read"
+            f"{path}: {losses} of {header.packets} packets are missing or damaged; the rest is read"
         )
         warnings.warn(notice, Notice, stacklevel=3)
     start = None
@@ -135,14 +135,14 @@ def _most(header: Header, data: bytes) -> int:
 
 def _coefficients(header: Header, packets: Mapping[Key, bytes], tree: Tree) -> np.ndarray:
     """Coefficients [N,C] that the packets give; 0 where there is none."""
-    found = np.zeros((len(tree.band), header.centres.shape[1]))
+    table = np.zeros((len(tree.band), header.centres.shape[1]))
     of = groups((header.degree + 1) ** 2)
     for (tile, group, layer), data in packets.items():
         rows = rows_of(tree, tile)
         if group != "position" and len(rows):
             step = header.step(layer)[tree.band[rows], of[group]]
-            found[rows, of[group]] += step * integers(decoder(data), np.zeros(step.shape, np.int64))
-    return found
+            table[rows, of[group]] += step * integers(decoder(data), np.zeros(step.shape, np.int64))
+    return table
 
 
 def rows_of(tree: Tree, tile: int) -> np.ndarray:

@@ -139,8 +139,8 @@ class Encoder:
             centres[number] = columns[layer == number].mean(0)
         centres = centres.astype(np.float32).astype(np.float64)
         values = tree.forward(columns - centres[layer])
-        turned = np.stack([tree.forward(one[order], adjoint=True) for one in self.gradients])
-        h = allocate.sensitivity(turned, tree.band) * allocate.coherence(self.g.sh.shape[1])
+        slopes = np.stack([tree.forward(one[order], adjoint=True) for one in self.gradients])
+        h = allocate.sensitivity(slopes, tree.band) * allocate.coherence(self.g.sh.shape[1])
         start, g = self.start, self.g
         flags = ANTIALIASED * g.antialiased + LINEAR * g.linear + SHARED * bool(start)
         header = Header(
@@ -186,9 +186,9 @@ def _position_payloads(header: Header, codes: np.ndarray) -> dict[Key, bytes]:
     def coded(nodes: np.ndarray, depth: int, below: np.ndarray) -> bytes:
         return encode(lambda stream: code_descendants(stream, nodes, depth, len(below), below))
 
-    found = {(0, "position", 0): coded(np.zeros(1, np.int64), DEPTH - header.cut, top)}
+    payloads = {(0, "position", 0): coded(np.zeros(1, np.int64), DEPTH - header.cut, top)}
     of_code = tile[np.searchsorted(top, codes >> header.cut)]
     for number in range(1, header.tiles + 1):
         data = coded(top[tile == number], header.cut, codes[of_code == number])
-        found[number, "position", 0] = data
-    return found
+        payloads[number, "position", 0] = data
+    return payloads

@@ -60,8 +60,8 @@ SYNCHRONOUS = 0.05
 
 def is_bag(path: Path) -> bool:
     """Whether a path is a ROS 1 bag file, or a ROS 2 bag: its folder, or a file of it."""
-    named = path.suffix in (".bag", *STORAGE) and not path.is_dir()
-    return named or (path / "metadata.yaml").exists()
+    by_name = path.suffix in (".bag", *STORAGE) and not path.is_dir()
+    return by_name or (path / "metadata.yaml").exists()
 
 
 @contextmanager
@@ -93,13 +93,13 @@ def opened(path: Path) -> Iterator[Any]:
 def messages(reader: Any, *kinds: str, topic: str | None = None) -> Iterator[tuple[str, Any]]:
     """(topic, message) of the messages of some types, or of a topic, in order of recording."""
     short = {kind.rpartition("/")[2] for kind in kinds}
-    chosen = [
+    connections = [
         connection
         for connection in reader.connections
         if connection.topic == topic or connection.msgtype.rpartition("/")[2] in short
     ]
-    if chosen:
-        for connection, _, raw in reader.messages(connections=chosen):
+    if connections:
+        for connection, _, raw in reader.messages(connections=connections):
             yield connection.topic, reader.deserialize(raw, connection.msgtype)
 
 
@@ -136,7 +136,7 @@ class Tree:
 
     def __init__(self, path: Path, reader: Any, camera: str, topic: str | None) -> None:
         sources: dict[str, dict[str, Samples]] = defaultdict(lambda: defaultdict(dict))
-        chosen = "" if topic is None else topic
+        main = "" if topic is None else topic
         for name, message in messages(reader, "TFMessage", "tfMessage", "Odometry", topic=topic):
             several = hasattr(message, "transforms")
             for each in message.transforms if several else [message]:
@@ -152,20 +152,20 @@ class Tree:
         self.tracks: dict[str, Track] = {}
         self.unused: list[str] = []
         for child, by_kind in sources.items():
-            self._add(path, child, by_kind, chosen)
+            self._add(path, child, by_kind, main)
         if topic is not None and stamped:
             body = camera
             while body in self.parents and len(self.tracks[body].times) == 1:
                 body = self.parents[body]
-            self._add(path, body, stamped, chosen)
+            self._add(path, body, stamped, main)
         elif topic is not None and not any(topic in by_kind for by_kind in sources.values()):
             raise InputError(f"{path}: pose {topic} has no poses; it has {_pose_topics(reader)}")
 
-    def _add(self, path: Path, child: str, by_kind: dict[str, Samples], chosen: str) -> None:
-        """Add the step of a frame: by the topic that is chosen, else tf, else the only one."""
-        kind = next((name for name in (chosen, "tf") if name in by_kind), min(by_kind))
+    def _add(self, path: Path, child: str, by_kind: dict[str, Samples], main: str) -> None:
+        """Add the step of a frame: by the topic `main`, else tf, else the only one."""
+        kind = next((name for name in (main, "tf") if name in by_kind), min(by_kind))
         others = sorted({*by_kind} - {kind})
-        if others and kind not in (chosen, "tf"):
+        if others and kind not in (main, "tf"):
             raise InputError(
                 f"{path}: poses of {child} come from {kind} and {others[0]}; give one as pose"
             )
@@ -180,9 +180,9 @@ class Tree:
 
     def pose(self, camera: str, time: float) -> np.ndarray | None:
         """Camera-to-world [4,4]; None where a transform is not known at this time."""
-        frame, pose, seen = camera, np.eye(4), set[str]()
-        while frame in self.parents and frame not in seen:
-            seen.add(frame)
+        frame, pose, path = camera, np.eye(4), set[str]()
+        while frame in self.parents and frame not in path:
+            path.add(frame)
             step = self.tracks[frame].at(time)
             if step is None:
                 return None
@@ -193,8 +193,8 @@ class Tree:
 def _pose_topics(reader: Any) -> str:
     """Topics of poses that could be given as pose."""
     kinds = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
-    found = [one.topic for one in reader.connections if one.msgtype.rpartition("/")[2] in kinds]
-    return ", ".join(sorted(set(found))) or "none"
+    topics = [one.topic for one in reader.connections if one.msgtype.rpartition("/")[2] in kinds]
+    return ", ".join(sorted(set(topics))) or "none"
 
 
 def read_bag(
@@ -255,8 +255,8 @@ def colour_topic(path: Path, reader: Any, topic: str | None) -> str:
     if topic is not None and topic in topics:
         return topic
     if topic is not None or len(colours) != 1:
-        listed = ", ".join(colours) or "none"
-        raise InputError(f"{path}: its topics of colour images are {listed}; give one as `images`")
+        names = ", ".join(colours) or "none"
+        raise InputError(f"{path}: its topics of colour images are {names}; give one as `images`")
     return colours[0]
 
 
@@ -304,10 +304,10 @@ def unpack_colour(path: Path, message: Any, stem: Path) -> Path:
             temporary.write_bytes(data)
         return file
     if message.encoding not in COLOURS:
-        known = ", ".join(COLOURS)
+        encodings = ", ".join(COLOURS)
         raise InputError(
             f"{path}: colour images of encoding {message.encoding!r} are not supported, "
-            f"but {known}; convert them"
+            f"but {encodings}; convert them"
         )
     pixels = _rows(message, "u1")[..., COLOURS[message.encoding]]
     write_png(stem.with_suffix(".png"), np.ascontiguousarray(pixels))
@@ -320,8 +320,8 @@ def _rows(message: Any, kind: str) -> np.ndarray:
     rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
     size = np.dtype(kind).itemsize
     channels = message.step // (message.width * size)
-    used = np.ascontiguousarray(rows[:, : message.width * channels * size])
-    return used.view(kind).reshape(message.height, message.width, channels)
+    pixels = np.ascontiguousarray(rows[:, : message.width * channels * size])
+    return pixels.view(kind).reshape(message.height, message.width, channels)
 
 
 def _metres(message: Any, scratch: Path) -> np.ndarray | None:

@@ -89,9 +89,9 @@ def check_dataset(
     common = [share for share in through if np.isfinite(share)]
     median = float(np.median(common)) if common else float("nan")
     if through and not median <= MAX_SEEN_THROUGH:
-        found = f"see through {median:.0%} of each other's rock"
+        what = f"see through {median:.0%} of each other's rock"
         problems.append(
-            f"neighbouring frames {found if common else 'share no point of the rock'}: "
+            f"neighbouring frames {what if common else 'share no point of the rock'}: "
             "poses, intrinsics or depth follow another convention; "
             "poses must be OpenGL camera-to-world, depth z-depth in metres"
         )
@@ -150,6 +150,6 @@ def seen_through(
     inside = in_image(other.camera, pixels, z)
     columns, rows = np.floor(pixels[inside]).astype(int).T
     nearest = minimum_filter(np.where(other_depth > 0, other_depth, np.inf), 3)
-    seen = np.where(other_depth > 0, nearest, 0)[rows, columns]
-    through = (seen > z[inside] * (1 + TOLERANCE))[seen > 0]
+    surface = np.where(other_depth > 0, nearest, 0)[rows, columns]
+    through = (surface > z[inside] * (1 + TOLERANCE))[surface > 0]
     return float(through.mean()) if len(through) else float("nan")

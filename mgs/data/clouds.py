@@ -62,8 +62,8 @@ def write_cloud(path: str | Path, cloud: SparseCloud) -> None:
     columns = {name: cloud.points[:, k] for k, name in enumerate("xyz")}
     if cloud.views is not None:
         columns |= {name: cloud.views[:, k] for k, name in enumerate(("nx", "ny", "nz"))}
-    known = {"track": cloud.track, "error": cloud.error}
-    columns |= {name: value for name, value in known.items() if value is not None}
+    extra = {"track": cloud.track, "error": cloud.error}
+    columns |= {name: value for name, value in extra.items() if value is not None}
     table = np.empty(len(cloud.points), [(name, "f4") for name in columns])
     for name, value in columns.items():
         table[name] = value
@@ -95,8 +95,8 @@ def read_cloud(path: str | Path) -> SparseCloud:
         None if column is None else column[first]
         for column in (views, values.get("track"), values.get("error"))
     )
-    known = [column for column in (points, views, track, error_px) if column is not None]
-    if len(points) < 2 or not all(np.isfinite(column).all() for column in known):
+    parts = [column for column in (points, views, track, error_px) if column is not None]
+    if len(points) < 2 or not all(np.isfinite(column).all() for column in parts):
         raise InputError(
             f"{path}: has values that are not finite, or fewer than two different points; "
             "make it again"
@@ -117,6 +117,6 @@ def views_of(cloud: SparseCloud, cameras: Sequence[Camera]) -> np.ndarray:
     far = np.where(outside, distance + distance.max(), distance)
     order = np.argsort(far, axis=1, kind="stable")
     taken = np.maximum(1, np.ceil(NEAREST_SHARE * (~outside).sum(1)))
-    chosen = np.argsort(order, axis=1, kind="stable") < taken[:, None]
-    mean = (offset / np.maximum(distance, 1e-30)[..., None] * chosen[..., None]).sum(1)
+    nearest = np.argsort(order, axis=1, kind="stable") < taken[:, None]
+    mean = (offset / np.maximum(distance, 1e-30)[..., None] * nearest[..., None]).sum(1)
     return mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)

@@ -40,12 +40,12 @@ def _is_whole(path: Path) -> bool:
     """Whether a binary file is as long as its counts say. pycolmap does not end if it is not."""
     with reading(path):
         data = path.read_bytes()
-    fixed, named, items, size = RECORDS[path.name]
+    fixed, has_name, items, size = RECORDS[path.name]
     try:
         (count,), place = struct.unpack_from("<Q", data), 8
         for _ in range(count):
             start, place = place, place + fixed
-            place = data.index(b"\0", place) + 1 if named else place
+            place = data.index(b"\0", place) + 1 if has_name else place
             if items:
                 (number,) = struct.unpack_from(items, data, place)
                 place += struct.calcsize(items) + size * number
@@ -65,10 +65,10 @@ def _parameters(model: int) -> int:
     """Number of parameters of a camera model. Raises ValueError if there is no such model."""
     from pycolmap import Camera, CameraModelId
 
-    known = {int(each): each for each in CameraModelId.__members__.values() if int(each) >= 0}
-    if model not in known:
+    models = {int(each): each for each in CameraModelId.__members__.values() if int(each) >= 0}
+    if model not in models:
         raise ValueError(model)
-    return len(Camera.create_from_model_id(1, known[model], 1.0, 1, 1).params)
+    return len(Camera.create_from_model_id(1, models[model], 1.0, 1, 1).params)
 
 
 def _bytes_of_sensors(data: bytes, place: int) -> int:
@@ -84,8 +84,8 @@ def models_in(source: Path) -> list[Path]:
     """Folders of COLMAP models: those of sparse/0, sparse/1 and so on; else sparse, or the folder
     itself."""
     parts = sorted(source.glob("sparse/*/"), key=natural)
-    found = [folder for folder in parts if _is_model(folder)]
-    return found or [folder for folder in (source / "sparse", source) if _is_model(folder)][:1]
+    folders = [folder for folder in parts if _is_model(folder)]
+    return folders or [folder for folder in (source / "sparse", source) if _is_model(folder)][:1]
 
 
 def _is_model(folder: Path) -> bool:
@@ -171,21 +171,21 @@ def _opened(model: Path) -> tuple[Any, dict[int, str]]:
             raise InputError(f"{model / file}: is damaged or cut off; export the model again")
     with parsing(model, "COLMAP model", "export it again"), TemporaryDirectory() as scratch:
         texts = [path for path in model.glob("*.txt") if path.is_file()]
-        marked = any(_has_mark(path) for path in texts)  # pycolmap takes the mark for a word
-        for path in texts if marked else ():
+        has_mark = any(_has_mark(path) for path in texts)  # pycolmap takes the mark for a word
+        for path in texts if has_mark else ():
             text = path.read_bytes().removeprefix(codecs.BOM_UTF8)
             Path(scratch, path.name).write_bytes(text)
-        reconstruction = pycolmap.Reconstruction(scratch if marked else model)
+        reconstruction = pycolmap.Reconstruction(scratch if has_mark else model)
         names = {number: image.name for number, image in reconstruction.images.items()}
     if (model / "images.bin").is_file():
         return reconstruction, names
-    listed = _names_in_text(model / "images.txt")  # pycolmap ends names at a space
-    if set(listed) != set(names):
+    every_name = _names_in_text(model / "images.txt")  # pycolmap ends names at a space
+    if set(every_name) != set(names):
         raise InputError(
-            f"{model / 'images.txt'}: lists {len(listed)} images, of which {len(names)} can be "
+            f"{model / 'images.txt'}: lists {len(every_name)} images, of which {len(names)} can be "
             "read; the file is cut off or damaged, export it again"
         )
-    return reconstruction, listed
+    return reconstruction, every_name
 
 
 def _has_mark(path: Path) -> bool:
@@ -239,8 +239,8 @@ def _camera(where: str, image: Any) -> tuple[Camera, Lens | None]:
     intrinsic = ("f", "fx", "fy", "cx", "cy")
     rest = {name: value for name, value in values.items() if name not in intrinsic}
     K = np.eye(3) if "w" in names else lens.calibration_matrix()
-    found = Lens.of(where, lens.model_name, K, rest)
+    distortion = Lens.of(where, lens.model_name, K, rest)
     try:
-        return Camera(K, lens.width, lens.height, pose), found
+        return Camera(K, lens.width, lens.height, pose), distortion
     except InputError as error:
         raise InputError(f"{where}: {error}") from None

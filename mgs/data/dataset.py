@@ -167,8 +167,8 @@ def read_records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     if not records or not isinstance(records, list):
         raise InputError(f"{path}: lists no frames; expected a nerfstudio transforms.json")
     for index, record in enumerate(records):
-        known = isinstance(record, dict) and "transform_matrix" in record
-        if not known or not record.get("file_path"):
+        whole = isinstance(record, dict) and "transform_matrix" in record
+        if not whole or not record.get("file_path"):
             raise InputError(f"{path}: frame {index} lacks file_path or transform_matrix; add it")
         for key in FILES.values():
             value = record.get(key) or ""
@@ -189,10 +189,10 @@ def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]
             f"{where} is distorted, or not of a pinhole camera; "
             "undistort the images with `mgs import`"
         )
-    missing = [key for key in INTRINSICS if both.get(key) is None]
-    if missing:
+    absent = [key for key in INTRINSICS if both.get(key) is None]
+    if absent:
         raise InputError(
-            f"{where} lacks {missing[0]}; correct the intrinsics "
+            f"{where} lacks {absent[0]}; correct the intrinsics "
             "(`mgs import` reads files with camera_angle_x)"
         )
     try:
@@ -260,10 +260,10 @@ def load_origin(path: str | Path) -> Vector:
 
 def _origin_of(path: Path, data: dict[str, Any]) -> Vector:
     """Origin in a transforms.json. Raises InputError unless it is three finite numbers."""
-    given = data.get("origin", [0.0, 0.0, 0.0])
-    if not isinstance(given, list) or len(given) != 3:
+    origin = data.get("origin", [0.0, 0.0, 0.0])
+    if not isinstance(origin, list) or len(origin) != 3:
         raise InputError(f"{path}: its origin is no list of three numbers; correct it")
-    x, y, z = (finite_number(str(path), "origin", value) for value in given)
+    x, y, z = (finite_number(str(path), "origin", value) for value in origin)
     return x, y, z
 
 
@@ -331,14 +331,14 @@ def write_transforms(
         own = intrinsics(frame.camera)
         record |= {key: value for key, value in own.items() if value != header[key]}
         records.append(record)
-    known = header | place | demand | dict(notes or {})
-    write_json(root / "transforms.json", known | {"frames": records})
+    about = header | place | demand | dict(notes or {})
+    write_json(root / "transforms.json", about | {"frames": records})
 
 
-def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
+def resumes(out: Path, record: str, settings: dict[str, Any]) -> bool:
     """Whether `out`, whose lock is held, contains a dataset to continue; False if it is empty.
 
-    Such a dataset has the JSON file `record`, which must agree with every item of `asked`. It is
+    Such a dataset has the JSON file `record`, which must agree with every item of `settings`. It is
     finished if it has a transforms.json. Temporary files of a killed process are removed. Raises
     InputError if `out` holds anything else.
     """
@@ -346,8 +346,8 @@ def resumes(out: Path, record: str, asked: dict[str, Any]) -> bool:
     if not (out / record).is_file():
         check_new_folder(out)
         return False
-    found = read_json(out / record)
-    if not isinstance(found, dict) or any(found.get(key) != asked[key] for key in asked):
+    old = read_json(out / record)
+    if not isinstance(old, dict) or any(old.get(key) != settings[key] for key in settings):
         state = "a finished" if (out / "transforms.json").is_file() else "an unfinished"
         raise InputError(f"{out}: {state} dataset of other settings or sources {THERE}")
     return True

@@ -78,36 +78,36 @@ class Gltf:
 
     def bytes_of(self, view: int) -> bytes:
         """Bytes of a buffer view."""
-        found = self.json["bufferViews"][view]
-        index, start = found["buffer"], found.get("byteOffset", 0)
+        entry = self.json["bufferViews"][view]
+        index, start = entry["buffer"], entry.get("byteOffset", 0)
         if index not in self._buffers:
             buffer = self.json["buffers"][index]
             if index > 0 and "uri" not in buffer:  # what a decoder would fill
-                raise self.unread(next(iter(found.get("extensions", {})), "of its buffer"))
+                raise self.unread(next(iter(entry.get("extensions", {})), "of its buffer"))
             self._buffers[index] = self.file(buffer["uri"]) if "uri" in buffer else self.binary
-        data = self._buffers[index][start : start + found["byteLength"]]
-        if start < 0 or len(data) != found["byteLength"]:
+        data = self._buffers[index][start : start + entry["byteLength"]]
+        if start < 0 or len(data) != entry["byteLength"]:
             raise ValueError("a buffer view lies outside its buffer")
         return data
 
     def accessor(self, index: int) -> np.ndarray:
         """Numbers of an accessor [N,size]; float64 if it is normalised, else of its own type."""
-        found = self.json["accessors"][index]
-        kind, size, count = COMPONENTS[found["componentType"]], SIZES[found["type"]], found["count"]
-        if "bufferView" in found:
-            start = found.get("byteOffset", 0)
-            values = self._numbers(found["bufferView"], start, kind, count, size)
+        entry = self.json["accessors"][index]
+        kind, size, count = COMPONENTS[entry["componentType"]], SIZES[entry["type"]], entry["count"]
+        if "bufferView" in entry:
+            start = entry.get("byteOffset", 0)
+            values = self._numbers(entry["bufferView"], start, kind, count, size)
         else:
             values = np.zeros((count, size), kind)
-        if "sparse" in found:
-            sparse, values = found["sparse"], values.copy()
+        if "sparse" in entry:
+            sparse, values = entry["sparse"], values.copy()
             n, at, new = sparse["count"], sparse["indices"], sparse["values"]
             whole = COMPONENTS[at["componentType"]]
             places = self._numbers(at["bufferView"], at.get("byteOffset", 0), whole, n, 1)[:, 0]
             values[places] = self._numbers(
                 new["bufferView"], new.get("byteOffset", 0), kind, n, size
             )
-        if found.get("normalized") and values.dtype.kind != "f":
+        if entry.get("normalized") and values.dtype.kind != "f":
             return np.maximum(values / np.iinfo(values.dtype).max, -1)
         return values
 
@@ -150,9 +150,9 @@ class Gltf:
 
     def _instances(self, node: dict[str, Any]) -> Iterator[Transform]:
         """Transforms of a node's instances (EXT_mesh_gpu_instancing); the identity without."""
-        given = node.get("extensions", {}).get(INSTANCING, {}).get("attributes", {})
+        index = node.get("extensions", {}).get(INSTANCING, {}).get("attributes", {})
         names = ("TRANSLATION", "ROTATION", "SCALE")
-        columns = {x.lower(): self.accessor(given[x]).tolist() for x in names if x in given}
+        columns = {x.lower(): self.accessor(index[x]).tolist() for x in names if x in index}
         for values in zip(*columns.values(), strict=True) if columns else [()]:
             yield node_matrix(dict(zip(columns, values, strict=True)))
 

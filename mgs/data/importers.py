@@ -69,7 +69,7 @@ def import_source(
 
         cameras, world = [shot.camera for shot in shots], World(origin=source.origin)
         silhouette = silhouette_of(mesh_in_sight(read_mesh(mesh), cameras, world, mesh))
-    asked = {
+    record = {
         "kind": source.kind,
         "frames": len(shots),
         "sha256_of_frames": _digest(shots),
@@ -78,12 +78,12 @@ def import_source(
         "test_views": None if tests is None else len(tests.shots),
     }
     with folder_locked(out):
-        if resumes(out, RECORD, asked) and (out / "transforms.json").is_file():
+        if resumes(out, RECORD, record) and (out / "transforms.json").is_file():
             return load_dataset(out)
 
         def begin() -> None:
             if not (out / RECORD).is_file():
-                write_json(out / RECORD, asked)
+                write_json(out / RECORD, record)
 
         _warn_of_bits(shots)
         frames = []
@@ -136,7 +136,7 @@ def _mask_file(masks: Path, shot: Shot, shots: Sequence[Shot]) -> Path:
 
 def _digest(shots: list[Shot]) -> str:
     """SHA-256 of names, cameras, times and paths of the shots, but not of file contents."""
-    known = [
+    rows = [
         (
             shot.name,
             shot.camera.K.tolist(),
@@ -155,7 +155,7 @@ def _digest(shots: list[Shot]) -> str:
         )
         for shot in shots
     ]
-    return hashlib.sha256(json.dumps(known).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
 
 def import_shot(
@@ -184,10 +184,10 @@ def import_shot(
         mask, rock = silhouette(camera) if silhouette else None, None
         if silhouette is None:
             mask, rock = _mask_and_rock(shot, rgba, undo)
-        read = partial(read_depth, unit=shot.depth_unit, float_unit=shot.float_unit)
+        reader = partial(read_depth, unit=shot.depth_unit, float_unit=shot.float_unit)
         depth = None
         if shot.depth is not None:
-            depth = read_fitting(read, shot.depth, shot.camera, shot.turned)
+            depth = read_fitting(reader, shot.depth, shot.camera, shot.turned)
         begin()
         if depth_path is not None and depth is not None:
             write_exr(depth_path, {"Z": undo(depth, False)})
@@ -216,13 +216,13 @@ def _mask_and_rock(
     colours would mix with those of empty pixels and leave a rim.
     """
     about = shot.camera, shot.turned
-    given = None if shot.rock is None else read_fitting(read_rgba, shot.rock, *about)
-    layer = rgba if given is None else given
+    cutout = None if shot.rock is None else read_fitting(read_rgba, shot.rock, *about)
+    layer = rgba if cutout is None else cutout
     full = np.iinfo(layer.dtype).max
     alpha = layer[..., 3]
-    if given is None and shot.mask is None and ((alpha > 0) & (alpha < full)).any():
-        given = rgba
-    rock = None if given is None else undo(premultiplied(given), True)
+    if cutout is None and shot.mask is None and ((alpha > 0) & (alpha < full)).any():
+        cutout = rgba
+    rock = None if cutout is None else undo(premultiplied(cutout), True)
     if shot.mask is not None:
         mask = read_fitting(read_mask, shot.mask, *about)
         return undo(mask.astype(np.uint8) * 255, True) >= 128, rock

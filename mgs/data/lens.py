@@ -55,7 +55,7 @@ class Lens:
         else:
             model = GENERAL.get(model, model)
             names = parameter_names(model)
-        known = {"fx": K[0, 0], "fy": K[1, 1], "f": K[0, 0], "cx": K[0, 2], "cy": K[1, 2]}
+        intrinsic = {"fx": K[0, 0], "fy": K[1, 1], "f": K[0, 0], "cx": K[0, 2], "cy": K[1, 2]}
         if "f" in names and not np.isclose(K[0, 0], K[1, 1]):
             raise InputError(f"{where} has two focal lengths, and {model} has one; correct them")
         if not names or "w" in names:
@@ -68,7 +68,7 @@ class Lens:
             )
         if model == "PINHOLE":
             return None
-        return cls(model, tuple(float({**known, **values}.get(name, 0)) for name in names))
+        return cls(model, tuple(float({**intrinsic, **values}.get(name, 0)) for name in names))
 
     def camera(self, width: int, height: int) -> Any:
         """The camera of pycolmap."""
@@ -83,10 +83,10 @@ def parameter_names(model: str) -> list[str]:
     from pycolmap import Camera as ColmapCamera
     from pycolmap import CameraModelId
 
-    known = CameraModelId.__members__.get(model)
-    if known is None or int(known) < 0:
+    number = CameraModelId.__members__.get(model)
+    if number is None or int(number) < 0:
         return []
-    text = ColmapCamera.create_from_model_id(1, known, 1.0, 1, 1).params_info
+    text = ColmapCamera.create_from_model_id(1, number, 1.0, 1, 1).params_info
     return [name.strip() for name in text.split(",")]
 
 
@@ -149,12 +149,12 @@ def _map(lens: Lens, pinhole: bytes, width: int, height: int) -> np.ndarray:
     """Positions float32 [H,W,2] to sample, for OpenCV: pixel centres are whole numbers. Images of
     one lens share it."""
     K, u = np.frombuffer(pinhole).reshape(3, 3), np.arange(width) + 0.5
-    found = np.empty((height, width, 2), np.float32)
+    places = np.empty((height, width, 2), np.float32)
     rows = max(1, BLOCK // width)
     for top in range(0, height, rows):
         v = np.arange(top, min(top + rows, height)) + 0.5
-        found[top : top + rows] = _distorted(lens, K, u, v) - 0.5
-    return found
+        places[top : top + rows] = _distorted(lens, K, u, v) - 0.5
+    return places
 
 
 def _is_sound(at: np.ndarray, lens: Lens, K: np.ndarray, size: tuple[int, int]) -> bool:
@@ -163,12 +163,12 @@ def _is_sound(at: np.ndarray, lens: Lens, K: np.ndarray, size: tuple[int, int]) 
     if not np.isfinite(at).all() or not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
         return False
     down, along = np.gradient(at, axis=(0, 1))
-    turned = along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0]
+    determinant = along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0]
     margin = 0.05 * np.array(size)
     inside = (at >= -margin).all() and (at <= size + margin).all()
     focal = lens.camera(*size).mean_focal_length()
     alike = all(0.1 < value / focal < 10 for value in (K[0, 0], K[1, 1]))
-    return bool(alike and inside and (turned > 0).all())
+    return bool(alike and inside and (determinant > 0).all())
 
 
 def shrunk(
@@ -213,11 +213,11 @@ def read_fitting(
     """Pixels of an image file, turned by its EXIF orientation if `turned`, or if only that fits its
     camera's size. Raises InputError, before anything is decoded, if neither size fits.
     """
-    wanted, found = (camera.width, camera.height), image_size(path)
-    orientation = exif_orientation(path) if turned or found == wanted[::-1] != wanted else 1
-    if wanted != (found[::-1] if orientation >= 5 else found):
+    size, real = (camera.width, camera.height), image_size(path)
+    orientation = exif_orientation(path) if turned or real == size[::-1] != size else 1
+    if size != (real[::-1] if orientation >= 5 else real):
         raise InputError(
-            f"{path}: is {found[0]}x{found[1]}, but its camera is {camera.width}x{camera.height}; "
+            f"{path}: is {real[0]}x{real[1]}, but its camera is {camera.width}x{camera.height}; "
             "resize it or correct w and h"
         )
     pixels = read(path)

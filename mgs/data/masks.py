@@ -48,17 +48,17 @@ def make_masks(
     tests = dataset.test_views()
     if tests is not None and not has_masks(tests.frames):
         make_masks(tests, mesh, progress)
-    depth, frames, seen = mesh_depth(mesh), [], False
+    depth, frames, visible = mesh_depth(mesh), [], False
     thumbnails = []
     for k, frame in enumerate(dataset.frames):
         progress(k, len(dataset))
         mask, rgb = depth(frame.camera) > 0, frame.rgb()
-        seen |= bool(mask.any())
+        visible |= bool(mask.any())
         path = dataset.root / "masks" / f"{frame.name}.png"
         write_png(path, mask)
         frames.append(replace(frame, mask_path=path))
         thumbnails.append(_outlined(rgb, mask))
-    if not seen:
+    if not visible:
         raise InputError(
             f"{dataset.root}: the mesh is in no image; mesh and poses do not fit, "
             "make masks with another"

@@ -35,14 +35,14 @@ def load_gltf_mesh(
     textures = "KHR_texture_transform|EXT_texture_webp" if coloured else r"\w+_texture_\w+"
     gltf = Gltf(path, f"{SHAPES}|{textures}", resolve)
     image = cache(partial(_image, gltf))
-    given = [
+    pairs = [
         (primitive, place)
         for mesh, place in gltf.placed()
         for primitive in gltf.json["meshes"][mesh]["primitives"]
     ]
-    textured = any(_base_colour(gltf, primitive)[1] for primitive, _ in given)
-    meshes = [_shape(gltf, *one) for one in given]
-    parts = [(one, mesh) for (one, _), mesh in zip(given, meshes, strict=True) if mesh is not None]
+    textured = any(_base_colour(gltf, primitive)[1] for primitive, _ in pairs)
+    meshes = [_shape(gltf, *one) for one in pairs]
+    parts = [(one, mesh) for (one, _), mesh in zip(pairs, meshes, strict=True) if mesh is not None]
     if coloured:
         for primitive, mesh in parts:
             visual = _visual(gltf, primitive, len(mesh.vertices), image, textured)
@@ -57,11 +57,11 @@ def load_gltf_mesh(
 
 def _shape(gltf: Gltf, primitive: dict[str, Any], place: Transform) -> trimesh.Trimesh | None:
     """Mesh of a primitive without its colours; None of lines and points."""
-    given = primitive["attributes"]
-    stored = gltf.json["accessors"][given["POSITION"]]
-    if primitive.get("extensions") and not {"bufferView", "sparse"} & set(stored):
+    attributes = primitive["attributes"]
+    positions = gltf.json["accessors"][attributes["POSITION"]]
+    if primitive.get("extensions") and not {"bufferView", "sparse"} & set(positions):
         raise gltf.unread(next(iter(primitive["extensions"])))
-    points = gltf.accessor(given["POSITION"]).astype(np.float64)
+    points = gltf.accessor(attributes["POSITION"]).astype(np.float64)
     indices = np.arange(len(points))
     if "indices" in primitive:
         indices = gltf.accessor(primitive["indices"])[:, 0].astype(np.int64)
@@ -71,8 +71,8 @@ def _shape(gltf: Gltf, primitive: dict[str, Any], place: Transform) -> trimesh.T
     A = place[:3, :3]
     faces = faces if np.linalg.det(A) > 0 else faces[:, ::-1]
     mesh = trimesh.Trimesh(points @ A.T + place[:3, 3], faces, process=False)
-    if "NORMAL" in given:
-        normals = gltf.accessor(given["NORMAL"]) @ np.linalg.inv(A)
+    if "NORMAL" in attributes:
+        normals = gltf.accessor(attributes["NORMAL"]) @ np.linalg.inv(A)
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         mesh.vertex_normals = normals / np.where(length > 0, length, 1)  # type: ignore[method-assign]
     return mesh
@@ -101,9 +101,9 @@ def _visual(
 ) -> Any:
     """Colours of a primitive with n vertices for trimesh; None if its file says none. textured:
     whether another primitive has a texture, so that this one needs one, too."""
-    given = primitive["attributes"]
+    attributes = primitive["attributes"]
     factor, texture = _base_colour(gltf, primitive)
-    colours = gltf.accessor(given["COLOR_0"])[:, :3] if "COLOR_0" in given else None
+    colours = gltf.accessor(attributes["COLOR_0"])[:, :3] if "COLOR_0" in attributes else None
     if (texture or textured) and colours is not None and (colours < 0.99).any():
         raise InputError(
             f"{gltf.path}: has vertex colours beside a texture; bake them into the texture"
@@ -116,7 +116,7 @@ def _visual(
         levels = np.round(255 * srgb_from_linear(rgb)).astype(np.uint8)
         return trimesh.visual.ColorVisuals(vertex_colors=levels)
     if texture:
-        pixels, uv = image(texture["index"]), _coordinates(gltf, given, texture)
+        pixels, uv = image(texture["index"]), _coordinates(gltf, attributes, texture)
     else:
         pixels, uv = Image.new("RGB", (2, 2), (255, 255, 255)), np.full((n, 2), 0.5)
     if (white != 1).any():
@@ -128,11 +128,11 @@ def _visual(
     return trimesh.visual.TextureVisuals(uv=uv * [1, -1] + [0, 1], material=material)
 
 
-def _coordinates(gltf: Gltf, given: dict[str, int], texture: dict[str, Any]) -> np.ndarray:
+def _coordinates(gltf: Gltf, attributes: dict[str, int], texture: dict[str, Any]) -> np.ndarray:
     """Texture coordinates [V,2] after KHR_texture_transform, v downwards."""
     change = texture.get("extensions", {}).get("KHR_texture_transform", {})
     number = change.get("texCoord", texture.get("texCoord", 0))
-    uv = gltf.accessor(given[f"TEXCOORD_{number}"]).astype(np.float64)
+    uv = gltf.accessor(attributes[f"TEXCOORD_{number}"]).astype(np.float64)
     c, s = np.cos(change.get("rotation", 0)), np.sin(change.get("rotation", 0))
     uv = (uv * change.get("scale", (1, 1))) @ [[c, -s], [s, c]] + change.get("offset", (0, 0))
     sampler = gltf.json["textures"][texture["index"]].get("sampler")
@@ -147,9 +147,9 @@ def _coordinates(gltf: Gltf, given: dict[str, int], texture: dict[str, Any]) -> 
 
 def _image(gltf: Gltf, texture: int) -> Image.Image:
     """Image of a texture, 8-bit RGB. Raises InputError as `check_pixels`, and if it is not read."""
-    found = gltf.json["textures"][texture]
-    others = found.get("extensions", {})
-    source = others.get("EXT_texture_webp", {}).get("source", found.get("source"))
+    entry = gltf.json["textures"][texture]
+    others = entry.get("extensions", {})
+    source = others.get("EXT_texture_webp", {}).get("source", entry.get("source"))
     if source is None:
         raise gltf.unread(next(iter(others), "of its texture"))
     one = gltf.json["images"][source]

@@ -114,8 +114,8 @@ def _check(path: object, vertices: np.ndarray, faces: np.ndarray) -> None:
     absent = (faces < 0) | (faces >= len(vertices))
     if absent.any():
         face, corner = np.argwhere(absent)[0]
-        named = f"vertex {faces[face, corner]} of {len(vertices)}"
-        raise InputError(f"{path}: face {face} names {named}; repair the mesh")
+        what = f"vertex {faces[face, corner]} of {len(vertices)}"
+        raise InputError(f"{path}: face {face} names {what}; repair the mesh")
     if np.abs(vertices).max() > FURTHEST:
         raise InputError(
             f"{path}: has vertices further than {FURTHEST:g} m from the origin; "
@@ -186,11 +186,11 @@ def read_mesh(path: str | Path) -> Mesh:
     wound as their neighbours, and outwards. Raises InputError as `load_mesh`.
     """
     path = Path(path)
-    known = _plain_ply(path)
-    if not known:
+    arrays = _plain_ply(path)
+    if not arrays:
         mesh = load_mesh(path, coloured=False)
-        known = mesh.vertices, mesh.faces
-    vertices, faces = known
+        arrays = mesh.vertices, mesh.faces
+    vertices, faces = arrays
     if path.suffix.lower() in GLTF:
         vertices = vertices @ WORLD_FROM_GLTF[:3, :3].T
     return mesh_of(vertices, faces, path)
@@ -207,8 +207,8 @@ def mesh_of(corners: ArrayLike, triangles: ArrayLike, where: object = "mesh") ->
     faces = faces[distinct_faces(vertices, faces)]
     place = _places(vertices)
     faces = np.where(_wound_against(place[faces])[:, None], faces[:, ::-1], faces)
-    used, corners = np.unique(faces, return_inverse=True)
-    vertices, faces = vertices[used], corners.reshape(faces.shape)
+    indices, corners = np.unique(faces, return_inverse=True)
+    vertices, faces = vertices[indices], corners.reshape(faces.shape)
     a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))
     inside_out = np.einsum("fk,fk->f", a, np.cross(b, c)).sum() < 0  # six times the signed volume
     return Mesh(vertices, faces[:, ::-1] if inside_out else faces, np.ones(len(faces), bool))
@@ -216,20 +216,20 @@ def mesh_of(corners: ArrayLike, triangles: ArrayLike, where: object = "mesh") ->
 
 def to_glb(mesh: trimesh.Trimesh) -> bytes:
     """GLB file of a mesh in world coordinates, with normals and texture, turned to +Y up."""
-    turned: Any = mesh.copy(include_cache=True)  # the cache holds the vertex normals
-    if turned.visual.kind == "vertex":  # glTF's are linear
-        rgb = linear_from_srgb(turned.visual.vertex_colors[:, :3] / 255)
-        turned.visual.vertex_colors = np.round(255 * rgb).astype(np.uint8)
-    turned.apply_transform(WORLD_FROM_GLTF.T)
-    return turned.export(None, file_type="glb", include_normals=True)
+    copy: Any = mesh.copy(include_cache=True)  # the cache holds the vertex normals
+    if copy.visual.kind == "vertex":  # glTF's are linear
+        rgb = linear_from_srgb(copy.visual.vertex_colors[:, :3] / 255)
+        copy.visual.vertex_colors = np.round(255 * rgb).astype(np.uint8)
+    copy.apply_transform(WORLD_FROM_GLTF.T)
+    return copy.export(None, file_type="glb", include_normals=True)
 
 
 def distinct_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Indices of the distinct faces [F,3] that have an area, ascending; of equal ones the first."""
-    kept = np.flatnonzero(np.linalg.norm(face_crosses(vertices, faces), axis=1) > 0)
-    corners = np.sort(_places(vertices)[faces[kept]], axis=1)
+    indices = np.flatnonzero(np.linalg.norm(face_crosses(vertices, faces), axis=1) > 0)
+    corners = np.sort(_places(vertices)[faces[indices]], axis=1)
     order, number = _numbered(corners)
-    return kept[
+    return indices[
         np.sort(order[np.searchsorted(number[order], np.arange(number.max(initial=-1) + 1))])
     ]
 

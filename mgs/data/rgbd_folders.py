@@ -37,31 +37,31 @@ OPEN3D_INTERVAL = 0.5
 def rows(path: Path, least: int) -> list[list[str]]:
     """Words of the lines without comments. Raises InputError for fewer than `least`."""
     lines = read_text(path).splitlines()
-    found = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
-    if short := [words for words in found if len(words) < least]:
+    table = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if short := [words for words in table if len(words) < least]:
         raise InputError(
             f"{path}: {' '.join(short[0])[:60]!r} has fewer than {least} columns; correct the line"
         )
-    return found
+    return table
 
 
 def numbers(path: Path, words: list[str]) -> list[float]:
     """Words as finite numbers. Raises InputError."""
     try:
-        found = [float(word) for word in words]
+        values = [float(word) for word in words]
     except ValueError:
-        found = [np.nan]
-    if not (np.abs(found) < LARGEST_NUMBER).all():
+        values = [np.nan]
+    if not (np.abs(values) < LARGEST_NUMBER).all():
         raise InputError(f"{path}: {' '.join(words)[:60]!r} are not all numbers; correct the line")
-    return found
+    return values
 
 
 def poses(path: Path) -> list[list[float]]:
     """Lines (time, x, y, z, qx, qy, qz, qw, ...) of a trajectory. Raises InputError if none is."""
-    found = [numbers(path, words) for words in rows(path, 8)]
-    if not found:
+    samples = [numbers(path, words) for words in rows(path, 8)]
+    if not samples:
         raise InputError(f"{path}: lists no poses; record or export it again")
-    return found
+    return samples
 
 
 def calibration(folder: Path) -> tuple[np.ndarray, Lens | None]:
@@ -99,25 +99,25 @@ def is_tum(folder: Path) -> bool:
 
 def read_tum(folder: Path, spacing: Spacing) -> Source:
     """Keyframes of rgb.txt, depth.txt and groundtruth.txt, whose poses are interpolated."""
-    listed: dict[str, list[tuple[float, Path]]] = {}
+    files: dict[str, list[tuple[float, Path]]] = {}
     for kind in ("rgb", "depth"):
         path = folder / f"{kind}.txt"
         lines = rows(path, 2) if kind == "rgb" or path.is_file() else []
-        listed[kind] = [(numbers(path, words[:1])[0], folder / words[1]) for words in lines]
+        files[kind] = [(numbers(path, words[:1])[0], folder / words[1]) for words in lines]
     path = folder / "groundtruth.txt"
     track = Track.of([(row[0], _pose(path, row[1:8])) for row in poses(path)])
-    images = {time: image for time, image in sorted(listed["rgb"]) if image.is_file()}
-    left_out = Counter({"whose file is missing": len(listed["rgb"]) - len(images)})
+    images = {time: image for time, image in sorted(files["rgb"]) if image.is_file()}
+    left_out = Counter({"whose file is missing": len(files["rgb"]) - len(images)})
     there = posed(images, track.at, left_out)
     if not there:
         raise InputError(f"{folder}: no image has a pose at its time; check groundtruth.txt")
     K, lens = calibration(folder)
-    times = np.array([time for time, _ in listed["depth"]])
+    times = np.array([time for time, _ in files["depth"]])
     shots: list[Shot] = []
     for k in spacing.choose(there):
         time, pose = there[k]
         near = int(np.argmin(np.abs(times - time))) if len(times) else -1
-        depth = listed["depth"][near][1] if near >= 0 else None
+        depth = files["depth"][near][1] if near >= 0 else None
         if depth is not None and abs(times[near] - time) > SYNCHRONOUS:
             depth = None
         name, unit = f"kf_{len(shots):04d}", TUM_DEPTH_UNIT
@@ -140,16 +140,16 @@ def read_open3d(folder: Path, spacing: Spacing) -> Source:
         raise InputError(
             f"{path}: needs three numbers and a 4x4 matrix for each image; record it again"
         )
-    given = np.array(values).reshape(-1, 19)[:, 3:].reshape(-1, 4, 4)
-    matrices, mended = zip(*map(orthonormal, given), strict=True)
+    raw = np.array(values).reshape(-1, 19)[:, 3:].reshape(-1, 4, 4)
+    matrices, mended = zip(*map(orthonormal, raw), strict=True)
     images, depths = (
         sorted((path for path in (folder / name).glob("*") if path.is_file()), key=natural)
         for name in ("color", "depth")
     )
-    for name, listed in (("color", images), ("depth", depths)):
-        if len(listed) != len(matrices) and (listed or name == "color"):
+    for name, files in (("color", images), ("depth", depths)):
+        if len(files) != len(matrices) and (files or name == "color"):
             raise InputError(
-                f"{path}: has {len(matrices)} poses for {len(listed)} images in {name}; "
+                f"{path}: has {len(matrices)} poses for {len(files)} images in {name}; "
                 "make them equal"
             )
     if unnumbered := [path for path in images if not re.search(r"\d", path.name)]:
@@ -175,11 +175,11 @@ def read_rtabmap(folder: Path, spacing: Spacing) -> Source:
     """Keyframes of NAME_rgb, NAME_depth (mm), NAME_calib and NAME_camera_poses.txt, by id."""
     path = min(folder.glob("*_camera_poses.txt"))
     name = path.name.removesuffix("_camera_poses.txt")
-    listed = poses(path)
-    if any(len(row) < 9 for row in listed):
+    lines = poses(path)
+    if any(len(row) < 9 for row in lines):
         raise InputError(f"{path}: has no ids; export with --poses_format 11")
-    views = [row for row in sorted(listed) if row[8] >= 0]
-    left_out = Counter({"landmark": len(listed) - len(views)})
+    views = [row for row in sorted(lines) if row[8] >= 0]
+    left_out = Counter({"landmark": len(lines) - len(views)})
     there = [(row[0], _pose(path, row[1:8])) for row in views]
     shots: list[Shot] = []
     for k in spacing.choose(there):

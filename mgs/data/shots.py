@@ -224,13 +224,13 @@ def turned_by_exif(source: Source) -> Source:
     if any(shot.turned for shot in source.shots):
         return source
     tags = [exif_orientation(shot.image) for shot in source.shots]
-    shown = set()
+    fits = set()
     for shot, tag in zip(source.shots, tags, strict=True):
         if tag >= 5 and (size := image_size(shot.image))[0] != size[1]:
-            shown.add((shot.camera.width, shot.camera.height) == size[::-1])
-    if shown == {True}:
+            fits.add((shot.camera.width, shot.camera.height) == size[::-1])
+    if fits == {True}:
         return replace(source, shots=[replace(shot, turned=True) for shot in source.shots])
-    if not shown and (count := sum(tag > 1 for tag in tags)):
+    if not fits and (count := sum(tag > 1 for tag in tags)):
         note = (
             f"EXIF turns {count} pictures, and their sizes do not show whether the poses are of "
             "the turned ones; they are taken as stored"

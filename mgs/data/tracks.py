@@ -37,9 +37,9 @@ def posed(
     left_out: Counter[str],
 ) -> list[tuple[float, np.ndarray]]:
     """(time, pose) of the times that have a pose; the others are counted in `left_out`."""
-    found = [(time, pose) for time in times if (pose := pose_at(time)) is not None]
-    left_out[WITHOUT_POSE] += len(times) - len(found)
-    return found
+    samples = [(time, pose) for time in times if (pose := pose_at(time)) is not None]
+    left_out[WITHOUT_POSE] += len(times) - len(samples)
+    return samples
 
 
 def orthonormal(pose: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -79,19 +79,19 @@ class Track:
     @classmethod
     def of(cls, samples: Sequence[tuple[float, np.ndarray]]) -> Track:
         """Track of (time, transform); of samples of the same time the last counts."""
-        known = dict(samples)
-        times = sorted(known)
-        return cls(np.array(times), np.stack([known[time] for time in times]))
+        by_time = dict(samples)
+        times = sorted(by_time)
+        return cls(np.array(times), np.stack([by_time[time] for time in times]))
 
     @cached_property
     def gaps(self) -> np.ndarray:
         """Whether the poses between two samples are unknown [T-1]: the time between them is LONG
         times the median, and the pose changed."""
         steps = np.diff(self.times)
-        moved = np.linalg.norm(np.diff(self.transforms[:, :3, 3], axis=0), axis=1)
+        shift = np.linalg.norm(np.diff(self.transforms[:, :3, 3], axis=0), axis=1)
         turns = Rotation.from_matrix(self.transforms[:, :3, :3])
-        turned = (turns[:-1].inv() * turns[1:]).magnitude()
-        still = (moved < STILL) & (turned < STILL)
+        turn = (turns[:-1].inv() * turns[1:]).magnitude()
+        still = (shift < STILL) & (turn < STILL)
         return np.asarray((steps > LONG * np.median(steps)) & ~still)
 
     @cached_property
@@ -126,20 +126,20 @@ class Spacing:
     @classmethod
     def parse(cls, text: str) -> Spacing:
         """Spacing of a text as 0.5s or 0.2m. Raises InputError for anything else."""
-        found = re.fullmatch(r"(\d+\.?\d*|\.\d+)(s|m)", text.strip())
-        if not found:
+        match = re.fullmatch(r"(\d+\.?\d*|\.\d+)(s|m)", text.strip())
+        if not match:
             raise InputError(f"keyframes {text!r}: expected seconds or metres, as 0.5s or 0.2m")
-        return cls(float(found[1]), found[2] == "m")
+        return cls(float(match[1]), match[2] == "m")
 
     def choose(self, shots: Sequence[tuple[float, np.ndarray]]) -> list[int]:
         """Indices of the keyframes among (time, camera-to-world) in order of time: the first, and
         each that is far enough from the keyframe before."""
-        kept: list[int] = []
+        indices: list[int] = []
         for k, (time, pose) in enumerate(shots):
-            if kept:
-                last_time, last = shots[kept[-1]]
-                moved = float(np.linalg.norm(pose[:3, 3] - last[:3, 3]))
-                if (moved if self.metres else time - last_time) < self.least - 1e-6:
+            if indices:
+                last_time, last = shots[indices[-1]]
+                distance = float(np.linalg.norm(pose[:3, 3] - last[:3, 3]))
+                if (distance if self.metres else time - last_time) < self.least - 1e-6:
                     continue
-            kept.append(k)
-        return kept
+            indices.append(k)
+        return indices

@@ -44,15 +44,15 @@ def visible(
     pixels, z = camera.project(points)
     view = camera.position - points
     cosine = np.einsum("nk,nk->n", normals, view) / np.maximum(np.linalg.norm(view, axis=1), 1e-30)
-    seen = in_image(camera, pixels, z)
+    inside = in_image(camera, pixels, z)
     if not two_sided:
-        seen &= cosine > 0
-    shown = np.zeros(len(points))
-    column, row = np.floor(pixels[seen]).astype(int).T
-    shown[seen] = depth[row, column]
+        inside &= cosine > 0
+    surface = np.zeros(len(points))
+    column, row = np.floor(pixels[inside]).astype(int).T
+    surface[inside] = depth[row, column]
     steep = np.maximum(np.abs(cosine), GRAZING)
     slack = tolerance + z / camera.K[0, 0] * np.sqrt(np.maximum(1 - steep**2, 0)) / steep
-    return seen & (shown > 0) & (np.abs(z - shown) < slack)
+    return inside & (surface > 0) & (np.abs(z - surface) < slack)
 
 
 def has_masks(frames: Sequence[Frame]) -> bool:

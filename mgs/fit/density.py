@@ -70,8 +70,8 @@ class Slopes:
 class Density:
     """A density control and when it is called.
 
-    control(model, found, rng) -> (model, kept [N]): index i of the Gaussian of the given model that
-        each still is, or ~i for a changed copy of i. Models have NumPy fields.
+    control(model, slopes, rng) -> (model, origin [N]): index i of the Gaussian of the given model
+        that each still is, or ~i for a changed copy of i. Models have NumPy fields.
     times(passes, images): the numbers of passes after which it is called.
     """
 
@@ -85,7 +85,7 @@ def _rotated(quats: np.ndarray, offsets: np.ndarray) -> np.ndarray:
 
 
 def adapt(
-    model: Gaussians, found: Slopes, rng: np.random.Generator
+    model: Gaussians, slopes: Slopes, rng: np.random.Generator
 ) -> tuple[Gaussians, np.ndarray]:
     """The control of Kerbl et al. 2023: Gaussians of large gradient are copied if small and divided
     in two if large; faint and too large ones are removed, and at times all opacities lowered.
@@ -93,34 +93,34 @@ def adapt(
     With no room for all, those of largest gradient are taken. Not removed are Gaussians that are
     large in an image: the authors' program clears that measure before it reads it.
     """
-    needed = np.argsort(-found.gradient, kind="stable")[: max(found.most - len(model), 0)]
-    needed = np.sort(needed[found.gradient[needed] >= LEAST_GRADIENT])
-    small = _size(model)[needed] <= SMALL * found.extent
-    copied, divided = needed[small], needed[~small]
+    grow = np.argsort(-slopes.gradient, kind="stable")[: max(slopes.most - len(model), 0)]
+    grow = np.sort(grow[slopes.gradient[grow] >= LEAST_GRADIENT])
+    small = _size(model)[grow] <= SMALL * slopes.extent
+    copied, divided = grow[small], grow[~small]
     whole = np.delete(np.arange(len(model)), divided)
     source = np.concatenate([whole, copied, divided, divided])
     new, parts = model[source], slice(len(whole) + len(copied), None)
     scales = np.exp(new.log_scales[parts].astype(np.float64))
     new.means[parts] += _rotated(new.quats[parts], scales * rng.normal(size=scales.shape))
     new.log_scales[parts] -= np.log(DIVISION)
-    kept = np.where(np.arange(len(source)) < len(whole), source, ~source)
+    origin = np.where(np.arange(len(source)) < len(whole), source, ~source)
     alive = new.opacities >= LEAST_OPACITY
-    if found.step > RESET_STEPS:
-        alive &= _size(new) <= TOO_LARGE * found.extent
+    if slopes.step > RESET_STEPS:
+        alive &= _size(new) <= TOO_LARGE * slopes.extent
     if alive.any():
-        new, kept = new[alive], kept[alive]
-    if found.step // RESET_STEPS > found.before // RESET_STEPS:
+        new, origin = new[alive], origin[alive]
+    if slopes.step // RESET_STEPS > slopes.before // RESET_STEPS:
         np.minimum(new.logit_opacities, logit(RESET_OPACITY), out=new.logit_opacities)
-    return new, kept
+    return new, origin
 
 
 def split(
-    model: Gaussians, found: Slopes, rng: np.random.Generator
+    model: Gaussians, slopes: Slopes, rng: np.random.Generator
 ) -> tuple[Gaussians, np.ndarray]:
     """Divide the GROWTH of all Gaussians whose gradient is largest along their longest axis, into
     halves of nearly the same mean and covariance; remove the faint."""
-    most = min(round(GROWTH * len(model)), max(found.most - len(model), 0))
-    divided = np.sort(np.argsort(-found.gradient, kind="stable")[:most])
+    most = min(round(GROWTH * len(model)), max(slopes.most - len(model), 0))
+    divided = np.sort(np.argsort(-slopes.gradient, kind="stable")[:most])
     whole = np.delete(np.arange(len(model)), divided)
     source = np.concatenate([whole, divided, divided])
     new, parts = model[source], slice(len(whole), None)
@@ -132,9 +132,9 @@ def split(
     new.means[parts] += _rotated(new.quats[parts], offsets)
     shorter = length + np.log(SHORTER)
     np.put_along_axis(new.log_scales[parts], longest, shorter, 1)
-    kept = np.where(np.arange(len(source)) < len(whole), source, ~source)
+    origin = np.where(np.arange(len(source)) < len(whole), source, ~source)
     alive = new.opacities >= LEAST_OPACITY
-    return (new[alive], kept[alive]) if alive.any() else (new, kept)
+    return (new[alive], origin[alive]) if alive.any() else (new, origin)
 
 
 def _size(model: Gaussians) -> np.ndarray:
@@ -175,7 +175,7 @@ DENSITIES: dict[str, Density | None] = {
 
 def controlled(
     density: Density,
-    found: Slopes,
+    slopes: Slopes,
     goal: Objective,
     model: Gaussians,
     buffers: list[list[Any]],
@@ -184,8 +184,8 @@ def controlled(
     """Call a control. A Gaussian that changed is its own start in the prior; buffers are zero where
     a parameter changed."""
     before = model.map(np.array)
-    after, kept = density.control(before, found, rng)
-    same, source, prior = kept >= 0, np.where(kept < 0, ~kept, kept), goal.prior
+    after, origin = density.control(before, slopes, rng)
+    same, source, prior = origin >= 0, np.where(origin < 0, ~origin, origin), goal.prior
 
     def start(name: str) -> Any:
         values = np.array(getattr(prior.start, name))[source]
@@ -209,8 +209,8 @@ def controlled(
         start=replace(after, **{name: start(name) for name in ARRAYS}),
         lam={name: lam(name) for name in prior.lam},
     )
-    kept_buffers = [
+    new_buffers = [
         [buffer(name, values) for values in each]
         for name, each in zip(prior.lam, buffers, strict=True)
     ]
-    return replace(goal, prior=refilled), as_drjit(after), kept_buffers
+    return replace(goal, prior=refilled), as_drjit(after), new_buffers

@@ -137,25 +137,25 @@ def worth(
     gain = rise / sigma**2 - 0.5 * np.log(precision / lam)
     gains, rises, unseen = {}, {}, np.ones(len(away), bool)
     for kind, columns in of.items():
-        seen = (precision > lam)[:, columns].any(axis=1)
-        gains[kind] = np.where(seen, gain[:, columns].sum(axis=1), 0.0)
+        some = (precision > lam)[:, columns].any(axis=1)
+        gains[kind] = np.where(some, gain[:, columns].sum(axis=1), 0.0)
         rises[kind] = rise[:, columns].sum(axis=1)
-        unseen &= ~seen
+        unseen &= ~some
     return Worth(gains, rises, phi, unseen)
 
 
-def paying(found: Worth, sizes: Mapping[str, int], loss: float) -> dict[str, Mask]:
+def paying(worths: Worth, sizes: Mapping[str, int], loss: float) -> dict[str, Mask]:
     """Choose the Gaussians that learn each kind, {kind: [N]}: those that gain, without those that
     gain least per parameter while Phi rises by at most `loss` dB in all.
 
     sizes: {kind: parameters of a Gaussian}; only these kinds are decided.
     """
-    gain = np.stack([found.gain[kind] / size for kind, size in sizes.items()]).ravel()
-    rise, kept = np.stack([found.rise[kind] for kind in sizes]).ravel(), gain > 0
-    least = np.flatnonzero(kept)[np.argsort(gain[kept], kind="stable")]
-    allowed = (10 ** (loss / 10) - 1) * found.phi
-    kept[least[np.cumsum(rise[least]) <= allowed]] = False
-    return dict(zip(sizes, kept.reshape(len(sizes), -1), strict=True))
+    gain = np.stack([worths.gain[kind] / size for kind, size in sizes.items()]).ravel()
+    rise, pays = np.stack([worths.rise[kind] for kind in sizes]).ravel(), gain > 0
+    least = np.flatnonzero(pays)[np.argsort(gain[pays], kind="stable")]
+    budget = (10 ** (loss / 10) - 1) * worths.phi
+    pays[least[np.cumsum(rise[least]) <= budget]] = False
+    return dict(zip(sizes, pays.reshape(len(sizes), -1), strict=True))
 
 
 def lean_fit(
@@ -186,22 +186,22 @@ def lean_fit(
     degree = 1 if left_out and left_out.pays else 0
     say("fitting all parameters")
     whole = fitted(images, views, settings, degree, cache)
-    found = _worth(whole, images, settings, cache)
+    worths = _worth(whole, images, settings, cache)
     columns = kinds(degree, settings.train.means)
     sizes = {kind: of.stop - of.start for kind, of in columns.items()}
     rates = settings.train.rates | {DIRECTIONAL: settings.train.rates["colour"]}
-    kept = {kind: ~found.unseen & (rates[kind] > 0) for kind in sizes}
+    learns = {kind: ~worths.unseen & (rates[kind] > 0) for kind in sizes}
     decided = [
         kind
         for kind in sizes
         if rates[kind] > 0 and (kind == DIRECTIONAL or (learn == "auto" and kind != "colour"))
     ]
     if decided:
-        kept |= paying(found, {kind: sizes[kind] for kind in decided}, loss)
+        learns |= paying(worths, {kind: sizes[kind] for kind in decided}, loss)
     say("fitting what the images pay for")
-    last = fitted(images, views, settings, degree, cache, kept)
-    parameters = sum(int(mask.sum()) * sizes[kind] for kind, mask in kept.items())
-    return LeanModel(last, whole, kept, parameters, left_out)
+    last = fitted(images, views, settings, degree, cache, learns)
+    parameters = sum(int(mask.sum()) * sizes[kind] for kind, mask in learns.items())
+    return LeanModel(last, whole, learns, parameters, left_out)
 
 
 def directional_gain(
@@ -270,15 +270,15 @@ def fitted(
     settings: ModelSettings,
     degree: int,
     cache: ListCache,
-    kept: Mapping[str, Mask] | None = None,
+    learns: Mapping[str, Mask] | None = None,
 ) -> Gaussians:
     """Fit some views (indices) from the start; return the Gaussians.
 
-    kept: as `LeanModel.learned`; None: all is learned. Raises InputError as `mgs.fit_gaussians`,
+    learns: as `LeanModel.learned`; None: all is learned. Raises InputError as `mgs.fit_gaussians`,
     and if the fit diverges.
     """
     start, train = images.start(views).with_degree(degree), settings.train
-    found = fit_gaussians(
+    fit = fit_gaussians(
         start,
         [images.cameras[i] for i in views],
         Deferred(views, lambda i: images.targets[i]),
@@ -286,20 +286,20 @@ def fitted(
         cache=cache,
         start=start,
         lam=settings.lam_by_kind(groups(degree, train.means)),
-        learns=None if kept is None else _masks(kept, start.sh.shape[1]),
+        learns=None if learns is None else _masks(learns, start.sh.shape[1]),
     )
-    if found.stop_reason == StopReason.DIVERGED:
+    if fit.stop_reason == StopReason.DIVERGED:
         raise InputError(
-            f"a new fit to the views of the run diverged: its loss rose to {found.losses[-1]:.3g}; "
+            f"a new fit to the views of the run diverged: its loss rose to {fit.losses[-1]:.3g}; "
             "lower its `train.rates`"
         )
-    return found.gaussians
+    return fit.gaussians
 
 
-def _masks(kept: Mapping[str, Mask], coefficients: int) -> dict[str, np.ndarray]:
+def _masks(learns: Mapping[str, Mask], coefficients: int) -> dict[str, np.ndarray]:
     """Masks of `LeanModel.learned` that broadcast to the learned arrays."""
     # Opacities have shape [N], all others more dimensions.
-    masks = {kind: mask if kind == "opacity" else mask[:, None] for kind, mask in kept.items()}
+    masks = {kind: mask if kind == "opacity" else mask[:, None] for kind, mask in learns.items()}
     directional = masks.pop(DIRECTIONAL, None)
     colour = [masks["colour"]]
     if directional is not None:

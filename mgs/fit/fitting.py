@@ -102,23 +102,23 @@ def _step(
     """
     copy, shift = with_gradients(model, prior), [dr.zeros(mi.Float, len(model)) for _ in slopes]
     dr.enable_grad(shift)
-    drawn = view.rendered(copy, shift).array
+    image = view.rendered(copy, shift).array
     target = view.target
-    values = LOSSES[error](drawn, target.pixels, target.weights, view.size, model.linear)
+    values = LOSSES[error](image, target.pixels, target.weights, view.size, model.linear)
     loss = dr.mean(dr.detach(values))
     dr.backward(0.5 * dr.sum(values))
-    step, moved, kept = mi.Float(t), {}, []
-    for name, buffer, rate, known in zip(prior.lam, buffers, rates, information, strict=True):
+    step, after, states = mi.Float(t), {}, []
+    for name, buffer, rate, bound in zip(prior.lam, buffers, rates, information, strict=True):
         value, slope = dr.detach(getattr(copy, name)), dr.grad(getattr(copy, name))
         offset = value - getattr(prior.start, name)
         pull = prior.lam[name] * prior.share
         gradient = slope + mi.TensorXf(pull * offset.array, offset.shape)
         loss += weighted_squares(pull, offset.array) / len(view.target)
-        moved[name], after = OPTIMISERS[optimiser].step(value, gradient, known, buffer, rate, step)
-        kept.append(after)
+        after[name], state = OPTIMISERS[optimiser].step(value, gradient, bound, buffer, rate, step)
+        states.append(state)
     if slopes:
         slopes = [total + new for total, new in zip(slopes, view.slopes(shift), strict=True)]
-    return _in_bounds(replace(model, **moved)), kept, dr.detach(loss), slopes
+    return _in_bounds(replace(model, **after)), states, dr.detach(loss), slopes
 
 
 def fit_gaussians(
@@ -161,9 +161,9 @@ def fit_gaussians(
     if density and (settings.means != "free" or learns):
         raise InputError("density: Gaussians can move only where all learn free means")
     kinds = learned(settings.means).values()
-    if missing := [kind for kind in kinds if kind not in settings.rates]:
+    if absent := [kind for kind in kinds if kind not in settings.rates]:
         raise InputError(
-            f"train.rates: has no rate of {missing[0]}, which is learned; give one, metres"
+            f"train.rates: has no rate of {absent[0]}, which is learned; give one, metres"
         )
     model, how = as_drjit(gaussians), (settings.means, settings.alpha_weight)
     goal = objective(
@@ -184,8 +184,8 @@ def fit_gaussians(
         changes = density is not None and done in times
         if density and changes:
             between = last * len(cameras), done * len(cameras)
-            found = slopes_of(slopes, cameras, between, settings.most_gaussians)
-            goal, model, buffers = controlled(density, found, goal, model, buffers, draws)
+            measure = slopes_of(slopes, cameras, between, settings.most_gaussians)
+            goal, model, buffers = controlled(density, measure, goal, model, buffers, draws)
             slopes, last = [], done
         if density and not slopes and done < end:
             slopes = [dr.zeros(mi.Float, len(model)) for _ in range(2)]
@@ -222,7 +222,7 @@ def _rates(
     """Rate of each kind of parameter, of these shapes, after some passes over the images: a Float
     of one number or one per parameter. learns: as in
     `fit_gaussians`."""
-    fall, found = settings.decay ** (done / max(settings.passes - 1, 1)), []
+    fall, rates = settings.decay ** (done / max(settings.passes - 1, 1)), []
     for kind, shape in shapes.items():
         rate: Any = settings.rates[kind] * (1.0 if kind in settings.steady_rates else fall)
         rate = rate * learns.get(kind, 1.0)
@@ -231,8 +231,8 @@ def _rates(
             factors = np.where(np.arange(shape[1]) > 0, settings.directional_rate, 1.0)
             factors[(degree + 1) ** 2 :] = 0
             rate = rate * factors[:, None]
-        found.append(filled(rate, shape))
-    return found
+        rates.append(filled(rate, shape))
+    return rates
 
 
 def _pass(
@@ -259,8 +259,8 @@ def _pass(
                 raise
             return model, buffers, float("nan"), slopes
         count = dr.opaque(mi.UInt32, t)
-        given = view, buffers, rates, count, information, slopes
-        model, buffers, loss, slopes = _step(optimiser, goal.error, model, goal.prior, *given)
+        arguments = view, buffers, rates, count, information, slopes
+        model, buffers, loss, slopes = _step(optimiser, goal.error, model, goal.prior, *arguments)
         losses.append(loss)
     finite = _is_finite(model)
     mean = float(np.mean([float(loss[0]) for loss in losses])) if finite else float("nan")

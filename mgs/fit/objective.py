@@ -82,10 +82,10 @@ class Target:
         if self.stored == 3:
             return dr.full(mi.Float, 1, len(self))
         pixel, channel = self._places()
-        known = dr.gather(mi.Float, self.values, pixel * self.stored + 3)
+        weight = dr.gather(mi.Float, self.values, pixel * self.stored + 3)
         if self.alpha_factor is None:
-            return known
-        return known * dr.select(channel == 3, self.alpha_factor, 1)
+            return weight
+        return weight * dr.select(channel == 3, self.alpha_factor, 1)
 
     def _places(self) -> tuple[Any, Any]:
         """Pixel and channel of each value that is compared, mi.UInt32 [H*W*C]."""
@@ -194,9 +194,9 @@ class Objective:
         )
         errors = []
         for photo in self.photos:
-            drawn, target = _rendered(model, photo, self.cache), photo.target
-            compared = drawn, target.pixels, target.weights, photo.size, model.linear
-            values = LOSSES[self.error](*compared)
+            image, target = _rendered(model, photo, self.cache), photo.target
+            arguments = image, target.pixels, target.weights, photo.size, model.linear
+            values = LOSSES[self.error](*arguments)
             errors.append(dr.mean(values) + penalty / len(target))
             dr.eval(errors[-1])  # frees the rendered image
         return float(np.mean([float(error[0]) for error in errors]))
@@ -236,10 +236,10 @@ class Objective:
         offsets = self.offsets(model)
         largest = [dr.zeros(mi.TensorXf, d.shape) for d, _ in offsets]
         for photo in self.photos:
-            found = self._information(model, photo)
+            diagonal = self._information(model, photo)
             largest = [
                 mi.TensorXf(dr.maximum(a.array, b.array), a.shape)
-                for a, b in zip(largest, found, strict=True)
+                for a, b in zip(largest, diagonal, strict=True)
             ]
             dr.eval(largest)
         return [
@@ -250,9 +250,9 @@ class Objective:
     def _information(self, model: Gaussians, photo: Photo) -> Vector:
         """Exact Fisher information of one image."""
         means, weight = self.prior.means, self.alpha_weight
-        found = fisher(model, photo.camera, cache=self.cache, means=means, alpha_weight=weight)
+        F = fisher(model, photo.camera, cache=self.cache, means=means, alpha_weight=weight)
         columns = zip(self.offsets(model), groups(model.sh_degree, means).values(), strict=True)
-        return [mi.TensorXf(padded(found[:, c]).reshape(d.shape)) for (d, _), c in columns]
+        return [mi.TensorXf(padded(F[:, c]).reshape(d.shape)) for (d, _), c in columns]
 
     def view(self, model: Gaussians, photo: Photo) -> View:
         """A photo with the block lists of a model. Raises InputError as `ListCache.get`."""
@@ -331,18 +331,18 @@ def _photo(gaussians: Gaussians, camera: Camera, target: np.ndarray, alpha_weigh
     if target.ndim != 3 or target.shape[:2] != (camera.height, camera.width):
         size = f"[{camera.height},{camera.width},3 to 5], that of its camera"
         raise InputError(f"target: has shape {list(target.shape)}, expected {size}")
-    stored = target.shape[-1]
+    channels = target.shape[-1]
     if alpha_weight:
-        if stored < 5:
+        if channels < 5:
             raise InputError(
-                f"target: has {stored} channels, and with a weight for alpha it needs 5, "
+                f"target: has {channels} channels, and with a weight for alpha it needs 5, "
                 "alpha as the last"
             )
         factor = dr.opaque(mi.Float, float(np.sqrt(alpha_weight)))
     if not gaussians.linear:
         target = padded(np.dstack([gaussians.blended(target[..., :3]), target[..., 3:]]))
     values = mi.Float(adopted(target).ravel())
-    return Photo(camera, camera_array(camera), Target(values, factor, stored))
+    return Photo(camera, camera_array(camera), Target(values, factor, channels))
 
 
 @one_at_a_time

@@ -77,35 +77,35 @@ def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float) -> Prun
     if not 0 < noise < 1e9:
         raise InputError(f"prune: noise {noise} must be positive, linear RGB; correct `noise`")
     before, covered = _images(gaussians, cameras)
-    kept, predicted, actual, allowed = np.arange(len(gaussians)), 0.0, 0.0, noise**2 * covered
+    indices, predicted, actual, budget = np.arange(len(gaussians)), 0.0, 0.0, noise**2 * covered
     for _ in range(ROUNDS):
-        left = gaussians[kept]
-        cost = removal_cost(left, cameras)
-        chosen = _cheapest_apart(cost, left.means, (allowed - actual) / 2)
-        fewer = np.delete(kept, chosen)
+        rest = gaussians[indices]
+        cost = removal_cost(rest, cameras)
+        cheap = _cheapest_apart(cost, rest.means, (budget - actual) / 2)
+        fewer = np.delete(indices, cheap)
         after, _ = _images(gaussians[fewer], cameras)
         change = sum(float(((a - b) ** 2).sum()) for a, b in zip(after, before, strict=True))
-        if not chosen or change > allowed:
+        if not cheap or change > budget:
             break
-        kept, predicted, actual = fewer, predicted + float(cost[chosen].sum()), change
+        indices, predicted, actual = fewer, predicted + float(cost[cheap].sum()), change
     scale = max(covered, 1e-30)
-    return Pruned(kept, noise, float(np.sqrt(predicted / scale)), float(np.sqrt(actual / scale)))
+    return Pruned(indices, noise, float(np.sqrt(predicted / scale)), float(np.sqrt(actual / scale)))
 
 
 def _images(gaussians: Gaussians, cameras: Sequence[Camera]) -> tuple[list[np.ndarray], float]:
     """Images [H,W,3], float64, and the number of pixel values that the model covers: 3 times the
     sum of alpha."""
-    drawn = [render(gaussians, camera) for camera in cameras]
-    covered = 3 * sum(float(np.asarray(image.alpha, np.float64).sum()) for image in drawn)
-    return [np.asarray(image.rgb).astype(np.float64) for image in drawn], covered
+    images = [render(gaussians, camera) for camera in cameras]
+    covered = 3 * sum(float(np.asarray(image.alpha, np.float64).sum()) for image in images)
+    return [np.asarray(image.rgb).astype(np.float64) for image in images], covered
 
 
 def _cheapest_apart(cost: np.ndarray, means: np.ndarray, allowed: float) -> list[int]:
     """Cheapest Gaussians whose costs [N] add up to at most `allowed`, no two of them among each
     other's NEIGHBOURS. means: [N,3]."""
-    chosen: list[int] = []
+    cheap: list[int] = []
     if len(cost) == 0:
-        return chosen
+        return cheap
     near = cKDTree(means).query(means, min(NEIGHBOURS + 1, len(cost)))[1].reshape(len(cost), -1)
     blocked, total = np.zeros(len(cost), bool), 0.0
     for j in np.argsort(cost, kind="stable"):
@@ -113,6 +113,6 @@ def _cheapest_apart(cost: np.ndarray, means: np.ndarray, allowed: float) -> list
             break
         if not blocked[j]:
             total += cost[j]
-            chosen.append(int(j))
+            cheap.append(int(j))
             blocked[near[j]] = True
-    return chosen
+    return cheap
