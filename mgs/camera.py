@@ -59,9 +59,9 @@ class Camera:
     traced: tuple[Any, Any] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        given = self.K, self.world_to_camera
-        if any(type(array).__module__.startswith("drjit") for array in given):
-            object.__setattr__(self, "traced", given)
+        arrays = self.K, self.world_to_camera
+        if any(type(array).__module__.startswith("drjit") for array in arrays):
+            object.__setattr__(self, "traced", arrays)
         K = np.asarray(self.K, np.float64) + 0.0  # makes 0.0 of -0.0: `key` compares bytes
         pose = np.asarray(self.world_to_camera, np.float64) + 0.0
         try:

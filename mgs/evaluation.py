@@ -103,9 +103,9 @@ def psnr_measure(
     def measure(gaussians: Gaussians, taken: list[int]) -> dict[str, float]:
         if tests is not None:
             return _psnr_means(of(gaussians, range(len(frames))), "test_")
-        shown = [i for i, frame in enumerate(frames) if i in taken or not frame.on_demand]
-        views = of(gaussians, shown)
-        held_out = {key: v[[i not in taken for i in shown]] for key, v in views.items()}
+        there = [i for i, frame in enumerate(frames) if i in taken or not frame.on_demand]
+        views = of(gaussians, there)
+        held_out = {key: v[[i not in taken for i in there]] for key, v in views.items()}
         return _psnr_means(views) | _psnr_means(held_out, "held_out_")
 
     return measure
@@ -132,13 +132,13 @@ def psnr_over(
         linear = linear_from_srgb(image) if exposure else None
         return compare_psnr(image, rendered, valid, rock, linear)
 
-    def measured(gaussians: Gaussians, chosen: Sequence[int]) -> dict[str, np.ndarray]:
+    def measured(gaussians: Gaussians, indices: Sequence[int]) -> dict[str, np.ndarray]:
         from mgs.splat import as_drjit
 
         model = as_drjit(gaussians)
-        cameras = {i: as_captured(frames[i], world).camera for i in chosen}
-        drawn = ((i, render_view(model, camera, cache)) for i, camera in cameras.items())
-        rows = list(_compared(drawn, compared, 2))
+        cameras = {i: as_captured(frames[i], world).camera for i in indices}
+        renders = ((i, render_view(model, camera, cache)) for i, camera in cameras.items())
+        rows = list(_compared(renders, compared, 2))
         return {name: np.array([row[name] for row in rows], float) for name in names}
 
     return measured
@@ -146,12 +146,12 @@ def psnr_over(
 
 def _psnr_means(values: Mapping[str, np.ndarray], prefix: str = "") -> dict[str, float]:
     """Mean of each array over the views that have it, if there are some; names with a prefix."""
-    measured = {key: column[~np.isnan(column)] for key, column in values.items()}
-    return {prefix + key: float(column.mean()) for key, column in measured.items() if len(column)}
+    numbers = {key: column[~np.isnan(column)] for key, column in values.items()}
+    return {prefix + key: float(column.mean()) for key, column in numbers.items() if len(column)}
 
 
 def _compared(
-    drawn: Iterable[tuple[Any, tuple[np.ndarray, ...]]],
+    renders: Iterable[tuple[Any, tuple[np.ndarray, ...]]],
     compare: Callable[..., dict[str, float]],
     at_once: int,
 ) -> Iterator[dict[str, float]]:
@@ -161,7 +161,7 @@ def _compared(
     """
     queue: deque[Future[dict[str, float]]] = deque()
     with ThreadPoolExecutor(at_once) as pool:
-        for view, arrays in drawn:
+        for view, arrays in renders:
             # Copies: memory of Dr.Jit must not be freed by another thread. That thread would wait
             # for a lock of Dr.Jit while it holds Python's, and this one the other way round.
             queue.append(pool.submit(compare, view, *map(np.array, arrays)))
@@ -203,10 +203,10 @@ def evaluate_model(
     work += [(frame, pictures and pictures / TEST_FOLDER) for frame in test_frames]
     largest = max((frame.camera.width * frame.camera.height for frame, _ in work), default=1)
     at_once = max(1, min(MEASURED_AT_ONCE, PIXELS_AT_ONCE // largest))
-    drawn = ((view, renderer(gaussians, view[0].camera)) for view in work)
+    renders = ((view, renderer(gaussians, view[0].camera)) for view in work)
     views: list[dict[str, Any]] = []
     progress(0, len(work))
-    for (frame, _), metrics in zip(work, _compared(drawn, _measured, at_once), strict=True):
+    for (frame, _), metrics in zip(work, _compared(renders, _measured, at_once), strict=True):
         in_training = len(views) < len(frames) and frame.name in trained
         views.append({"name": frame.name, "trained": in_training} | metrics)
         progress(len(views), len(work))

@@ -93,10 +93,10 @@ def remove_leftovers(folder: Path) -> None:
     """Remove the temporary files that ended processes left in a folder and below it."""
     for where, _, names in os.walk(folder):
         for name in names:
-            named, path = LEFTOVER.fullmatch(name), Path(where, name)
-            if named and not path.is_symlink() and path.is_file():
-                mine = int(named[1]) == os.getpid()
-                if mine or not Path("/proc", named[1]).exists():
+            match, path = LEFTOVER.fullmatch(name), Path(where, name)
+            if match and not path.is_symlink() and path.is_file():
+                mine = int(match[1]) == os.getpid()
+                if mine or not Path("/proc", match[1]).exists():
                     path.unlink(missing_ok=True)
 
 
@@ -131,10 +131,10 @@ def reading(path: Path, what: str = "file") -> Iterator[None]:
     refused, since reading one may never end, and files larger than the free memory.
     """
     try:
-        found = path.stat()
-        if stat.S_IFMT(found.st_mode) not in (stat.S_IFREG, stat.S_IFDIR):
+        about = path.stat()
+        if stat.S_IFMT(about.st_mode) not in (stat.S_IFREG, stat.S_IFDIR):
             raise InputError(f"{path}: is no regular file; give a file, not a pipe or a device")
-        check_room(found.st_size, f"{path}: reading it", "give a smaller file")
+        check_room(about.st_size, f"{path}: reading it", "give a smaller file")
         yield
     except FileNotFoundError:
         raise InputError(f"{path}: no such {what}") from None
@@ -244,8 +244,8 @@ def read_toml(path: str | Path) -> dict[str, Any]:
             raise ValueError(f"a line has more than {LONGEST_LINE:,} characters")
         return tomllib.loads(data.decode())
 
-    found: dict[str, Any] = _parsed(path, "TOML", values, LARGEST_TOML)
-    return found
+    table: dict[str, Any] = _parsed(path, "TOML", values, LARGEST_TOML)
+    return table
 
 
 def read_csv(path: str | Path) -> list[tuple[int, list[str]]]:
@@ -256,8 +256,8 @@ def read_csv(path: str | Path) -> list[tuple[int, list[str]]]:
         table = csv.reader(io.StringIO(data.decode("utf-8-sig", errors="replace"), newline=""))
         return [(table.line_num, row) for row in table if any(cell.strip() for cell in row)]
 
-    found: list[tuple[int, list[str]]] = _parsed(path, "CSV", rows)
-    return found
+    lines: list[tuple[int, list[str]]] = _parsed(path, "CSV", rows)
+    return lines
 
 
 def read_xml(path: str | Path) -> Any:
@@ -314,12 +314,12 @@ class Ours:
     def check(self, folder: Path) -> None:
         """Raises InputError where a folder is not of this kind, or holds a path that is read."""
         there = {path.name for path in folder.iterdir()}
-        known = (*self.names, LOCK, ".*.part*")
-        other = [name for name in sorted(there) if not any(fnmatch(name, one) for one in known)]
-        kept = [str(path) for path in self.reads if folder.resolve() in resolved_parents(path)]
+        own = (*self.names, LOCK, ".*.part*")
+        other = [name for name in sorted(there) if not any(fnmatch(name, one) for one in own)]
+        inputs = [str(path) for path in self.reads if folder.resolve() in resolved_parents(path)]
         why = ""
-        if kept:
-            why = f"{kept[0]} is in it and is read"
+        if inputs:
+            why = f"{inputs[0]} is in it and is read"
         elif other or self.names[0] not in there:
             why = f"it holds {other[0]}" if other else f"it has no {self.names[0]}"
             why = f"this command did not make it, since {why}"
@@ -453,11 +453,11 @@ def scratch_folder(path: str | Path, resumable: bool = False) -> Iterator[Path]:
 def _clear(folder: Path) -> None:
     """Remove everything in a folder but its lock."""
     with suppress(OSError):
-        for left in folder.iterdir():
-            if left.is_dir() and not left.is_symlink():
-                shutil.rmtree(left, ignore_errors=True)
-            elif left.name != LOCK:
-                left.unlink()
+        for entry in folder.iterdir():
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry, ignore_errors=True)
+            elif entry.name != LOCK:
+                entry.unlink()
 
 
 @contextmanager
@@ -466,7 +466,7 @@ def folder_locked(folder: str | Path) -> Iterator[None]:
     it made and that are still empty are removed. Raises InputError as `locked`."""
     folder = Path(folder)
     try:
-        made = [each for each in (folder, *folder.parents) if not each.exists()]
+        new = [each for each in (folder, *folder.parents) if not each.exists()]
         folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
         raise InputError(
@@ -479,7 +479,7 @@ def folder_locked(folder: str | Path) -> Iterator[None]:
             yield
     finally:
         with suppress(OSError):
-            for each in made:
+            for each in new:
                 each.rmdir()
 
 

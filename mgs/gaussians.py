@@ -96,8 +96,8 @@ class Gaussians:
 
     def __getitem__(self, index: Any) -> Gaussians:
         """Select Gaussians by a slice, a mask [N], indices [M] in their order, or one index."""
-        chosen = [index] if isinstance(index, int | np.integer) else index
-        return self.map(lambda array: array[chosen])
+        rows = [index] if isinstance(index, int | np.integer) else index
+        return self.map(lambda array: array[rows])
 
     def counted_from(self, origin: Sequence[float]) -> Gaussians:
         """The same Gaussians in a world whose coordinates count from `origin` [3], metres. Those

@@ -210,9 +210,9 @@ def read_depth(path: str | Path, unit: float = 1e-3, float_unit: float = 1.0) ->
 def _depth_channel(path: Path) -> np.ndarray:
     """Channel of an EXR that is its depth, float32 [H,W]. Raises InputError as `read_depth`."""
     channels = read_exr(path)
-    named = [name for name in channels if name.rpartition(".")[2].lower() in ("z", "depth")]
-    if len(named) == 1 or len(channels) == 1:
-        return channels[(named or [*channels])[0]]
+    depths = [name for name in channels if name.rpartition(".")[2].lower() in ("z", "depth")]
+    if len(depths) == 1 or len(channels) == 1:
+        return channels[(depths or [*channels])[0]]
     if "Z" in channels:
         return channels["Z"]
     if set(channels) <= set("RGBA") and all(
@@ -375,10 +375,10 @@ _redirecting = Lock()
 def _silent() -> Iterator[None]:
     """Context manager: drops what libraries print to the standard error."""
     with _redirecting, open(os.devnull, "wb") as nowhere:
-        kept = os.dup(2)
+        stderr = os.dup(2)
         try:
             os.dup2(nowhere.fileno(), 2)
             yield
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(stderr, 2)
+            os.close(stderr)

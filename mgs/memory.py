@@ -34,18 +34,18 @@ MEMORY_FILE = Path("/proc/meminfo")
 """Linux's report of the memory that is free without swapping."""
 
 
-def check_room(needed: float, what: str, instead: str) -> None:
+def check_room(size: float, what: str, instead: str) -> None:
     """Raise InputError if `what` needs more bytes than are free, with what to do `instead`.
 
     The system would kill the process without a message. Systems that do not report free memory are
     trusted. Memory kept for reuse is released before anything is refused.
     """
-    if needed <= LITTLE or needed <= _spare():
+    if size <= LITTLE or size <= _spare():
         return
     release()
-    if needed > (spare := _spare()):
+    if size > (spare := _spare()):
         raise InputError(
-            f"{what} may take {needed / 2**30:,.1f} GiB, "
+            f"{what} may take {size / 2**30:,.1f} GiB, "
             f"and {spare / 2**30:,.1f} GiB are free; {instead}"
         )
 

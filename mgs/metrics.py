@@ -81,9 +81,9 @@ def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
     if min(a.shape[:2]) < SSIM_WINDOW:
         size, least = f"{a.shape[1]}x{a.shape[0]}", f"{SSIM_WINDOW}x{SSIM_WINDOW}"
         raise InputError(f"SSIM needs images of at least {least} pixels, not {size}")
-    drawn = ((a != 0) | (b != 0)).any(axis=2)
-    drawn[a.shape[0] // 2, a.shape[1] // 2] = True  # both images may be black
-    box, similarity = around(drawn, SSIM_WINDOW), np.ones(a.shape)  # 1 where all around is black
+    lit = ((a != 0) | (b != 0)).any(axis=2)
+    lit[a.shape[0] // 2, a.shape[1] // 2] = True  # both images may be black
+    box, similarity = around(lit, SSIM_WINDOW), np.ones(a.shape)  # 1 where all around is black
     _, similarity[box] = structural_similarity(
         np.asarray(a[box], np.float64),
         np.asarray(b[box], np.float64),
@@ -134,11 +134,11 @@ def compare_psnr(
     `psnr`.
     """
     masks = {"psnr": None if valid.all() else valid, "psnr_mask": rock}
-    shown = srgb_from_linear(rendered)
-    values = {name: psnr(image, shown, mask) for name, mask in masks.items()}
+    picture = srgb_from_linear(rendered)
+    values = {name: psnr(image, picture, mask) for name, mask in masks.items()}
     if linear is not None:
-        shown = srgb_from_linear(colour_corrected(linear, rendered, rock))
-        values |= {f"{name}_corrected": psnr(image, shown, mask) for name, mask in masks.items()}
+        picture = srgb_from_linear(colour_corrected(linear, rendered, rock))
+        values |= {f"{name}_corrected": psnr(image, picture, mask) for name, mask in masks.items()}
     return values
 
 

@@ -39,9 +39,9 @@ def data_uri(picture: Image.Image, kind: str, **options: int) -> str:
 def thumbnails(paths: Sequence[Path]) -> list[Image.Image]:
     """Small pictures of up to MOST_FILES of the files that exist and can be read, evenly chosen."""
     files = [path for path in paths if path.is_file()]
-    chosen = np.unique(np.linspace(0, len(files) - 1, min(MOST_FILES, len(files))).astype(int))
+    indices = np.unique(np.linspace(0, len(files) - 1, min(MOST_FILES, len(files))).astype(int))
     pictures = []
-    for i in chosen:
+    for i in indices:
         try:
             with Image.open(files[i]) as image:
                 small = image.convert("RGB")

@@ -61,8 +61,8 @@ def load_libllvm(path: str) -> Libllvm:
     try:
         library = ctypes.CDLL(path)
     except OSError as error:
-        missing = "/" in path and not Path(path).exists()
-        reason = "no such file" if missing else f"does not load ({error})"
+        absent = "/" in path and not Path(path).exists()
+        reason = "no such file" if absent else f"does not load ({error})"
         raise InputError(f"libLLVM {path}: {reason}") from None
     if hasattr(library, "LLVMGetVersion"):  # since LLVM 16
         numbers = [ctypes.c_uint() for _ in range(3)]
@@ -203,15 +203,15 @@ def _check_libllvm() -> None:
     """Raise InputError if Dr.Jit has loaded no libLLVM, or one that is too old."""
     import drjit as dr
 
-    used = dr.detail.llvm_version()
-    if used[0] < 0:
+    version = dr.detail.llvm_version()
+    if version[0] < 0:
         raise InputError(
             f"Dr.Jit cannot use libLLVM {find_libllvm()} on this processor; "
             "it needs x86-64 with AVX and FMA, or ARM64"
         )
-    if used[0] < MIN_LLVM:
+    if version[0] < MIN_LLVM:
         raise InputError(
-            f"Dr.Jit was started with libLLVM {used[0]} before mgs could choose; "
+            f"Dr.Jit was started with libLLVM {version[0]} before mgs could choose; "
             f"let {LIBRARY_VARIABLE} name {_GOOD}"
         )
 

@@ -280,13 +280,13 @@ class Scene:
         """
         if not self.keep:
             return self._information(state.gaussians, state.frames[view].camera, estimator)
-        model, kept = self.memo.get("views", (None, None))
+        model, cache = self.memo.get("views", (None, None))
         if model is not state.gaussians:
             # Copies: the kernel's array has padded rows, and Dr.Jit keeps its memory.
             make = lambda key: np.array(self._information(state.gaussians, *key))  # noqa: E731
-            kept = kept_within(self.keep, make, lambda F: F.nbytes)
-            self.memo["views"] = state.gaussians, kept
-        return kept((state.frames[view].camera, estimator))
+            cache = kept_within(self.keep, make, lambda F: F.nbytes)
+            self.memo["views"] = state.gaussians, cache
+        return cache((state.frames[view].camera, estimator))
 
     def _information(self, model: Gaussians, camera: Camera, estimator: str | None) -> np.ndarray:
         name = estimator or self.settings.estimator

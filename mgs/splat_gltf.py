@@ -167,15 +167,15 @@ def _joined(path: Path, parts: list[Gaussians]) -> Gaussians:
 
 def _gaussians(gltf: Gltf, primitive: dict[str, Any]) -> Gaussians:
     """Gaussians of a primitive, in its own coordinates."""
-    extension, given = primitive["extensions"][EXTENSION], primitive["attributes"]
+    extension, index = primitive["extensions"][EXTENSION], primitive["attributes"]
     if extension.get("extensions"):
         kind = next(iter(extension["extensions"]))
         raise InputError(f"{gltf.path}: its Gaussians are compressed ({kind}); export uncompressed")
 
     def values(name: str) -> np.ndarray:
-        return gltf.accessor(given[name]).astype(np.float32)
+        return gltf.accessor(index[name]).astype(np.float32)
 
-    coefficients = sum(name.startswith(f"{EXTENSION}:SH_") for name in given)
+    coefficients = sum(name.startswith(f"{EXTENSION}:SH_") for name in index)
     opacities = values(f"{EXTENSION}:OPACITY")[:, 0].astype(np.float64)
     scales = values(f"{EXTENSION}:SCALE")
     if (scales < 0).any():

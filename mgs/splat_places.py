@@ -74,8 +74,8 @@ def moved(g: Gaussians, matrix: np.ndarray, where: object) -> Gaussians:
     sh_turn = np.linalg.pinv(sh_basis(d, g.sh_degree)) @ sh_basis(d @ Q, g.sh_degree)
     sh = np.einsum("kl,nlc->nkc", sh_turn, g.sh)
     quats, log_scales, sh = (np.asarray(array, np.float32) for array in (quats, log_scales, sh))
-    turned = replace(g, quats=quats, log_scales=log_scales, sh=sh)
-    return settled(turned, g.means.astype(np.float64) @ A.T, origin)
+    rotated = replace(g, quats=quats, log_scales=log_scales, sh=sh)
+    return settled(rotated, g.means.astype(np.float64) @ A.T, origin)
 
 
 def to_source(g: Gaussians, world: World) -> Gaussians:

@@ -173,7 +173,7 @@ def _from_columns(
     if rest:
         higher = stack(*(f"f_rest_{i}" for i in range(rest))).reshape(n, 3, coefficients - 1)
         sh = np.concatenate([sh, np.transpose(higher, (0, 2, 1))], axis=1)
-    found = Gaussians(
+    gaussians = Gaussians(
         means=stack("x", "y", "z"),
         log_scales=log_scales,
         quats=stack("rot_0", "rot_1", "rot_2", "rot_3"),
@@ -183,8 +183,8 @@ def _from_columns(
         linear=linear,
     )
     if any(columns[axis].dtype.itemsize < 8 for axis in "xyz"):
-        return found
-    return settled(found, np.stack([columns[axis] for axis in "xyz"], 1), np.zeros(3))
+        return gaussians
+    return settled(gaussians, np.stack([columns[axis] for axis in "xyz"], 1), np.zeros(3))
 
 
 def _smoothed(
@@ -212,10 +212,10 @@ def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
     present = chunks.dtype.names or ()
     coloured = any(f"{end}_{channel}" in present for end in ("min", "max") for channel in "rgb")
     ranges = [*"xyz", "scale_x", "scale_y", "scale_z", *("rgb" if coloured else "")]
-    wanted = [(chunks, f"{end}_{name}", "f") for name in ranges for end in ("min", "max")]
-    for table, name, kind in wanted + [(vertices, name, "u") for name in PACKED]:
-        found = table.dtype[name] if name in (table.dtype.names or ()) else None
-        if found is None or found.kind != kind or found.itemsize < 4:
+    needs = [(chunks, f"{end}_{name}", "f") for name in ranges for end in ("min", "max")]
+    for table, name, kind in needs + [(vertices, name, "u") for name in PACKED]:
+        dtype = table.dtype[name] if name in (table.dtype.names or ()) else None
+        if dtype is None or dtype.kind != kind or dtype.itemsize < 4:
             raise InputError(
                 f"{path}: a compressed PLY without a usable {name!r}; "
                 "export it again, or uncompressed"

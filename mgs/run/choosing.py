@@ -39,8 +39,8 @@ def choose(
         here = positions[state.taken[-1]]
         cost = poses.travel_cost(positions[views], here, mission.travel)
     elif plan is not None:
-        left = views_left(state, mission)
-        planned = plan(scene, state, free(scene, state, mission), left, mission.nearest)
+        count = views_left(state, mission)
+        planned = plan(scene, state, free(scene, state, mission), count, mission.nearest)
         views = [i for i in views if i in planned] or views
     return rated(scene, state, policy, views, cost)[0]
 
@@ -119,7 +119,7 @@ def planned_flight(scene: Scene, state: State, policy: Policy, mission: Mission)
         return []
     flight = flight_of(scene, state, mission)
     for count in (state.seeds, len(state.taken)):
-        start, done = state.taken[:count], list(state.taken[count:])
+        start, past = state.taken[:count], list(state.taken[count:])
         before = replace(state, taken=start)
         stops = tuple(reachable(scene, before, mission))
         if (start, stops) not in flight.tours:
@@ -133,6 +133,6 @@ def planned_flight(scene: Scene, state: State, policy: Policy, mission: Mission)
             way = tour.planned_tour(flight.legs, ends, stops, gains, share, 1 / most)
             flight.tours[start, stops] = way[1:-1]
         plan = flight.tours[start, stops]
-        if plan[: len(done)] == done and plan[len(done) :]:
-            return plan[len(done) :]
+        if plan[: len(past)] == past and plan[len(past) :]:
+            return plan[len(past) :]
     return []

@@ -82,12 +82,12 @@ def before_fit(mask: np.ndarray, alpha: np.ndarray, margin: int) -> Before:
     mask: bool [H,W]. alpha: [H,W], drawn from 0.5 up. margin: pixels; a pixel disagrees where it is
     drawn farther outside the mask, or not drawn farther inside.
     """
-    drawn = alpha >= 0.5
-    either = int((mask | drawn).sum())
+    body = alpha >= 0.5
+    either = int((mask | body).sum())
     outside = ~binary_dilation(mask, iterations=margin)
     inside = binary_erosion(mask, iterations=margin, border_value=1)
-    wrong = int(((drawn & outside) | (inside & ~drawn)).sum())
-    return Before(wrong / max(either, 1), _distance(mask, drawn))
+    wrong = int(((body & outside) | (inside & ~body)).sum())
+    return Before(wrong / max(either, 1), _distance(mask, body))
 
 
 def _distance(one: np.ndarray, other: np.ndarray) -> float:
@@ -122,11 +122,11 @@ def view_indicators(
     counted = mask & (target[..., 3] > 0)
     if not counted.any():
         return ViewIndicators(before, 0.0, 0.0)
-    truth, drawn = target[counted][:, :3].astype(np.float64), rendered[counted].astype(np.float64)
-    squared, variance = float(np.mean((truth - drawn) ** 2)), float(truth.var(axis=0).mean())
-    brightness = np.log(truth.mean(axis=1) + DARK) - np.log(drawn.mean(axis=1) + DARK)
+    truth, image = target[counted][:, :3].astype(np.float64), rendered[counted].astype(np.float64)
+    squared, variance = float(np.mean((truth - image) ** 2)), float(truth.var(axis=0).mean())
+    brightness = np.log(truth.mean(axis=1) + DARK) - np.log(image.mean(axis=1) + DARK)
     ratios = tuple(np.quantile(brightness, RATIO_QUANTILES).tolist())
-    srgb = float(np.mean(np.square(srgb_from_linear(truth) - srgb_from_linear(drawn))))
+    srgb = float(np.mean(np.square(srgb_from_linear(truth) - srgb_from_linear(image))))
     unexplained, pixels = squared / max(variance, 1e-12), int(counted.sum())
     return ViewIndicators(before, unexplained, squared**0.5, srgb, ratios, pixels)
 

@@ -53,15 +53,15 @@ class Directional:
         after all views taken."""
         surface = scene.surface(state)
         for first in (state.seeds, len(state.taken)):
-            start, done = state.taken[:first], list(state.taken[first:])
-            task = start, tuple(sorted({*views, *done})), count + len(done)
+            start, past = state.taken[:first], list(state.taken[first:])
+            task = start, tuple(sorted({*views, *past})), count + len(past)
             if nearest is not None:
                 path = surface.path(*task, nearest, self.model)
-                if path[: len(done)] == done and path[len(done) :]:
-                    return path[len(done) : len(done) + 1]
+                if path[: len(past)] == past and path[len(past) :]:
+                    return path[len(past) : len(past) + 1]
             else:
                 plan = surface.planned(*task, self.model)
-                if set(done) <= set(plan) and set(plan) - set(done):
+                if set(past) <= set(plan) and set(plan) - set(past):
                     return plan
         return views
 

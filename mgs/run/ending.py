@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from mgs.run.settings import NbvSettings
 
 
-def diverged(out: Path, step: int, kept: int, losses: Sequence[float]) -> str:
+def diverged(out: Path, step: int, steps: int, losses: Sequence[float]) -> str:
     """Message for a fit that diverged: its first and last losses, and how to go on.
 
-    step: that of the fit. kept: number of finished steps.
+    step: that of the fit. steps: number of finished steps.
     """
     first, *passes = (f"{loss:.3g}" for loss in losses)
     fit = "the fit to the seeds" if step == 0 else f"the fit of step {step}"
-    left = {0: "", 1: "; step 0 is kept"}.get(kept, f"; steps 0 to {kept - 1} are kept")
+    rest = {0: "", 1: "; step 0 is kept"}.get(steps, f"; steps 0 to {steps - 1} are kept")
     rates = "`train.rates`" if step == 0 else "`warm_rate` or `train.rates`"
     longer = "`train.passes`" if step == 0 else "`warm_passes`"
     short = len(passes) < DIVERGED_PASSES and math.isfinite(losses[-1])
@@ -30,7 +30,7 @@ def diverged(out: Path, step: int, kept: int, losses: Sequence[float]) -> str:
     return (
         f"{out}: {fit} diverged: its loss was {first} at the start, and {', '.join(passes[-3:])} "
         f"in the last passes; {more}lower the learning rates ({rates} in {out / 'config.json'}) "
-        f"and go on with `mgs nbv --resume {out}`{left}"
+        f"and go on with `mgs nbv --resume {out}`{rest}"
     )
 
 
@@ -69,8 +69,8 @@ def run_end(
     if limit is not None and predicted is not None and predicted >= limit:
         return {"reason": str(RunEnd.PSNR), "views": views, "psnr": predicted, "limit": limit}
     if metres is not None:
-        lost = {"given_up": given_up} if given_up else {}
-        return {"reason": str(RunEnd.FLIGHT), "views": views, "metres": metres, **lost}
+        failures = {"given_up": given_up} if given_up else {}
+        return {"reason": str(RunEnd.FLIGHT), "views": views, "metres": metres, **failures}
     gain = refused.get("information_gain", math.inf) if refused else math.inf
     if refused and settings.stop_gain is not None and gain < settings.stop_gain:
         view = {"name": refused["name"], "information_gain": gain}
@@ -94,8 +94,8 @@ def why_ended(ended: Mapping[str, Any]) -> str:
     if ended["reason"] == RunEnd.FLIGHT:
         way = f"the flight is {ended['metres']:.1f} m long with the way home"
         if count := ended.get("given_up"):
-            lost = f"{count} pose{'' if count == 1 else 's'} gave no picture"
-            return f"no pose is left in reach, {views}; {lost}, resuming asks for them again; {way}"
+            note = f"{count} pose{'' if count == 1 else 's'} gave no picture"
+            return f"no pose is left in reach, {views}; {note}, resuming asks for them again; {way}"
         return f"no pose is left that the flight's limits allow, {views}; {way}"
     gain, limit = (
         f"{ended['information_gain']:.4g} {GAIN_UNIT}",

@@ -31,11 +31,11 @@ DECIMALS = 9
 
 def array_digest(arrays: Iterable[np.ndarray]) -> str:
     """BLAKE2b hash of arrays with their shapes and types: 32 hexadecimal digits."""
-    found = hashlib.blake2b(digest_size=16)
+    digest = hashlib.blake2b(digest_size=16)
     for array in arrays:
-        found.update(f"{array.dtype.str} {array.shape};".encode())
-        found.update(np.ascontiguousarray(array).data)
-    return found.hexdigest()
+        digest.update(f"{array.dtype.str} {array.shape};".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
 
 
 def file_digest(path: Path) -> str:
@@ -93,9 +93,9 @@ def check_unchanged(
         if record["cameras"].get(frame.name) != camera_digest(frame.asked or frame.camera):
             where = f"{dataset.root / 'transforms.json'}: the camera of frame {frame.name} has"
             raise InputError(f"{where} {changed} it, or start a new run")
-        known = record["files"].get(frame.name, {})
-        for kind, digest in frame_digests(frame, known).items():
-            if digest != known[kind]:
+        old = record["files"].get(frame.name, {})
+        for kind, digest in frame_digests(frame, old).items():
+            if digest != old[kind]:
                 where = f"{dataset.root / 'transforms.json'}: the {kind} of frame {frame.name}"
                 file = _path(frame, kind) or where
                 raise InputError(f"{file} has changed since {out} took it; restore it")

@@ -87,9 +87,9 @@ def begin(folder: Path, poses: Dataset, prior: Prior) -> None:
     write_json(folder / "transforms.json", data | demand)
     frames = load_dataset(folder, up=poses.world.up).frames
     silhouette = cache(lambda: silhouette_of(prior.mesh))
-    for given, frame in zip(poses.frames, frames, strict=True):
-        if not given.on_demand:
-            image, depth, mask = given.image_path, given.depth_path, given.mask_path
+    for pose, frame in zip(poses.frames, frames, strict=True):
+        if not pose.on_demand:
+            image, depth, mask = pose.image_path, pose.depth_path, pose.mask_path
             shot = Shot(frame.name, frame.camera, None, frame.timestamp, image, depth)
             _commit(folder, frame, replace(shot, mask=mask), silhouette, poses.world)
 
@@ -104,12 +104,12 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
     silhouette = cache(lambda: silhouette_of(prior.mesh))
     centre = prior.points.mean(axis=0)
     token = token_of(dataset) if live and live.folder else ""
-    used = dict[Path, set[str]]()
+    files = dict[Path, set[str]]()
 
     def capture(frame: Frame) -> Frame:
-        known = as_captured(frame, dataset.world)
-        if known.capture_path or known.given_up:
-            return known
+        current = as_captured(frame, dataset.world)
+        if current.capture_path or current.given_up:
+            return current
         if live is None:
             raise InputError(
                 f"{dataset.root}: frame {frame.name} has no image; "
@@ -120,9 +120,9 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
             pose, out = ask(folder, frame, dataset, attempt, token)
             try:
                 live.deliver(pose, out)
-                _warn_of_late(used)
+                _warn_of_late(files)
                 received = _received(dataset, frame, out, live, centre, silhouette)
-                used[out] = {*answers(out)}
+                files[out] = {*answers(out)}
                 return received
             except (InputError, OSError) as error:
                 reason = str(error)
@@ -147,9 +147,9 @@ def token_of(dataset: Dataset) -> str:
     return token if isinstance(token, str) and re.fullmatch(r"[0-9a-f]{8}", token) else ""
 
 
-def _warn_of_late(used: dict[Path, set[str]]) -> None:
+def _warn_of_late(files: dict[Path, set[str]]) -> None:
     """Warn, once each, of files that came after the picture they belong to was read."""
-    for out, ends in used.items():
+    for out, ends in files.items():
         for end, path in answers(out).items():
             if end not in ends:
                 ends.add(end)
@@ -170,7 +170,7 @@ def ask(
     heading, pitch = heading_and_pitch(frame.camera)
     camera = dataset.world.leave(frame.camera)
     name = f"{frame.name}-{token}" if token else frame.name
-    asked = {
+    request = {
         "name": frame.name,
         "picture": f"{name}.png",
         "convention": CONVENTION,
@@ -184,11 +184,11 @@ def ask(
         **intrinsics(camera),
     }
     pose, out = folder / f"{name}.pose.json", folder / f"{name}.png"
-    known: Any = read_json(pose) if pose.is_file() else {}
-    same = isinstance(known, dict) and known == asked | {"attempt": known.get("attempt")}
+    old: Any = read_json(pose) if pose.is_file() else {}
+    same = isinstance(old, dict) and old == request | {"attempt": old.get("attempt")}
     if not same and (there := [*answers(out).values()]):
         raise InputError(f"{there[0]}: lay there before its pose was asked for; move it away")
-    write_json(pose, asked | {"attempt": attempt})
+    write_json(pose, request | {"attempt": attempt})
     return pose, out
 
 
@@ -201,9 +201,9 @@ def _received(
     silhouette: Callable[[], Callable[[Camera], np.ndarray]],
 ) -> Frame:
     """Read, check and commit an answer. Raises InputError where it is refused."""
-    image, found = picture(out), answers(out)
+    image, files = picture(out), answers(out)
     camera, lens = frame.camera, None
-    if flown := found.get(".flown.json"):
+    if flown := files.get(".flown.json"):
         camera, lens = _flown(flown, frame, image, dataset.world)
     away = float(np.linalg.norm(camera.position - frame.camera.position))
     limit = live.distance
@@ -211,9 +211,9 @@ def _received(
         limit = REACH * float(np.linalg.norm(frame.camera.position - centre))
     if away > limit:
         raise InputError(f"{flown}: is {away:.3g} from the pose asked for, more than {limit:.3g}")
-    depth = found.get(".depth.exr") or found.get(".depth.png")
+    depth = files.get(".depth.exr") or files.get(".depth.png")
     unit = DEPTH_UNIT if depth and depth.suffix == ".png" else 1.0
-    mask = found.get(".mask.png")
+    mask = files.get(".mask.png")
     shot = Shot(frame.name, camera, lens, frame.timestamp, image, depth, unit, mask)
     return _commit(dataset.root, frame, shot, silhouette, dataset.world)
 
@@ -224,15 +224,15 @@ def _flown(path: Path, frame: Frame, image: Path, world: World) -> tuple[Camera,
     if not isinstance(record, dict) or "transform_matrix" not in record:
         raise InputError(f"{path}: has no transform_matrix")
     camera, lens, _ = record_camera(str(path), intrinsics(frame.camera) | record, image)
-    asked, camera = frame.camera, world.enter(camera)
-    same = (camera.width, camera.height) == (asked.width, asked.height) and all(
+    plan, camera = frame.camera, world.enter(camera)
+    same = (camera.width, camera.height) == (plan.width, plan.height) and all(
         np.allclose(one, other, rtol=0, atol=SAME)
         for one, other in (
-            (camera.world_to_camera, asked.world_to_camera),
-            (camera.K, asked.K),
+            (camera.world_to_camera, plan.world_to_camera),
+            (camera.K, plan.K),
         )
     )
-    return asked if same else camera, lens
+    return plan if same else camera, lens
 
 
 def _commit(
@@ -244,19 +244,19 @@ def _commit(
 ) -> Frame:
     """Import a picture into the dataset, check it, and write its record, in this world."""
     remove_file(root, frame.image_path)  # of a picture that was refused or interrupted
-    made = import_shot(shot, root, None if shot.mask else silhouette(), 1, lambda: None)
-    if made.mask_path is None:
+    result = import_shot(shot, root, None if shot.mask else silhouette(), 1, lambda: None)
+    if result.mask_path is None:
         raise InputError(f"{shot.mask}: is no mask")
-    check_photograph(made)
-    camera = world.leave(made.camera)
-    moved = {
+    check_photograph(result)
+    camera = world.leave(result.camera)
+    own = {
         "K": camera.K.tolist(),
         "width": camera.width,
         "height": camera.height,
         "world_to_camera": camera.world_to_camera.tolist(),
     }
     record = {
-        "camera": None if made.camera == frame.camera else moved,
+        "camera": None if result.camera == frame.camera else own,
         "depth": shot.depth is not None,
     }
     write_json(capture_record(frame), record)

@@ -135,9 +135,9 @@ class Coverage:
     def relaxation(self, scene: Scene, state: State, views: Sequence[int]) -> relaxed.Coverage:
         """Number of Gaussians that these views newly observe together."""
         surface, lam = scene.surface(state), scene.surface_lam
-        left = ~criteria.observed(state.surface, lam)
-        F = np.stack([surface.information(i)[left, :3] for i in views])
-        return relaxed.Coverage(F, state.surface[left, :3], lam[:3])
+        rest = ~criteria.observed(state.surface, lam)
+        F = np.stack([surface.information(i)[rest, :3] for i in views])
+        return relaxed.Coverage(F, state.surface[rest, :3], lam[:3])
 
 
 @dataclass(frozen=True)

@@ -129,11 +129,11 @@ def load(name: str) -> Policy:
         )
     with _users_code(name, path):
         module = _executed(path, path.read_bytes())
-        wanted = name.rpartition(":")[2]
-        function = getattr(module, wanted, None)
+        target = name.rpartition(":")[2]
+        function = getattr(module, target, None)
         if not callable(function):
             raise InputError(
-                f"policy {name}: {path} has no function {wanted}; give the name of one that it has"
+                f"policy {name}: {path} has no function {target}; give the name of one that it has"
             )
         return Own(name, function() if isinstance(function, type) else function, path)
 
@@ -194,8 +194,8 @@ class Own:
     def _planned(self, name: str, method: Callable[..., Any], *arguments: Any) -> Any:
         """Call a method of the object; the result of `plan` becomes a list of views."""
         with _users_code(self.full, self.path):
-            made = method(*arguments)
-            return [int(view) for view in made] if name == "plan" else made
+            result = method(*arguments)
+            return [int(view) for view in result] if name == "plan" else result
 
     def __call__(self, scene: Scene, state: State, views: list[int]) -> Any:
         shared = {p: ARGUMENTS[p](scene, state, views) for p in self.parameters if p in ARGUMENTS}

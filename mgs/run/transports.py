@@ -60,9 +60,9 @@ def command(text: str, timeout: float) -> Transport:
         words = shlex.split(text)
     except ValueError as error:
         raise InputError(f"capture_command {text!r}: {error}; correct the quotes") from None
-    missing = [field for field in ("{pose}", "{out}") if not any(field in word for word in words)]
-    if missing:
-        raise InputError(f"capture_command {text!r}: has no {missing[0]}; add it")
+    absent = [field for field in ("{pose}", "{out}") if not any(field in word for word in words)]
+    if absent:
+        raise InputError(f"capture_command {text!r}: has no {absent[0]}; add it")
     if shutil.which(words[0]) is None:
         raise InputError(f"capture_command {text!r}: there is no program {words[0]}")
 
@@ -99,8 +99,8 @@ def command(text: str, timeout: float) -> Transport:
 def _last_line(log: Path) -> str:
     """Last line of a program's output, after a colon."""
     lines = log.read_bytes()[-LOG_TAIL:].decode(errors="replace").split("\n")
-    shown = ["".join(filter(str.isprintable, line)).strip() for line in lines]
-    last = next((line for line in reversed(shown) if line), "")
+    texts = ["".join(filter(str.isprintable, line)).strip() for line in lines]
+    last = next((line for line in reversed(texts) if line), "")
     return f": {last[:200]}" if last else ""
 
 

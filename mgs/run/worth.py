@@ -40,18 +40,18 @@ def certificate(
     Returns None where the policy has no `relaxation`, the plan has no view or all of them, or no
     view adds anything.
     """
-    made = _criterion(scene, state, policy, views) if 0 < len(plan) < len(views) else None
-    if made is None:
+    criterion = _criterion(scene, state, policy, views) if 0 < len(plan) < len(views) else None
+    if criterion is None:
         return None
-    chosen, limits = [views.index(i) for i in plan], mission.certificate
-    nodes = min(SEARCH_NODES, SEARCH_PAIRS // made.pairs)
+    indices, limits = [views.index(i) for i in plan], mission.certificate
+    nodes = min(SEARCH_NODES, SEARCH_PAIRS // criterion.pairs)
     nodes = nodes if limits.nodes is None else limits.nodes
-    worth = certify(made, chosen, policy.name, nodes, limits.seconds or np.inf)
-    if made.pairs > CURVE_PAIRS:
+    worth = certify(criterion, indices, policy.name, nodes, limits.seconds or np.inf)
+    if criterion.pairs > CURVE_PAIRS:
         return worth
     positions = scene.positions(state.frames)
     even = spread(positions[list(views)], positions[list(state.taken)], scene.centre)
-    return replace(worth, curve=curve(made, chosen, even))
+    return replace(worth, curve=curve(criterion, indices, even))
 
 
 def _criterion(
@@ -62,8 +62,8 @@ def _criterion(
     if relaxation is None or not views:
         return None
     report(Stage.SCORE, 0, 1)
-    made: Criterion | None = relaxation(scene, state, views)
-    return made if made and made.gain(range(len(views))) > 0 else None
+    criterion: Criterion | None = relaxation(scene, state, views)
+    return criterion if criterion and criterion.gain(range(len(views))) > 0 else None
 
 
 def planned_certificate(
@@ -73,18 +73,18 @@ def planned_certificate(
 
     Returns None where that depends on fits to come, or on the way from view to view.
     """
-    left = views_left(state, mission)
+    count = views_left(state, mission)
     on_its_way = mission.travel is not None or mission.nearest is not None
-    if policy.needs_fit or not hasattr(policy, "relaxation") or on_its_way or left <= 0:
+    if policy.needs_fit or not hasattr(policy, "relaxation") or on_its_way or count <= 0:
         return None
     views = free(scene, state, mission)
     if mission.flies:
         planned = planned_flight(scene, state, policy, mission)
         planned = planned or [view for view, _ in plan_flight(scene, state, policy, mission)]
     elif plan := getattr(policy, "plan", None):
-        planned = plan(scene, state, views, left, None)
+        planned = plan(scene, state, views, count, None)
     else:
-        every = mission.model_copy(update={"batch": left})
+        every = mission.model_copy(update={"batch": count})
         planned = [choice.view for choice in choose_batch(scene, state, policy, every)[1]]
     return certificate(scene, state, policy, mission, planned, views)
 
@@ -94,9 +94,9 @@ def enough_views(scene: Scene, state: State, policy: Policy, mission: Mission) -
 
     Raises InputError where the policy has no `relaxation`, or no candidate adds anything.
     """
-    made = _criterion(scene, state, policy, free(scene, state, mission))
-    if made is not None:
-        return len(greedy(made, mission.enough or ENOUGH))
+    criterion = _criterion(scene, state, policy, free(scene, state, mission))
+    if criterion is not None:
+        return len(greedy(criterion, mission.enough or ENOUGH))
     why = "no candidate adds anything; give the number"
     if not hasattr(policy, "relaxation"):
         why = (
