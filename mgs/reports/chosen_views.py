@@ -78,18 +78,18 @@ def _write_nerfstudio(out: Path, frames: Sequence[Frame], points: np.ndarray, wo
     """transforms.json, images, masks, depth in 16 bits, and points.ply."""
     deepest = max((frame.depth().max() for frame in frames if frame.depth_path), default=0.0)
     step = max(STEP, float(deepest) / (2**16 - 1))
-    written = []
+    copies = []
     for frame in frames:
         copy = _copied(out, frame, "")
         if frame.depth_path is not None:
             path = out / "depth" / f"{frame.name}.png"
             write_png(path, np.round(frame.depth() / step).astype(np.uint16))
             copy = replace(copy, depth_path=path)
-        written.append(copy)
+        copies.append(copy)
     PlyData([PlyElement.describe(points, "vertex")]).write(str(out / "points.ply"))
     notes: dict[str, str | float] = {"ply_file_path": "points.ply"}
     notes |= {"depth_unit_scale_factor": step} if deepest else {}
-    write_transforms(out, written, world, notes)
+    write_transforms(out, copies, world, notes)
 
 
 def _write_colmap(out: Path, frames: Sequence[Frame], points: np.ndarray, world: World) -> None:

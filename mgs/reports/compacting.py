@@ -100,11 +100,11 @@ def encoders(
     cameras = [frame.camera for frame in run.taken]
     for noise in NOISES:
         say("removing Gaussians")
-        kept = prune(g, cameras, noise).kept
+        indices = prune(g, cameras, noise).kept
         say("weighing errors")
-        layer = start.layer[kept] if start else None
+        layer = start.layer[indices] if start else None
         yield Encoder(
-            g[kept], lambda model: _gradients(run, model), None, layer, world.up, world.origin
+            g[indices], lambda model: _gradients(run, model), None, layer, world.up, world.origin
         )
 
 

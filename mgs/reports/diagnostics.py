@@ -84,7 +84,7 @@ def view_maps(
     rgb, alpha, depth = render_view(gaussians, camera, cache)
     maps = {channel: rgb[..., i] for i, channel in enumerate("RGB")}
     maps |= {"A": alpha, "Z": depth}
-    names, shown = list(scalars), np.where(alpha > 0, alpha, 1.0)
+    names, weight = list(scalars), np.where(alpha > 0, alpha, 1.0)
     for first in range(0, len(names), 3):
         three = names[first : first + 3]
         # Divided by the largest value: float32 is precise for colours of about 1.
@@ -93,7 +93,7 @@ def view_maps(
         for i, name in enumerate(three):
             values[:, i] = scalars[name] / largest[i]
         coloured = replace(gaussians, sh=sh_from_rgb(values))
-        mean = np.asarray(render(coloured, camera, cache=cache).rgb) / shown[..., None]
+        mean = np.asarray(render(coloured, camera, cache=cache).rgb) / weight[..., None]
         for i, name in enumerate(three):
             maps[name] = (mean[..., i] * largest[i]).astype(np.float32)
     if "unobserved" in maps:
@@ -164,10 +164,10 @@ def write_preview(
         axes[0].set_title(literal(title))
         for axis, (channel, (label, name)) in zip(axes[1:], PANELS.items(), strict=True):
             norm = _norm(channel, maps[channel][visible])
-            shown = show_map(axis, maps, channel, window, name, norm=norm)
+            image = show_map(axis, maps, channel, window, name, norm=norm)
             axis.set_title(f"{label} ({unit})" if channel == "Z" else label)
             ticks = [0, 1] if channel == "unobserved" else None
-            figure.colorbar(shown, ax=axis, shrink=0.85, aspect=16, pad=0.02, ticks=ticks)
+            figure.colorbar(image, ax=axis, shrink=0.85, aspect=16, pad=0.02, ticks=ticks)
         axes[0].set_axis_off()
 
 
@@ -241,7 +241,7 @@ def diagnose(
     frames = choose_views(opened.dataset.frames, trained, views)
     scalars, out = run_scalars(opened), opened.folder / "diagnostics"
     write_information_ply(out / "information.ply", opened.model, scalars)
-    written = [out / "information.ply"]
+    paths = [out / "information.ply"]
     for done, frame in enumerate(frames):
         progress(done, len(frames))
         maps = view_maps(gaussians, frame.camera, scalars)
@@ -252,6 +252,6 @@ def diagnose(
         world = opened.dataset.world
         write_exr(files[0], maps, world.leave(frame.camera), world.unit)
         write_preview(files[1], maps, title, world.unit)
-        written += files
+        paths += files
     progress(len(frames), len(frames))
-    return written
+    return paths

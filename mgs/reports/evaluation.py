@@ -53,10 +53,10 @@ def evaluate_run(
         frames = run.dataset.with_images(trained)
         test_frames = () if tests is None else tests.frames
         subject = _subject(run.gaussians, [*frames, *test_frames], trained)
-        drawn = [folder / f"{frame.name}.png" for frame in frames]
-        drawn += [folder / TEST_FOLDER / f"{frame.name}.png" for frame in test_frames]
+        files = [folder / f"{frame.name}.png" for frame in frames]
+        files += [folder / TEST_FOLDER / f"{frame.name}.png" for frame in test_frames]
         metrics = _measured_before(run, subject)
-        whole = bool(metrics.get("pictures")) and all(path.is_file() for path in drawn)
+        whole = bool(metrics.get("pictures")) and all(path.is_file() for path in files)
         if metrics and (whole or not pictures):
             also = f", and {folder}" if pictures else ""
             say(f"kept {file}, measured before on this very model and dataset{also}")

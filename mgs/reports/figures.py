@@ -81,8 +81,8 @@ def orbit_figure(
     height = 2.75 * lines + (0.6 if columns > 1 else 1.1)
     with drawing(path, 2.7 * columns, height, NO_GRID) as figure:
         axes = figure.subplots(lines, columns, squeeze=False).ravel()
-        for axis, (label, (seeds, chosen)) in zip(axes, choices.items(), strict=False):
-            draw_cameras(axis, positions, surface, seeds, chosen)
+        for axis, (label, (seeds, views)) in zip(axes, choices.items(), strict=False):
+            draw_cameras(axis, positions, surface, seeds, views)
             axis.set_title(_in_lines(label))
         for axis in axes[len(choices) :]:
             axis.remove()
@@ -98,7 +98,7 @@ def draw_cameras(
     positions: np.ndarray,
     surface: np.ndarray,
     seeds: Sequence[int],
-    chosen: Sequence[int],
+    views: Sequence[int],
     newest: int | None = None,
 ) -> None:
     """Draw cameras from above into axes: all as rings, seeds as discs, chosen ones as discs with
@@ -114,12 +114,12 @@ def draw_cameras(
     axis.scatter(*xy.T, s=14, label="candidate", **hollow)
     disc = {"s": 95, "linewidths": 0, "zorder": 3}
     axis.scatter(*xy[list(seeds)].T, color=SEED, label="seed", **disc)
-    axis.scatter(*xy[list(chosen)].T, color=CHOSEN, label="chosen, in this order", **disc)
+    axis.scatter(*xy[list(views)].T, color=CHOSEN, label="chosen, in this order", **disc)
     if newest is not None:
         axis.plot(*np.stack([xy[newest], centre]).T, color=NEWEST, linewidth=1)
         axis.scatter(*xy[newest], color=NEWEST, **disc)
     text = {"color": "white", "fontsize": 7.5, "ha": "center", "va": "center_baseline"}
-    for order, index in enumerate(chosen, 1):
+    for order, index in enumerate(views, 1):
         axis.annotate(str(order), xy[index], zorder=4, **text)
     span = np.abs(xy - centre).max() * 1.12
     low, high = centre - span, centre + span
@@ -187,15 +187,15 @@ def comparison_figure(
     truth, renders: linear RGB [H,W,3]; captions: label -> text below it (PSNR, SSIM).
     """
     window = crop(truth.max(axis=2) > 0)
-    shown = srgb_from_linear(truth)[window]
+    target = srgb_from_linear(truth)[window]
     images = {label: srgb_from_linear(image)[window] for label, image in renders.items()}
-    differences = {label: np.abs(image - shown).mean(axis=2) for label, image in images.items()}
+    differences = {label: np.abs(image - target).mean(axis=2) for label, image in images.items()}
     limit = max(float(np.quantile(d, 0.995)) for d in differences.values()) or 1.0
-    columns, aspect = 1 + len(images), shown.shape[0] / shown.shape[1]
+    columns, aspect = 1 + len(images), target.shape[0] / target.shape[1]
     with drawing(path, 2.7 * columns, 2.7 * aspect * 2 + 1.2, NO_GRID, dpi=150) as figure:
         figure.suptitle("One view: truth, renders, errors")
         axes = figure.subplots(2, columns)
-        axes[0, 0].imshow(shown, interpolation="nearest")
+        axes[0, 0].imshow(target, interpolation="nearest")
         axes[0, 0].set_title(f"truth\n{_in_lines(title)}")
         scale = {"cmap": "magma", "vmin": 0, "vmax": limit, "interpolation": "nearest"}
         for (above, below), (label, image) in zip(axes.T[1:], images.items(), strict=True):

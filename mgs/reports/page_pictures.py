@@ -77,8 +77,8 @@ class Album:
         limit = max((float(np.quantile(e, 0.995)) for e in self.errors.values()), default=0.0)
         limit = max(round(limit, 3), 1 / 255)
         for name, error in self.errors.items():
-            shown = painted(error.astype(np.float32) / limit, ERROR_COLOURS)
-            self.pictures[name] = web_picture(shown)
+            image = painted(error.astype(np.float32) / limit, ERROR_COLOURS)
+            self.pictures[name] = web_picture(image)
         self.errors.clear()
         return limit
 
@@ -117,12 +117,12 @@ def new_album(frames: Sequence[Frame], count: int) -> Album:
     return Album(window, max(1, int(min(width, WIDEST, fits))))
 
 
-def draw_taken(album: Album, label: str, run: Run, drawn: Callable[[], None]) -> None:
+def draw_taken(album: Album, label: str, run: Run, tick: Callable[[], None]) -> None:
     """Draw the views that a run has taken, in their order.
 
     Adds `truth/NAME`, `render/NAME/LABEL`, `error/NAME/LABEL`, and `before/NAME/LABEL` and
     `after/NAME/LABEL`: the uncertainty of the model seen from there before and after the view was
-    taken. drawn: called after each view. Raises InputError if a file of a frame cannot be read.
+    taken. tick: called after each view. Raises InputError if a file of a frame cannot be read.
     """
     from mgs.splat import fisher, groups
 
@@ -137,7 +137,7 @@ def draw_taken(album: Album, label: str, run: Run, drawn: Callable[[], None]) ->
         draw_render(album, f"{frame.name}/{label}", frame, rendered)
         for when in ("before", "after"):
             album.add_uncertainty(f"{when}/{frame.name}/{label}", maps[when], maps["A"])
-        drawn()
+        tick()
 
 
 def draw_render(album: Album, name: str, frame: Frame, rendered: np.ndarray) -> None:

@@ -119,12 +119,12 @@ def views_plot(metric: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> 
     """
     traces = []
     for (label, views), style in zip(runs.items(), line_styles(runs), strict=True):
-        measured = [view for view in views if view.get(metric) is not None]
+        numbers = [view for view in views if view.get(metric) is not None]
         for trained, which in ((True, "training view"), (False, "held-out view")):
-            shown = [view for view in measured if view["trained"] == trained]
+            part = [view for view in numbers if view["trained"] == trained]
             symbol = SYMBOLS[style["marker"]] + ("" if trained else "-open")
             marker = {"symbol": symbol, "color": style["color"], "size": 8}
-            xs, ys = [view["name"] for view in shown], [view[metric] for view in shown]
+            xs, ys = [view["name"] for view in part], [view[metric] for view in part]
             trace = {"name": f"{label}, {which}", "x": xs, "y": ys}
             traces.append(trace | {"mode": "markers", "marker": marker})
     name = METRIC_NAMES[metric]
@@ -173,8 +173,8 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     The last trace, "shown above", marks the view of the page's slider; the page moves it.
     """
     taken, frames = run.indices, run.dataset.frames
-    seeds, chosen = taken[: run.settings.seeds], taken[run.settings.seeds :]
-    order = list(range(1, len(chosen) + 1))
+    seeds, views = taken[: run.settings.seeds], taken[run.settings.seeds :]
+    order = list(range(1, len(views) + 1))
     names, cameras = zip(*((frame.name, frame.camera) for frame in frames), strict=True)
     eyes = np.array([camera.position for camera in cameras])
     middle = np.mean(run.gaussians.means, axis=0)
@@ -200,9 +200,9 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
         others = "candidates, by price"
     diamond = {"size": 6, "color": "#D55E00", "symbol": "diamond"}
     bar = {"title": {"text": "step"}, "thickness": 12, "len": 0.6}
-    scale = {"colorscale": "Viridis", "showscale": bool(chosen), "colorbar": bar}
-    steps = [f"{names[i]}, step {k}" for k, i in zip(order, chosen, strict=True)]
-    path = markers("chosen, in their order", chosen, steps, size=6, color=order, **scale)
+    scale = {"colorscale": "Viridis", "showscale": bool(views), "colorbar": bar}
+    steps = [f"{names[i]}, step {k}" for k, i in zip(order, views, strict=True)]
+    path = markers("chosen, in their order", views, steps, size=6, color=order, **scale)
     path |= {"mode": "lines+markers+text", "text": [str(k) for k in order]}
     path |= {"line": {"color": GREY, "width": 2}, "textfont": {"size": 11}}
     here = {"size": 12, "color": "#dd1111", "symbol": "circle-open"}
@@ -219,7 +219,7 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     alt = (
         f"Camera positions of {label} in 3D around the model. "
         f"Seeds: {', '.join(names[i] for i in seeds)}. "
-        f"Chosen, in this order: {', '.join(names[i] for i in chosen) or 'none yet'}."
+        f"Chosen, in this order: {', '.join(names[i] for i in views) or 'none yet'}."
     )
     layout = {"scene": {"aspectmode": "data", "camera": view, **axes}}
     return {"title": f"Orbit, {label}", "alt": alt, "data": traces, "layout": layout}

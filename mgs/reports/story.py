@@ -46,13 +46,13 @@ def story_frames(run: Run, progress: Progress) -> Film:
     among the test views, or else the views never taken, or else all. Raises InputError as `models`,
     and if an image cannot be read.
     """
-    scene, shown = scene_of(run), None
+    scene, view = scene_of(run), None
     with listening(progress):
         for model in models(run, scene):
             unknown = {"uncertainty": criteria.uncertainty(model.H, scene.lam)}
-            shown = shown or _shown_view(run, model, unknown)
-            maps = view_maps(model.gaussians, shown.camera, unknown)
-            yield _drawn(run, model, maps, shown)
+            view = view or _shown_view(run, model, unknown)
+            maps = view_maps(model.gaussians, view.camera, unknown)
+            yield _drawn(run, model, maps, view)
 
 
 def _shown_view(run: Run, model: State, unknown: dict[str, np.ndarray]) -> Frame:
@@ -71,12 +71,12 @@ def _left(maps: dict[str, np.ndarray]) -> float:
     return float(maps["uncertainty"][maps["A"] >= VISIBLE].mean())
 
 
-def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], shown: Frame) -> np.ndarray:
+def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], view: Frame) -> np.ndarray:
     """One frame, sRGB uint8 [H,W,3]."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    truth = srgb_from_linear(shown.masked_rgb())
+    truth = srgb_from_linear(view.masked_rgb())
     rgb = picture(maps)
     window = crop(truth.max(axis=2) > 0)
     count, seeds = len(model.taken), run.settings.seeds

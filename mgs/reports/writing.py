@@ -54,22 +54,22 @@ def report(
     Files of an earlier report are replaced. Raises InputError as `compare_runs`; if a run is
     unfinished or was not evaluated since its last step. Then nothing is written.
     """
-    compared = compare_runs([runs] if isinstance(runs, str | PathLike) else runs)
-    for run in compared.values():
+    by_label = compare_runs([runs] if isinstance(runs, str | PathLike) else runs)
+    for run in by_label.values():
         check_finished(run)
         check_measured(run)
-    out, (frame, views) = Path(out), shown_view(list(compared.values()))
-    chosen = any(run.settings.budget for run in compared.values())
-    paths = {name: out / f"{name}.{kind}" for name in CHOICES if chosen}
-    if chosen:
-        _draw_choices(paths, compared)
+    out, (frame, views) = Path(out), shown_view(list(by_label.values()))
+    choices = any(run.settings.budget for run in by_label.values())
+    paths = {name: out / f"{name}.{kind}" for name in CHOICES if choices}
+    if choices:
+        _draw_choices(paths, by_label)
     paths["comparison"] = out / f"comparison.{kind}"
-    _draw_comparison(paths["comparison"], compared, frame, views)
-    if panels := _psnr_panels(compared):
+    _draw_comparison(paths["comparison"], by_label, frame, views)
+    if panels := _psnr_panels(by_label):
         paths["psnr"] = out / f"psnr.{kind}"
         figures.curves_figure(paths["psnr"], "Quality after each image", panels)
 
-    rows = comparison_rows(compared)
+    rows = comparison_rows(by_label)
     write_text(out / "table.md", markdown_table(rows))
     write_json(out / "table.json", rows)
     return [*paths.values(), out / "table.md", out / "table.json"]
@@ -126,9 +126,9 @@ def _draw_comparison(path: Path, runs: Mapping[str, Run], frame: Frame, views: s
     for label, run in runs.items():
         renders[label] = render_view(run.gaussians, frame.camera)[0]
         view = next(view for view in (run.metrics or {})[views] if view["name"] == frame.name)
-        seen = ", trained on" if view["trained"] else ""
+        note = ", trained on" if view["trained"] else ""
         decibels, ssim = (table_cell(key, view[key]) for key in ("psnr", "ssim"))
-        captions[label] = f"{len(run.indices)} images{seen}; {decibels} dB, SSIM {ssim}"
+        captions[label] = f"{len(run.indices)} images{note}; {decibels} dB, SSIM {ssim}"
     figures.comparison_figure(path, frame.masked_rgb(), renders, frame.name, captions)
 
 
