@@ -127,7 +127,7 @@ def prior(
     from mgs.prior.build import outline_error, prior_from_mesh, save_prior
     from mgs.prior.figure import draw_prior
     from mgs.prior.initial import AGREEMENT, colour_agreement
-    from mgs.prior.photographs import source_of
+    from mgs.prior.photographs import choose_source
     from mgs.prior.settings import PriorSettings
 
     console = Terminal()
@@ -149,7 +149,7 @@ def prior(
             if mesh.suffix.lower() in GLTF:
                 console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
         else:
-            chosen = source_of(data, source, points)
+            chosen = choose_source(data, source, points)
             console.print(f"prior from {chosen}" + ("" if source or points else WHY[chosen]))
             options = {"source": chosen, "points": points}
             result, segmented = _built(data, settings, folder, progress, **options)

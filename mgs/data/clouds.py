@@ -15,7 +15,7 @@ from mgs.data.world import World
 from mgs.errors import InputError
 from mgs.files import atomic_path, parsing, reading
 
-COLUMNS = ("x", "y", "z", "nx", "ny", "nz", "track", "error")
+FIELDS = ("x", "y", "z", "nx", "ny", "nz", "track", "error")
 
 NEAREST_SHARE = 0.25
 """Share of the cameras with a point in their image, nearest first, that are taken to have seen it
@@ -83,7 +83,7 @@ def read_cloud(path: str | Path) -> SparseCloud:
         file.read(1)
     with parsing(path, "cloud", "give a PLY file with x y z, or import again"):
         data = PlyData.read(str(path))["vertex"].data
-        names = [name for name in COLUMNS if name in (data.dtype.names or ())]
+        names = [name for name in FIELDS if name in (data.dtype.names or ())]
         values = {name: np.asarray(data[name], np.float64) for name in names}
         points = np.stack([values[name] for name in "xyz"], 1)
         views = None

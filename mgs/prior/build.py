@@ -33,7 +33,7 @@ from mgs.prior.hull import MOST_PIXELS
 from mgs.prior.photographs import (
     check_masks,
     check_photographs,
-    source_of,
+    choose_source,
     surface_of,
 )
 from mgs.prior.resolution import (
@@ -140,11 +140,11 @@ def prior_and_cloud(
 ) -> tuple[Prior, SegmentedCloud | None]:
     """Build the prior of a dataset. Returns it, and the cloud of its mesh (None for a hull).
 
-    Arguments as `build_prior`. Raises InputError as `source_of`, `check_masks`, `surface_of`,
+    Arguments as `build_prior`. Raises InputError as `choose_source`, `check_masks`, `surface_of`,
     `scattered`, `segment_dataset`, `poisson_mesh` and `sample_surface`, and if no frame sees the
     mesh; NoSurface, which holds the cloud, if points give no surface.
     """
-    kind = source_of(dataset, source, points)
+    kind = choose_source(dataset, source, points)
     if kind == "random":
         return _random_prior(dataset, settings, dataset.frames), None
     if kind != "depth":

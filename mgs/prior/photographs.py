@@ -47,7 +47,7 @@ ONE_SIDED = 0.5
 """Least length of the mean normal of points seen from one side."""
 
 
-def source_of(dataset: Dataset, source: str | None = None, points: Path | None = None) -> str:
+def choose_source(dataset: Dataset, source: str | None = None, points: Path | None = None) -> str:
     """Source of a dataset's prior: the one asked for, else the first of depth, points, hull and
     random.
 

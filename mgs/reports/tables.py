@@ -12,7 +12,7 @@ from mgs.reports.runs import check_measured
 from mgs.run.ending import RunEnd
 from mgs.run.folder import Run
 
-COLUMNS = {
+HEADERS = {
     "policy": "policy",
     "images": "images",
     "test.psnr": "PSNR, test views (dB)",
@@ -77,11 +77,11 @@ def metrics_row(label: str, metrics: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Keys of COLUMNS of which some row has a value, in order."""
+    """Keys of HEADERS of which some row has a value, in order."""
     exposure, masked = any(row.get("exposure") for row in rows), is_masked(rows)
     return [
         key
-        for key in COLUMNS
+        for key in HEADERS
         if any(row.get(key) is not None for row in rows)
         and (masked or "mask" not in key)
         and ("corrected" not in key or (exposure and masked == ("mask" in key)))
@@ -101,7 +101,7 @@ def has_held_out(rows: Sequence[Mapping[str, Any]]) -> bool:
 
 def table_cell(key: str, value: Any) -> str:
     """Format a number as a table cell: SSIM with four decimals, PSNR (dB), coverage (%) and path
-    with two, others with five digits; a dash for None. key: its name, as in COLUMNS or
+    with two, others with five digits; a dash for None. key: its name, as in HEADERS or
     metrics.json."""
     if value is None:
         return "–"
@@ -122,7 +122,7 @@ def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
 def table_heading(key: str, rows: Sequence[Mapping[str, Any]]) -> str:
     """Heading of a column of these rows."""
     every = "all views" if has_held_out(rows) else "training views"
-    return COLUMNS[key].replace("{unit}", rows[0]["unit"]).replace("all views", every)
+    return HEADERS[key].replace("{unit}", rows[0]["unit"]).replace("all views", every)
 
 
 def markdown(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -75,10 +75,10 @@ def finished(scene: Scene, state: State, mission: Mission) -> bool:
     if views_left(state, mission) <= 0 or not reachable(scene, state, mission):
         return True
     limit = mission.stop_uncertainty
-    return limit is not None and uncertainty(scene, state) <= limit
+    return limit is not None and mean_uncertainty(scene, state) <= limit
 
 
-def uncertainty(scene: Scene, state: State) -> float:
+def mean_uncertainty(scene: Scene, state: State) -> float:
     """Mean over all parameters of the variance that is left, over that of the prior."""
     return float(criteria.uncertainty(state.H, scene.lam).mean())
 

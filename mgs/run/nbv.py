@@ -26,7 +26,7 @@ from mgs.learning import information, refine_poses, surface_information
 from mgs.memory import VIEW_BYTES
 from mgs.policy.poses import seed_views
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
-from mgs.prior.photographs import source_of as source_of_prior
+from mgs.prior.photographs import choose_source
 from mgs.prior.settings import PriorSettings
 from mgs.progress import Progress, listening, no_progress
 from mgs.run import recording
@@ -46,7 +46,7 @@ from mgs.run.folder import (
 from mgs.run.live import Live, begin, live_capture
 from mgs.run.loop import first_views
 from mgs.run.policies import Policy
-from mgs.run.policy_file import in_file, is_function, label, name_of, policy_of, source_of
+from mgs.run.policy_file import code_of, in_file, is_function, label, name_of, policy_of
 from mgs.run.settings import (
     ALPHA_WEIGHT,
     ENOUGH,
@@ -143,7 +143,7 @@ def start_run(
       file) (docs/howto/on-site.md). They are kept in OUT/dataset.
     - prior: a folder, or a Prior, which is copied into the run. Default: DATASET/prior if it
       exists, else a prior of `gaussians` built in the run (default: as many as cameras resolve).
-    - source: what a prior built in the run is made from (`mgs.prior.photographs.source_of`).
+    - source: what a prior built in the run is made from (`mgs.prior.photographs.choose_source`).
       "random" reads no mask but those of the seeds; means are then free and the prior loose.
     - loose: as `NbvSettings.with_spacing`.
     - force: replace an existing run.
@@ -218,7 +218,7 @@ def start_run(
             write_refined(unfinished / DATASET, dataset, frames)
         start(unfinished, mission, dataset)
         if not isinstance(policy, str):
-            (unfinished / POLICY_SOURCE).write_text(source_of(policy), encoding="utf-8")
+            (unfinished / POLICY_SOURCE).write_text(code_of(policy), encoding="utf-8")
     return Run(out, mission, dataset if images == root else None, stored, policy)
 
 
@@ -255,7 +255,7 @@ def start_fit(
     root, train = Path(dataset), dict(settings.pop("train", {}))
     data, folder = load_dataset(root), Path(prior) if prior is not None else root / "prior"
     built = gaussians is None and (prior is not None or (folder / "prior.json").is_file())
-    kind = load_prior(folder).kind if built else source_of_prior(data.survey())
+    kind = load_prior(folder).kind if built else choose_source(data.survey())
     bare = prior is None and kind == "points" and not has_masks(data.frames)
     whole = "random" if bare and train.get("means", "free") == "free" else None
     kind = whole or kind
@@ -402,7 +402,7 @@ def check_named(run: Run, policy: str | Callable[..., Any] | None) -> None:
             raise InputError(f"{run.folder}: its policy is a Python function; in Python: {call}")
         kept = run.folder / POLICY_SOURCE
         with reading(kept):
-            same = kept.read_text(encoding="utf-8") == source_of(policy)
+            same = kept.read_text(encoding="utf-8") == code_of(policy)
         if not same:
             raise InputError(
                 f"policy {label(own)}: is not as {kept} has it; restore it, or start a new run"

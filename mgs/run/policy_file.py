@@ -79,7 +79,7 @@ def is_function(name: str) -> bool:
     return name.startswith(FUNCTION)
 
 
-def source_of(policy: Callable[..., Any]) -> str:
+def code_of(policy: Callable[..., Any]) -> str:
     """Source text of a function, or of an object and its class; empty where Python does not know
     it."""
     plain = inspect.isroutine(policy) or isinstance(policy, type)

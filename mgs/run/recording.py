@@ -30,7 +30,7 @@ from mgs.run.folder import (
     write_checkpoint,
     write_steps,
 )
-from mgs.run.loop import select_views, uncertainty
+from mgs.run.loop import mean_uncertainty, select_views
 from mgs.run.policies import Policy
 from mgs.run.policy_file import policy_of
 from mgs.run.settings import NbvSettings, check_settings
@@ -227,7 +227,7 @@ class Recorder:
         new = state.taken[len(before.taken) if before else 0 :]
         fit, line = state.fit, lines[-1]
         line |= {
-            "uncertainty": uncertainty(self.scene, state),
+            "uncertainty": mean_uncertainty(self.scene, state),
             "iterations": int(fit.iterations),
             "loss": float(fit.loss),
             "stop_reason": str(fit.stop_reason),
@@ -310,7 +310,7 @@ class Recorder:
             metres = flight_of(scene, state, settings).metres(state.taken)
         predicted = last.get("prediction", {}).get("psnr")
         given_up = sum(frame.given_up for frame in state.frames)
-        uncertain = uncertainty(scene, state)
+        uncertain = mean_uncertainty(scene, state)
         end = run_end(settings, state.step, uncertain, next_view, metres, predicted, given_up)
         last |= {"ended": end} if end else {}
         return replace(checkpoint, steps=[*steps[:-1], last])

@@ -26,7 +26,7 @@ from mgs.splat.recording import frozen
 from mgs.splat.walking import (
     PIXELS,
     Lane,
-    Row,
+    PixelRow,
     blend,
     computed_after,
     lanes,
@@ -259,7 +259,7 @@ def adjoint(
         pixels.append([T[pixel], sum(v * d for v, d in zip(values, slopes, strict=True))])
     count = ADJOINT_SUMS[means]
 
-    def visit(splat: Splats, rows: list[Row], pixels: Any) -> Any:
+    def visit(splat: Splats, rows: list[PixelRow], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
         sums, (r, g, b) = [mi.Float(0)] * 10, splat.colour
         for j, row in enumerate(rows):
@@ -402,7 +402,7 @@ def fisher(
     squared, mixed = fisher_moments(cross, means)
     count, of_colour = fisher_sums(cross, means, roots is not None), 1 if roots is None else 3
 
-    def visit(splat: Splats, rows: list[Row], pixels: Any) -> Any:
+    def visit(splat: Splats, rows: list[PixelRow], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
         sums = [mi.Float(0)] * count
         for j, row in enumerate(rows):
@@ -472,7 +472,7 @@ def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
     behind = _finished(pixels, background, mi.Float)
     dr.eval(behind)
 
-    def visit(splat: Splats, rows: list[Row], pixels: Any) -> Any:
+    def visit(splat: Splats, rows: list[PixelRow], pixels: Any) -> Any:
         new, alive, total = [], mi.Bool(False), mi.Float(0)
         for pixel, (transmittance, *behind) in enumerate(pixels):
             raw = rows[pixel // lane.columns].raw_alpha[pixel % lane.columns]

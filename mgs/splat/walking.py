@@ -150,7 +150,7 @@ def lanes(lists: BlockLists) -> tuple[Lane, list[Any]]:
 
 
 @dataclass
-class Row:
+class PixelRow:
     """One row of a lane's pixels under one splat: eta of the row; xi and raw alpha, before
     thresholds, of each pixel."""
 
@@ -186,7 +186,7 @@ def exp2(x: Any) -> Any:
     return dr.reinterpret_array(type(x), dr.reinterpret_array(integer, value) + exponent)
 
 
-def block_rows(lane: Lane, s: Splats) -> list[Row]:
+def block_rows(lane: Lane, s: Splats) -> list[PixelRow]:
     """xi, eta and alpha = 2^(log2_opacity - xi^2 - eta^2) of one splat on all pixels of a lane.
 
     The exponent is quadratic in x and y. So along a row the ratio of neighbouring alphas changes by
@@ -248,7 +248,7 @@ def block_rows(lane: Lane, s: Splats) -> list[Row]:
             for i in columns:
                 raw[i] = raw[i + side] * ratio
                 ratio = ratio * bend
-        block.append(Row(eta, xi, raw))
+        block.append(PixelRow(eta, xi, raw))
     return block
 
 
@@ -314,7 +314,7 @@ def walk(
     keeps that order and finishes each pixel before the next one needs registers.
     """
 
-    def visit(i: Any, pairs: list[tuple[Any, Splats, list[Row]]], pixels: Any) -> Any:
+    def visit(i: Any, pairs: list[tuple[Any, Splats, list[PixelRow]]], pixels: Any) -> Any:
         # Pixel by pixel, all splats of this iteration, so that a pixel's state is read once.
         splats = [(start(pair, splat), rows) for pair, splat, rows in pairs]
         new: list[list[Any]] = []
@@ -364,7 +364,7 @@ def walk_and_store(
                 dr.scatter_reduce(dr.ReduceOp.Add, by_pair, packet, at, mode=dr.ReduceMode.Local)
 
     def visit_and_store(
-        pair: Any, pairs: list[tuple[Any, Splats, list[Row]]], pixels: Any
+        pair: Any, pairs: list[tuple[Any, Splats, list[PixelRow]]], pixels: Any
     ) -> tuple[Any, Any]:
         ((_, splat, rows),) = pairs
         pixels, alive, sums = visit(splat, rows, pixels)
@@ -384,7 +384,7 @@ def walk_and_store(
 
 def pair_at(
     lists: BlockLists, packed: Any, lane: Lane, first: Any, k: int
-) -> tuple[Any, Splats, list[Row]]:
+) -> tuple[Any, Splats, list[PixelRow]]:
     """The k-th pair after the first, its splat, and the lane's rows under it. After a lane's last
     pair, the first one again as a splat that draws nothing."""
     if k == 0:
