@@ -93,15 +93,35 @@ def test_a_wrong_focal_length_is_named(frames, tmp_path):
     assert "fit a focal length 0.7" in found.problem
 
 
+ARCH = [([-0.4, 0, 0.25], [0.15, 0.2, 0.35]), ([0.5, 0.1, 0.3], [0.2, 0.1, 0.4])]
+
+
 @pytest.mark.parametrize("name", [*MISTAKES][:2])
-@pytest.mark.parametrize("depth", [True, False])
-def test_without_matches_depth_or_directions_tell(tmp_path, depth, name):
+@pytest.mark.parametrize("evidence", ["depth", "outlines", "directions"])
+def test_without_matches_others_tell(tmp_path, evidence, name):
     """Pictures of little texture, where cameras are far apart."""
-    frames, folder = synthetic.write_dataset(tmp_path, depth=depth).frames, tmp_path / "matches"
+    depth, folder = evidence == "depth", tmp_path / "matches"
+    rocks = [(np.array(c), np.array(a)) for c, a in ARCH]
+    frames = synthetic.write_dataset(tmp_path, None, rocks, depth=depth).frames
+    if evidence == "directions":
+        frames = [replace(frame, mask_path=None) for frame in frames]
     right, found = agreement(frames, folder), agreement(wrong(frames, MISTAKES[name]), folder)
-    assert right is None or (right.error < 1 and not right.problem)
-    assert depth == (right is not None)
+    assert evidence in found.evidence
     assert name in found.problem
+    assert right is None or (right.error < 1 and not right.problem)
+    assert (right is None) == (evidence == "directions")
+
+
+@pytest.mark.parametrize("rocks", [ARCH, [([0, 0, 0.3], [0.5, 0.4, 0.2])]])
+def test_masks_tell_shuffled_pictures(tmp_path, rocks):
+    rocks = [(np.array(c), np.array(a)) for c, a in rocks]
+    cameras = synthetic.orbit_cameras(9, 160, 120) + synthetic.orbit_cameras(5, 160, 120, 2.0, 2.5)
+    frames = synthetic.write_dataset(tmp_path, cameras, rocks, depth=False).frames
+    order = np.random.default_rng(7).permutation(len(frames))
+    shuffled = [replace(f, camera=frames[k].camera) for f, k in zip(frames, order, strict=True)]
+    right, found = (agreement(one, tmp_path / "matches") for one in (frames, shuffled))
+    assert right.error < 1
+    assert "do not belong to these pictures" in found.problem
 
 
 def test_depth_in_another_unit_is_named(tmp_path):

@@ -56,7 +56,7 @@ ROWS = (
     (
         "eps",
         "rock cluster (DBSCAN)",
-        "{cluster_size:,} points, one of {clusters} clusters, eps {eps}",
+        "{cluster_size:,} points, of a cloud of {clusters} clusters, eps {eps}",
     ),
     ("cloud_spacing", "points of the rock", "{cluster_size:,}, {cloud_spacing} apart"),
     ("hull_cell", "visual hull", "cells of {hull_cell}, fills {hull_fills_masks:.1%} of the masks"),

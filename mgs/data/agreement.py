@@ -1,5 +1,5 @@
-"""Check of poses against pictures: points matched between neighbours, their depth, or only whether
-the cameras look at one place."""
+"""Check of poses against pictures: points matched between neighbours, their depth, the outlines of
+their masks, or only whether the cameras look at one place."""
 
 from __future__ import annotations
 
@@ -42,6 +42,10 @@ HIDDEN = 1.05
 
 LEAST_SEEN = 0.25
 """Least share of the points of a depth image that a neighbour must see for their comparison."""
+
+LEAST_OUTLINES, OUTLINE, ORDERS = 6, 2.0, 5
+"""Fewest masks that are compared; error of their outlines, pixels, that is never wrong; and number
+of shuffled orders of the pictures, half of whose median error is wrong."""
 
 PARALLEL = 0.02
 """Least mean squared sine between the optical axes and their mean direction. Cameras that look the
@@ -96,7 +100,8 @@ class Agreement:
 
 def agreement(frames: Sequence[Frame], matcher: Matcher) -> Agreement | None:
     """Compare poses with what pictures of neighbours in time show: points matched in them, else
-    their depth, else the place that all cameras look at. None where nothing can be compared.
+    their depth, else the outlines of their masks, else the place that all cameras look at. None
+    where nothing can be compared.
 
     matcher: of the frames' images.
     """
@@ -110,7 +115,7 @@ def agreement(frames: Sequence[Frame], matcher: Matcher) -> Agreement | None:
         pairs.append((one, other))
         if len(a) >= max(LEAST_MATCHES, LEAST_SHARE * count):
             matched.append((one.camera, other.camera, a, b))
-    width, found = frames[0].camera.width, []
+    limit, found = WRONG * frames[0].camera.width, []
     if len(matched) >= LEAST_PAIRS:
         count = sum(len(points) for _, _, points, _ in matched)
 
@@ -119,7 +124,7 @@ def agreement(frames: Sequence[Frame], matcher: Matcher) -> Agreement | None:
             return float(np.quantile(each, SOUND, method="higher"))
 
         found.append(
-            _judged(by_matches, f"{count:,} points matched in neighbouring pictures", width)
+            _judged(by_matches, f"{count:,} points matched in neighbouring pictures", limit)
         )
     if all(frame.depth_path for pair in pairs for frame in pair) and pairs:
         measured = [(one, one.depth(), other, other.depth()) for one, other in pairs]
@@ -129,10 +134,71 @@ def agreement(frames: Sequence[Frame], matcher: Matcher) -> Agreement | None:
             return float(np.quantile(each, 0.5, method="lower"))
 
         what = f"the depth of {len(pairs)} pairs of neighbouring pictures"
-        found.append(_judged(by_depth, what, width, lengths=True))
+        found.append(_judged(by_depth, what, limit, lengths=True))
+    if not found and len(outlines := _outlines(frames)) >= LEAST_OUTLINES:
+        found.append(_by_outlines(outlines))
     compared = [one for one in found if one]
     wrong = [one for one in compared if one.problem]
     return [*wrong, *compared, _directions([frame.camera for frame in frames])][0]
+
+
+def _outlines(frames: Sequence[Frame]) -> list[tuple[Camera, np.ndarray]]:
+    """Cameras, and corners [N,2] pixels of the convex hulls of their masks; without masks that are
+    empty or reach the edge of the picture."""
+    import cv2
+
+    found = []
+    for frame in frames[:: 1 + len(frames) // (2 * PAIRS)]:
+        inner = frame.mask()[1:-1, 1:-1] if frame.mask_path else np.zeros((1, 1), bool)
+        if inner.any() and inner.sum() == frame.mask().sum():
+            y, x = np.nonzero(inner)
+            corners = cv2.convexHull(np.column_stack([x, y]).astype(np.int32))[:, 0]
+            found.append((frame.camera, corners + 1.5))
+    return found
+
+
+def _by_outlines(seen: Sequence[tuple[Camera, np.ndarray]]) -> Agreement | None:
+    """Agreement of masks: planes through two cameras that touch the object touch both its outlines.
+    They do not in another order of the pictures, unless the object is round."""
+    n = len(seen)
+
+    def error(convention: Convention, zoom: float, order: Sequence[int] = range(n)) -> float:
+        cameras, outlines = [camera for camera, _ in seen], [seen[k][1] for k in order]
+        each = [
+            _tangent_error(cameras[k], outlines[k], cameras[m], outlines[m], convention, zoom)
+            for k in range(n)
+            for m in ((k + 1) % n, (k + n // 4) % n)
+        ]
+        return float(np.median(each))
+
+    rng = np.random.default_rng(0)
+    shuffled = np.median([error(_same, 1.0, rng.permutation(n).tolist()) for _ in range(ORDERS)])
+    return _judged(error, f"the outlines of {n} masks", max(OUTLINE, float(shuffled) / 2))
+
+
+def _tangent_error(
+    one: Camera, a: np.ndarray, other: Camera, b: np.ndarray, convention: Convention, zoom: float
+) -> float:
+    """Larger distance, pixels, of the two planes through both cameras that touch the outline a
+    [N,2] of one from those that touch the outline b of the other."""
+    poses = [convention(camera.world_to_camera) for camera in (one, other)]
+    eyes = [-pose[:3, :3].T @ pose[:3, 3] for pose in poses]
+    base = (eyes[1] - eyes[0]) / max(float(np.linalg.norm(eyes[1] - eyes[0])), 1e-30)
+    focal = zoom * one.K[0, 0]
+    rays = []
+    for camera, pose, corners in zip((one, other), poses, (a, b), strict=True):
+        level = (corners - camera.K[:2, 2]) / (zoom * camera.K[[0, 1], [0, 1]])
+        ray = np.column_stack([level, np.ones(len(level))]) @ pose[:3, :3]
+        rays.append(ray / np.linalg.norm(ray, axis=1, keepdims=True))
+    ahead = np.cross(base, np.cross(rays[0].mean(0), base))
+    side = np.cross(base, ahead)
+    angles = [np.arctan2(ray @ side, ray @ ahead) for ray in rays]
+    errors = []
+    for end in (np.argmin, np.argmax):
+        i, j = (int(end(angle)) for angle in angles)
+        slope = np.linalg.norm(np.cross(rays[0][i], base))
+        errors.append(focal * slope * abs(angles[0][i] - angles[1][j]))
+    return float(max(errors))
 
 
 def observed(seen: Sequence[tuple[Camera, np.ndarray, np.ndarray]]) -> Agreement | None:
@@ -149,12 +215,14 @@ def observed(seen: Sequence[tuple[Camera, np.ndarray, np.ndarray]]) -> Agreement
             found.append(np.where(z > 0, np.linalg.norm(place - pixels, axis=1), np.inf))
         return float(np.median(np.concatenate(found)))
 
-    return _judged(error, f"{count:,} places where pictures show its points", seen[0][0].width)
+    return _judged(
+        error, f"{count:,} places where pictures show its points", WRONG * seen[0][0].width
+    )
 
 
-def _judged(error: Error, evidence: str, width: int, lengths: bool = False) -> Agreement | None:
-    """Agreement by an error; what mends it, a convention or a focal length, is named. None if
-    the error is infinite and nothing mends it."""
+def _judged(error: Error, evidence: str, limit: float, lengths: bool = False) -> Agreement | None:
+    """Agreement by an error; what mends it, a convention or a focal length, is named, and an error
+    beyond the limit, pixels. None if the error is infinite and nothing mends it."""
     ours = error(_same, 1.0)
     if ours < 1:
         return Agreement(ours, evidence)
@@ -173,7 +241,7 @@ def _judged(error: Error, evidence: str, width: int, lengths: bool = False) -> A
     if measured is None:
         return None
     wrong = "do not belong to these pictures: check their order, their names and the lens"
-    return Agreement(ours, evidence, wrong if ours > WRONG * width else "")
+    return Agreement(ours, evidence, wrong if ours > limit else "")
 
 
 def _searched(error: Callable[[float], float], most: float) -> tuple[float, float]:

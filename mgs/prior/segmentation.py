@@ -43,7 +43,7 @@ IN_MASKS = 0.8
 
 STACKED = 0.5
 """Without masks another cluster belongs to the rock if the gap between them is at most this share
-of the rock's extent, and their middles are, level, at most half as far apart: an overhang."""
+of the rock's extent, and its median point a tenth of that from being above or below the rock."""
 
 LEAST_PART = 0.02
 """Least number of points of another part of the rock, over that of the rock's largest."""
@@ -154,7 +154,7 @@ def rock_cluster(
     neighbours where the cloud is sparse, metres; DBSCAN sees no finer points, since it takes one
     density for all. The rock is the cluster of largest weight, or of several nearly as large ones
     (EQUAL_SIZE) the nearest to the target; with it go the clusters of which belongs(points of the
-    cluster, points of the rock) is true. Returns (inside [N] bool, eps in metres, number of
+    cluster, points of the rock so far) is true. Returns (inside [N] bool, eps in metres, number of
     clusters). Raises InputError if there is no cluster, or two that do not belong together are
     equally large and about equally near.
     """
@@ -182,15 +182,10 @@ def rock_cluster(
     away = np.array([np.linalg.norm(thin[labels == k].mean(0) - target) for k in large])
     order = np.argsort(away, kind="stable")
     rock = int(large[order[0]])
-    parts = [
-        k
-        for k in range(count)
-        if k == rock
-        or (
-            (labels == k).sum() >= LEAST_PART * (labels == rock).sum()
-            and belongs(thin[labels == k], thin[labels == rock])
-        )
-    ]
+    parts, least = [rock], LEAST_PART * (labels == rock).sum()
+    others = [k for k in range(count) if k != rock and (labels == k).sum() >= least]
+    while more := [k for k in others if belongs(thin[labels == k], thin[np.isin(labels, parts)])]:
+        parts, others = parts + more, [k for k in others if k not in more]
     if len(large) > 1 and away[order[1]] < NEARER * away[order[0]] and large[order[1]] not in parts:
         first, second = ((labels == large[k]).sum() for k in order[:2])
         raise InputError(
@@ -260,11 +255,11 @@ def segment_dataset(
     def belongs(part: np.ndarray, rock: np.ndarray) -> bool:
         if has_masks(dataset.frames):
             return float(np.median(mask_share(part, dataset.frames)[0])) >= IN_MASKS
-        offset = part.mean(0) - rock.mean(0)
-        level = np.linalg.norm(offset - plane.normal * (offset @ plane.normal))
         reach = STACKED * float(np.ptp(rock, axis=0).max())
         gap = float(cKDTree(rock).query(part)[0].min())
-        return bool(level < reach / 2 and gap < reach)
+        flat = [points - np.outer(points @ plane.normal, plane.normal) for points in (rock, part)]
+        beside = float(np.median(cKDTree(flat[0]).query(flat[1])[0]))
+        return gap < reach and beside < reach / 10
 
     name = str(dataset.root)
     inside, eps, clusters = rock_cluster(
