@@ -115,7 +115,7 @@ def load_gaussians(path: str | Path, prior: str | Path | None = None) -> Gaussia
 
 def _drawn_size(g: Gaussians) -> float:
     """Median standard deviation of the Gaussians as they are drawn."""
-    return float(np.exp(np.clip(np.median(g.log_scales), *LOG_SCALE_RANGE)))
+    return float(np.exp(np.median(np.clip(g.log_scales, *LOG_SCALE_RANGE))))
 
 
 def upward(path: str | Path) -> Vector:

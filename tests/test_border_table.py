@@ -3,7 +3,7 @@ pictures where the imported cameras project them."""
 
 import codecs
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -178,14 +178,14 @@ def turned(root: Path, tag: int) -> Path:
     return root
 
 
-def tum(root: Path, views: list[View]) -> Path:
+def tum(root: Path, views: list[View], moved: Sequence[float] = (0, 0, 0)) -> Path:
     """TUM RGB-D whose poses come late, in reverse order, and of which two are missing."""
     (root / "rgb").mkdir(parents=True)
     poses = []
     for k, view in enumerate(views):
         Image.fromarray(view.drawn()[0]).save(root / f"rgb/{k}.png")
         pose = np.linalg.inv(view.pose)
-        poses.append(" ".join(map(str, [1e9 + k, *pose[:3, 3], *quaternion(pose)])))
+        poses.append(" ".join(map(str, [1e9 + k, *pose[:3, 3] + moved, *quaternion(pose)])))
     (root / "rgb.txt").write_text("".join(f"{1e9 + k} rgb/{k}.png\n" for k in range(len(views))))
     (root / "groundtruth.txt").write_text("\n".join(poses[1:-1][::-1]))
     f, (x, y) = views[0].f, views[0].centre
@@ -196,14 +196,24 @@ def tum(root: Path, views: list[View]) -> Path:
 UTM = np.array([448262.0, 5411932.0, 412.0])
 
 
-def utm(root: Path) -> Path:
-    """transforms.json whose world is moved by UTM."""
-    data = json.loads((nerfstudio(root, orbit()) / "transforms.json").read_text())
+def changed(root: Path, change: Callable[[dict], object]) -> Path:
+    """transforms.json each of whose frames is changed."""
+    data = json.loads((root / "transforms.json").read_text())
     for record in data["frames"]:
-        for row, step in zip(record["transform_matrix"], UTM, strict=False):
-            row[3] += step
+        change(record)
     (root / "transforms.json").write_text(json.dumps(data))
     return root
+
+
+def far(record: dict) -> None:
+    for row, step in zip(record["transform_matrix"], UTM, strict=False):
+        row[3] += step
+
+
+def old_fisheye(record: dict) -> None:
+    """As programs wrote it before camera_model."""
+    del record["camera_model"]
+    record["is_fisheye"] = True
 
 
 BROWN = {"k1": -0.12, "k2": 0.05, "p1": 0.004, "p2": -0.003}
@@ -219,6 +229,7 @@ SOURCES: dict[str, Callable[[Path], Path]] = {
     "Brown and fisheye mixed": lambda r: nerfstudio(
         r, [*orbit(4, lens=BROWN), *orbit(3, lens=ANGLES, **WIDE)]
     ),
+    "is_fisheye": lambda r: changed(nerfstudio(r, orbit(lens=ANGLES, **WIDE)), old_fisheye),
     "thin prism": lambda r: colmap(
         r,
         orbit(lens=PRISM, **WIDE),
@@ -235,7 +246,8 @@ SOURCES: dict[str, Callable[[Path], Path]] = {
         colmap(r, orbit(), "PINHOLE 160 120 150 150 80 60", "Süd 1/b.v{}.png"),
     ),
     # 6: far from the origin
-    "UTM": utm,
+    "UTM": lambda r: changed(nerfstudio(r, orbit()), far),
+    "UTM, TUM": lambda r: tum(r, orbit(9), UTM),
 }
 
 
@@ -243,7 +255,7 @@ SOURCES: dict[str, Callable[[Path], Path]] = {
 @pytest.mark.parametrize("source", SOURCES)
 def test_balls_lie_where_the_imported_cameras_project_them(tmp_path, source):
     command("import", SOURCES[source](tmp_path / "source"), "--out", tmp_path / "out")
-    found = misses(tmp_path / "out", BALLS + UTM if source == "UTM" else BALLS)
+    found = misses(tmp_path / "out", BALLS + UTM if source.startswith("UTM") else BALLS)
     assert len(found) > 25
     assert np.median(found) < 0.25
     assert np.quantile(found, 0.9) < 0.6
@@ -263,11 +275,12 @@ CONVENTIONS = {
 @pytest.mark.parametrize("axes", CONVENTIONS)
 def test_poses_of_other_axes_are_named_without_matches(tmp_path, axes, capsys):
     turn, problem = CONVENTIONS[axes]
-    root = nerfstudio(tmp_path / "source", orbit())
-    data = json.loads((root / "transforms.json").read_text())
-    for record, view in zip(data["frames"], orbit(), strict=True):
-        record["transform_matrix"] = (np.linalg.inv(view.pose) @ turn).tolist()
-    (root / "transforms.json").write_text(json.dumps(data))
+
+    def turned_axes(record):
+        pose = np.array(record["transform_matrix"]) @ np.diag([1, -1, -1, 1]) @ turn
+        record["transform_matrix"] = pose.tolist()
+
+    root = changed(nerfstudio(tmp_path / "source", orbit()), turned_axes)
     command("import", root, "--out", tmp_path / "out")
     assert problem in said(capsys)[1]
 
@@ -284,12 +297,14 @@ def test_depth_of_balls_is_theirs(tmp_path, kind):
     ending, encoded, step = DEPTHS[kind]
     views = orbit(lens=BROWN)
     root = nerfstudio(tmp_path / "source", views, depth_unit_scale_factor=step)
-    data = json.loads((root / "transforms.json").read_text())
-    for k, record in enumerate(data["frames"]):
+    (root / "depth").mkdir()
+
+    def with_depth(record):
+        k = Path(record["file_path"]).stem
         record["depth_file_path"] = f"depth/{k}.{ending}"
-        (root / "depth").mkdir(exist_ok=True)
-        cv2.imwrite(str(root / f"depth/{k}.{ending}"), encoded(views[k].drawn()[1]))
-    (root / "transforms.json").write_text(json.dumps(data))
+        cv2.imwrite(str(root / f"depth/{k}.{ending}"), encoded(views[int(k)].drawn()[1]))
+
+    changed(root, with_depth)
     command("import", root, "--out", tmp_path / "out")
     off = []
     for frame in load_dataset(tmp_path / "out").frames:

@@ -65,6 +65,12 @@ def test_a_bag_whose_poses_are_not_plain_is_refused(tmp_path, data, pose):
         read_source(bag, unpack=tmp_path / "x")
 
 
+def test_a_frame_that_is_no_optical_one_is_named(tmp_path, data, monkeypatch):
+    monkeypatch.setattr("test_recordings.OPTICAL", "camera_link")
+    source = read_source(write_bag(tmp_path / "bag", data, depth=False), unpack=tmp_path / "x")
+    assert any("frame camera_link of" in note for note in source.notes)
+
+
 def test_names_with_numbers_are_in_their_order(tmp_path, data):
     source = read_source(write_open3d(tmp_path / "o", data))
     assert errors(data, source.shots).max() < 1e-9

@@ -272,6 +272,17 @@ def test_float32_too_far_from_the_origin_is_noticed(tmp_path):
     write_ply(tmp_path / "x.ply", replace(model, means=model.means + np.float32(5e6)))
     with pytest.warns(Notice, match=r"steps of 0\.5 so far from the origin"):
         load_gaussians(tmp_path / "x.ply")
+    write_ply(tmp_path / "x.ply", replace(model, log_scales=0 * model.log_scales + 3e38))
+    assert load_gaussians(tmp_path / "x.ply").means.shape == model.means.shape
+
+
+def test_scales_that_are_logarithms_are_refused(tmp_path):
+    write_gaussians(tmp_path / "x.glb", gaussians(0, n=1), "glb", np.eye(3))
+    scale = np.exp(gaussians(0, n=1).log_scales).astype("<f4").tobytes()
+    data = (tmp_path / "x.glb").read_bytes()
+    (tmp_path / "x.glb").write_bytes(data.replace(scale, np.full(3, -2, "<f4").tobytes()))
+    with pytest.raises(InputError, match="negative scales, which are probably logarithms"):
+        load_gaussians(tmp_path / "x.glb")
 
 
 def test_an_spz_of_version_1_has_positions_of_float16(tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -82,6 +81,7 @@ def import_data(
       points that pictures share; for poses that are a little wrong. Needs texture.
     - test_split: Split of NeRF-synthetic data that becomes the test views; publications take test.
     """
+    from mgs.cli.fit import moves_in_words
     from mgs.data.agreement import agreement
     from mgs.data.bags import is_bag
     from mgs.data.clouds import write_cloud
@@ -89,7 +89,7 @@ def import_data(
     from mgs.data.meshes import GLTF
     from mgs.data.photographs import KIND as PHOTOGRAPHS
     from mgs.data.sources import read_source
-    from mgs.data.structure import CLOUD, Matcher, lacks_points
+    from mgs.data.structure import CLOUD, Matcher, lacks_points, refined
 
     console, notes = Terminal(), Terminal(stderr=True)
     if masks is not None and mesh is not None:
@@ -140,8 +140,8 @@ def import_data(
             poses = poses if compared is None or (poses and poses.problem) else compared
             right = not (poses and poses.problem)
             if refine_poses and right and not finished:
-                result, cloud, moved = refined(result, scratch / "every")
-                console.print(moved)
+                result, cloud, moves = refined(result, scratch / "every")
+                console.print(moves_in_words(moves, result.unit))
             elif lacks_points(result) and right:
                 cameras = [result.world.leave(frame.camera) for frame in result.frames]
                 cloud = matcher.triangulated(cameras)
@@ -162,34 +162,6 @@ def import_data(
     world = f"up {_numbers(upward)}, {reason}"
     _print_summary(console, shots, tests, result, f"{fits}; {world}")
     console.print(f"{out} is finished already" if finished else f"wrote {out}", soft_wrap=True)
-
-
-def refined(dataset: Dataset, folder: Path) -> tuple[Dataset, SparseCloud | None, str]:
-    """Adjust the poses of a dataset and its test views, and write them; returns the dataset as it
-    is then, its points, and a line on how far poses moved. folder: for matches."""
-    from mgs.cli.fit import moves_in_words
-    from mgs.data.dataset import TEST_FOLDER, load_dataset, write_transforms
-    from mgs.data.structure import Matcher
-    from mgs.fit.poses import motion_between
-
-    world, tests = dataset.world, dataset.test_views()
-    frames = [*dataset.frames, *(tests.frames if tests else ())]
-    given = [world.leave(frame.camera) for frame in frames]
-    cameras, cloud = Matcher.of_frames(frames, folder).refined(given)
-    moves = {}
-    for frame, old, new in zip(frames, given, cameras, strict=True):
-        motion = motion_between(old, new)
-        degrees, length = np.degrees(np.linalg.norm(motion[:3])), np.linalg.norm(motion[3:])
-        moves[frame.name] = {"degrees": float(degrees), "length": float(length)}
-    there = [
-        replace(frame, camera=world.enter(camera))
-        for frame, camera in zip(frames, cameras, strict=True)
-    ]
-    count = len(dataset.frames)
-    if tests:
-        write_transforms(dataset.root / TEST_FOLDER, there[count:], world)
-    write_transforms(dataset.root, there[:count], world)
-    return load_dataset(dataset.root), cloud, moves_in_words(moves, dataset.unit)
 
 
 def _points(cloud: SparseCloud) -> str:

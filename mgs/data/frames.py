@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -139,3 +140,15 @@ def as_asked(frame: Frame) -> Frame:
     """The frame as it was before its live capture; a frame that was given up stays so."""
     camera = frame.asked or frame.camera
     return replace(frame, camera=camera, asked=None, capture_path=None)
+
+
+def moves(given: Sequence[Frame], frames: Sequence[Frame]) -> dict[str, dict[str, float]]:
+    """How far the pose of each frame moved, by name: degrees, and length in the dataset's unit."""
+    found = {}
+    for old, new in zip(given, frames, strict=True):
+        motion = old.camera.world_to_camera @ new.camera.camera_to_world
+        chord = np.linalg.norm(motion[:3, :3] - np.eye(3)) / np.sqrt(8)
+        turn = 2 * np.degrees(np.arcsin(min(chord, 1.0)))
+        shift = float(np.linalg.norm(motion[:3, 3]))
+        found[old.name] = {"degrees": round(float(turn), 4), "length": shift}
+    return found

@@ -19,8 +19,8 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud
-from mgs.data.dataset import Dataset
-from mgs.data.frames import Frame
+from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, write_transforms
+from mgs.data.frames import Frame, moves
 from mgs.data.lens import Lens
 from mgs.files import read_json, write_json
 from mgs.images import exif_orientation, unlimited_headers
@@ -291,3 +291,23 @@ def cloud_of(reconstruction: Any) -> SparseCloud | None:
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
     known = error if (error >= 0).all() else None
     return SparseCloud(np.stack(points), directions, np.array(tracks), known)
+
+
+def refined(
+    dataset: Dataset, folder: Path
+) -> tuple[Dataset, SparseCloud | None, dict[str, dict[str, float]]]:
+    """Adjust the poses of a dataset and its test views to the points that pictures share, and write
+    them; returns the dataset as it is then, its points, and `mgs.data.frames.moves`. folder: for
+    matches."""
+    world, tests, count = dataset.world, dataset.test_views(), len(dataset)
+    frames = [*dataset.frames, *(tests.frames if tests else ())]
+    matcher = Matcher.of_frames(frames, folder)
+    cameras, cloud = matcher.refined([world.leave(frame.camera) for frame in frames])
+    there = [
+        replace(frame, camera=world.enter(camera))
+        for frame, camera in zip(frames, cameras, strict=True)
+    ]
+    if tests:
+        write_transforms(dataset.root / TEST_FOLDER, there[count:], world)
+    write_transforms(dataset.root, there[:count], world)
+    return load_dataset(dataset.root), cloud, moves(frames, there)

@@ -14,12 +14,11 @@ from mgs import runtime
 from mgs.camera import extent_of
 from mgs.data.dataset import FILES as PATHS
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, write_transforms
-from mgs.data.frames import Frame
+from mgs.data.frames import Frame, moves
 from mgs.data.structure import CLOUD
 from mgs.data.visibility import has_masks
 from mgs.errors import InputError
 from mgs.files import THERE, Ours, atomic_folder, reading, write_json
-from mgs.fit.poses import motion_between
 from mgs.fit.settings import ModelSettings, as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE, Gaussians
 from mgs.learning import information, refine_poses, surface_information
@@ -286,15 +285,12 @@ def write_refined(folder: Path, given: Dataset, frames: Sequence[Frame]) -> None
         paths = {key: path.resolve() for key in PATHS if (path := getattr(frame, key))}
         return replace(frame, **paths)
 
-    moved = {}
-    for old, new in zip(given.frames, frames, strict=True):
-        motion = motion_between(old.camera, new.camera)
-        turn, shift = np.degrees(np.linalg.norm(motion[:3])), np.linalg.norm(motion[3:])
-        moved[old.name] = {"degrees": round(float(turn), 4), "length": float(shift)}
     tests = given.test_views()
     if tests is not None:
         write_transforms(folder / TEST_FOLDER, [*map(elsewhere, tests.frames)], given.world)
-    write_json(folder / POSES, {"dataset": str(given.root.resolve()), "moved": moved})
+    write_json(
+        folder / POSES, {"dataset": str(given.root.resolve()), "moved": moves(given.frames, frames)}
+    )
     write_transforms(folder, [*map(elsewhere, frames)], given.world)
 
 
