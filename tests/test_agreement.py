@@ -120,6 +120,8 @@ def test_masks_tell_shuffled_pictures(tmp_path, rocks):
     order = np.random.default_rng(7).permutation(len(frames))
     shuffled = [replace(f, camera=frames[k].camera) for f, k in zip(frames, order, strict=True)]
     right, found = (agreement(one, tmp_path / "matches") for one in (frames, shuffled))
+    matcher = Matcher.of_frames(frames, tmp_path / "matches")
+    assert poses.agreement(frames, matcher, masked=False) is None
     assert right.error < 1
     assert "do not belong to these pictures" in found.problem
 

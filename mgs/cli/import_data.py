@@ -136,7 +136,7 @@ def import_data(
         poses, cloud = shots.fit, shots.sparse
         if shots.kind != PHOTOGRAPHS:
             matcher = Matcher.of_frames(result.frames, scratch / "matches")
-            compared = agreement(result.frames, matcher)
+            compared = agreement(result.frames, matcher, masked=mesh is None)
             poses = poses if compared is None or (poses and poses.problem) else compared
             right = not (poses and poses.problem)
             if refine_poses and right and not finished:

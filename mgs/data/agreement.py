@@ -98,12 +98,12 @@ class Agreement:
     problem: str = ""
 
 
-def agreement(frames: Sequence[Frame], matcher: Matcher) -> Agreement | None:
+def agreement(frames: Sequence[Frame], matcher: Matcher, masked: bool = True) -> Agreement | None:
     """Compare poses with what pictures of neighbours in time show: points matched in them, else
     their depth, else the outlines of their masks, else the place that all cameras look at. None
     where nothing can be compared.
 
-    matcher: of the frames' images.
+    matcher: of the frames' images. masked: whether the masks were made without the poses.
     """
     places = np.unique(np.linspace(0, max(len(frames) - 2, 0), PAIRS).astype(int)).tolist()
     places = places if len(frames) > 1 else []
@@ -135,7 +135,7 @@ def agreement(frames: Sequence[Frame], matcher: Matcher) -> Agreement | None:
 
         what = f"the depth of {len(pairs)} pairs of neighbouring pictures"
         found.append(_judged(by_depth, what, limit, lengths=True))
-    if not found and len(outlines := _outlines(frames)) >= LEAST_OUTLINES:
+    if masked and not found and len(outlines := _outlines(frames)) >= LEAST_OUTLINES:
         found.append(_by_outlines(outlines))
     compared = [one for one in found if one]
     wrong = [one for one in compared if one.problem]
