@@ -59,8 +59,8 @@ def _check(path: Path) -> None:
     with progress_bar("reading", console) as progress:
         check = check_dataset(data, partial(progress, "reading"))
     camera, (low, high) = data.frames[0].camera, check.depth_range
-    missing = len(data) - len(taken_frames(data))
-    waiting = f" ({missing} of them on demand, not taken yet)" if missing else ""
+    absent = len(data) - len(taken_frames(data))
+    waiting = f" ({absent} of them on demand, not taken yet)" if absent else ""
     console.print(
         f"{path}: {len(data)} frames{waiting}, {camera.width}x{camera.height}, "
         f"rock on {check.mask_share:.0%} of the pixels"

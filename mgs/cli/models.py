@@ -117,8 +117,8 @@ def diagnose(
     runtime.start()
     for run, folder in zip(runs, folders, strict=True):
         with folder_locked(folder), progress_bar() as bar:
-            written = mapped(run, names, partial(bar, "mapping"))
-        for path in written:
+            paths = mapped(run, names, partial(bar, "mapping"))
+        for path in paths:
             echo(f"wrote {path}")
 
 

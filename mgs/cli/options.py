@@ -88,8 +88,8 @@ def keys_of(model: type[BaseModel], prefix: str = "") -> Iterator[Row]:
         elif field.is_required() or default in (None, (), False):
             yield f"{prefix}{name}", "", text
         else:
-            shown = str(default).lower() if isinstance(default, bool) else str(default)
-            yield f"{prefix}{name}", shown, text
+            value = str(default).lower() if isinstance(default, bool) else str(default)
+            yield f"{prefix}{name}", value, text
 
 
 def with_keys(model: type[BaseModel], *fields: str) -> Callable[[Command], Command]:
@@ -132,9 +132,9 @@ def _names(key: str, row: str) -> bool:
 
 def _value(text: str) -> Any:
     """Value of a setting: as in TOML, a list also without brackets; otherwise the text."""
-    for written in (text, f"[{text}]"):
+    for toml in (text, f"[{text}]"):
         try:
-            return tomllib.loads(f"value = {written}")["value"]
+            return tomllib.loads(f"value = {toml}")["value"]
         except tomllib.TOMLDecodeError:
             continue
     return text

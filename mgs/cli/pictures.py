@@ -106,9 +106,9 @@ def view(
         token = viewer.access.token
         if token:
             echo(f"--host {host}: anyone who has the address below, with its token, can look")
-        shown = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+        address = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         query = f"/?token={token}" if token else ""
-        echo(f"open http://{shown}:{viewer.port}{query} in a browser; Ctrl-C ends it")
+        echo(f"open http://{address}:{viewer.port}{query} in a browser; Ctrl-C ends it")
         while True:
             viewer.tick()
             time.sleep(0.05)

@@ -55,19 +55,19 @@ def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
 
     for name in report_files(kind):
         check_new_file(out / name, force)
-    compared = compare_runs(runs)
+    by_label = compare_runs(runs)
     with folder_locked(out):
-        written = compared_in(list(compared.values()), out, kind)
-    rows = comparison_rows(compared)
+        files = compared_in(list(by_label.values()), out, kind)
+    rows = comparison_rows(by_label)
     print_quality(Terminal(), rows)
-    for row, run in zip(rows, compared.values(), strict=True):
+    for row, run in zip(rows, by_label.values(), strict=True):
         if run.settings.budget:
             path = f"a path of {row['path']:.2f} {row['unit']}"
             echo(f"{row['policy']}: {path}; the run has ended: {why_ended(run.ended or {})}")
-    for file in written:
+    for file in files:
         echo(f"wrote {file}")
-    chosen = any(run.settings.budget for run in compared.values())
-    if chosen and not any(file.stem == "psnr" for file in written):
+    choices = any(run.settings.budget for run in by_label.values())
+    if choices and not any(file.stem == "psnr" for file in files):
         echo("PSNR against images is left out: make all runs with evaluate_every to have it")
 
 

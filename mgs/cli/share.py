@@ -78,12 +78,12 @@ def export(
                 f"{model}: its colours are sRGB already; leave out --colour-space linear"
             )
         srgb = gaussians.linear and colour_space == "srgb"
-        shown = _in_srgb(model, gaussians) if srgb else gaussians
-        shown = replace(shown, origin=gaussians.origin)
-        shown = shown.with_degree(max(sh or 0, shown.sh_degree))
-        write_gaussians(path, shown, to, to_y_up(up))
+        splats = _in_srgb(model, gaussians) if srgb else gaussians
+        splats = replace(splats, origin=gaussians.origin)
+        splats = splats.with_degree(max(sh or 0, splats.sh_degree))
+        write_gaussians(path, splats, to, to_y_up(up))
         megabytes = path.stat().st_size / 1e6
-        echo(f"wrote {len(shown):,} Gaussians to {path} ({megabytes:.1f} MB)")
+        echo(f"wrote {len(splats):,} Gaussians to {path} ({megabytes:.1f} MB)")
 
 
 def _export_compact(
@@ -117,8 +117,8 @@ def _export_compact(
 
 def _bytes(text: str) -> int:
     """Number of bytes of a text like 40k. Raises InputError for anything else."""
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)([kM]?)", text)
-    number = float(found[1]) * {"": 1, "k": 1e3, "M": 1e6}[found[2]] if found else 0
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([kM]?)", text)
+    number = float(match[1]) * {"": 1, "k": 1e3, "M": 1e6}[match[2]] if match else 0
     if not 1 <= number < 1e12:
         raise InputError(f"--bytes {text}: expected a number of bytes, as in 40k or 1.5M")
     return int(number)

@@ -123,18 +123,18 @@ class Record(_Strict, extra="forbid"):
     def _agree(self) -> Record:
         """The first line is that of the seeds; each other one is that of one more view."""
         seeds = (self.steps[0].seeds or []) if self.steps else []
-        chosen = self.steps[1:]
-        if self.taken != [*seeds, *(line.frame for line in chosen)] or not seeds:
+        lines = self.steps[1:]
+        if self.taken != [*seeds, *(line.frame for line in lines)] or not seeds:
             raise ValueError("its frames are not those of its steps")
         for step, line in enumerate(self.steps):
             if (line.step, line.images) != (step, len(seeds) + step):
                 raise ValueError(f"step {step} has the number {line.step}, {line.images} images")
             if 0 < len(_FIT & line.model_fields_set) < len(_FIT):
                 raise ValueError(f"step {step} has a part of its fit")
-            measured = {"fitted"} | ({"new", "gain"} if step else set())
-            if line.prediction and not measured <= line.prediction.keys():
+            keys = {"fitted"} | ({"new", "gain"} if step else set())
+            if line.prediction and not keys <= line.prediction.keys():
                 raise ValueError(f"the prediction of step {step} has not all its numbers")
-        if any(line.information_gain is None for line in chosen):
+        if any(line.information_gain is None for line in lines):
             raise ValueError("a chosen view has no information gain")
         return self
 
