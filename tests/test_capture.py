@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from program import command, steps, study, table_numbers
+from program import command, steps, table_numbers
 from refusals import listing, refused
 
 from mgs.data.check import check_dataset
@@ -246,9 +246,6 @@ def test_every_command_that_reads_a_run_reads_this_one(captured, tmp_path, capsy
     (pose, *_) = never
     command("diagnose", captured, "--views", pose)  # maps of a pose need no image
     assert (captured / f"diagnostics/{pose}.png").is_file()
-    study("calibration", captured)
-    calibration = json.loads((captured / "diagnostics/uncertainty.json").read_text())
-    assert calibration["views"] == {"folds": 6, "test": 2}
     page_path = tmp_path / "page.html"
     command("report", captured, "--out", tmp_path / "report", "--html", page_path)
     command("simplify", captured)

@@ -8,20 +8,18 @@ from pathlib import Path
 
 import pytest
 import synthetic
-from program import command, said, steps, study, timeless
+from program import command, said, steps, timeless
 
 from mgs.cli import app, demo, progress
 from mgs.cli.app import COMMANDS, main
 from mgs.data.dataset import load_dataset
 from mgs.evaluation import psnr_measure
-from mgs.images import read_exr
 from mgs.prior.build import load_prior
 from mgs.prior.initial import initial_gaussians
 from mgs.run.policies import POLICIES
 from mgs.splat import ListCache
 from mgs.splat_ply import read_ply
 from mgs.synth.rendering import write_contact_sheet
-from studies import predicted_error
 
 pytestmark = pytest.mark.usefixtures("coarse_priors")
 
@@ -134,21 +132,6 @@ def test_ctrl_c_inside_a_call_of_drjit_is_one_line_too(capsys, monkeypatch):
     monkeypatch.setattr(app, "app", broken)
     with pytest.raises(RuntimeError, match="broken"):
         main(["doctor"])
-
-
-def test_errors_are_predicted_and_calibrated(run):
-    """Shares inside the intervals, on the run's own views, are what they were fitted to be."""
-    study("calibration", run)
-    found = json.loads((run / "diagnostics/uncertainty.json").read_text())
-    assert found["views"] == {"folds": 7, "held out": 3}
-    rows = {(row["prediction"], row["views"]): row for row in found["rows"]}
-    assert len(rows) == 4 * 2
-    for prediction in predicted_error.ROWS:
-        assert rows[prediction, "folds"]["held"]["0.9"][0] == pytest.approx(0.9, abs=0.01)
-        assert rows[prediction, "held out"]["spearman"] > 0
-    maps = read_exr(next((run / "diagnostics").glob("*.errors.exr")))
-    assert set(maps) == {f"{kind}.{channel}" for kind in ("error", "sigma") for channel in "RGB"}
-    assert min(maps[f"sigma.{channel}"].min() for channel in "RGB") > 0
 
 
 @pytest.mark.usefixtures("short_fits")
