@@ -64,7 +64,8 @@ def test_a_run_from_random_points_reads_no_candidate(scenes, tmp_path, monkeypat
     for name in ("target", "mask"):
         monkeypatch.setattr(mgs.Frame, name, _noted(getattr(mgs.Frame, name), read))
     how = {"source": "random", "gaussians": 60, "seeds": 2, "budget": 2, "train": {"passes": 1}}
-    run = mgs.run_nbv(data.root, tmp_path / "run", policy="farthest", **how)
+    run = mgs.run_nbv(data.root, tmp_path / "run", **how)
+    assert run.settings.policy == "farthest", "the default where there is no surface"
     assert run.settings.train.means == "free"
     assert set(read) == {data.frames[i].name for i in run.state.taken}
     with pytest.raises(mgs.InputError, match="need a surface"):

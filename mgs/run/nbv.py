@@ -44,7 +44,7 @@ from mgs.run.folder import (
 )
 from mgs.run.live import Live, begin, live_capture
 from mgs.run.loop import first_views
-from mgs.run.policies import Policy
+from mgs.run.policies import POLICIES, Policy
 from mgs.run.policy_file import code_of, in_file, is_function, label, name_of, policy_of
 from mgs.run.settings import (
     ALPHA_WEIGHT,
@@ -74,6 +74,9 @@ LOOSE = {"points": 4.0, "hull": 4.0, "random": 40.0}
 """Sources of a prior less sure than the images -> factor on its standard deviations in a fit
 of free means to all images. Chosen constants."""
 
+WITHOUT_SURFACE = "farthest"
+"""Default policy from random points (docs/results.md, The published protocol)."""
+
 OnPass = Callable[[int, int, Gaussians], None]
 """on_pass(done, most, model), called after each pass of a fit."""
 
@@ -97,7 +100,7 @@ def run_nbv(
 
 def nbv(
     scene: Scene,
-    policy: str | Callable[..., Any] = "directional-i",
+    policy: str | Callable[..., Any] | None = None,
     *,
     out: str | Path,
     on_step: Callable[[Checkpoint], None] = lambda state: None,
@@ -106,9 +109,9 @@ def nbv(
 ) -> Run:
     """Choose views of a scene one by one, in a run folder `out`; return the finished run.
 
-    policy: a name, an object, or a function. mission: fields of `Mission`. `run_nbv` with the
-    scene's dataset, prior and settings; the prior is copied into the run. Raises InputError as
-    `start_run` and `resume_nbv`.
+    policy: a name, an object, or a function; default as in `start_run`. mission: fields of
+    `Mission`. `run_nbv` with the scene's dataset, prior and settings; the prior is copied into the
+    run. Raises InputError as `start_run` and `resume_nbv`.
     """
     model = {name: getattr(scene.settings, name) for name in ModelSettings.model_fields}
     return run_nbv(
@@ -147,10 +150,11 @@ def start_run(
     - loose: as `NbvSettings.with_spacing`.
     - force: replace an existing run.
     - settings: fields of `NbvSettings`. `policy` may also be a function (docs/howto/policy.md),
-      whose source is kept in the run. The default of `budget` is 50 views or all candidates;
-      "auto" is the fewest views that have the share `enough` of the gain of all candidates by the
-      policy's criterion, at the model before training. The default of `alpha_weight` is
-      ALPHA_WEIGHT, or 0 if frames have neither mask nor alpha.
+      whose source is kept in the run. Its default from random points is WITHOUT_SURFACE. The
+      default of `budget` is 50 views or all candidates; "auto" is the fewest views that have the
+      share `enough` of the gain of all candidates by the policy's criterion, at the model before
+      training. The default of `alpha_weight` is ALPHA_WEIGHT, or 0 if frames have neither mask nor
+      alpha.
 
     Leaves no folder behind if it fails. Raises InputError if the folder is not empty, a setting is
     invalid, the dataset is too small, an input is missing or damaged, or the cameras are too near
@@ -182,24 +186,22 @@ def start_run(
     if source == "random":
         settings["train"] = {"means": "free"} | dict(settings.get("train", {}))
         loose = LOOSE["random"]
-    policy = settings.get("policy", NbvSettings.model_fields["policy"].default)
+    stored = load_prior(folder) if folder else None
+    given: Any = stored or prior
+    random = "random" in (source, getattr(given, "kind", None))
+    policy = settings.get("policy") or (WITHOUT_SURFACE if random else next(iter(POLICIES)))
     paths = {"dataset": images.resolve(), "prior": where.resolve()}
     mission = _settings(dataset, policy, settings | paths)
     rule = policy_of(policy)  # a user's policy fails here, before there is a folder
     check_settings(mission, len(dataset))
-    stored = load_prior(folder) if folder else None
     inputs = [path for path in (root, folder) if path]
     with atomic_folder(out, Ours(FILES, inputs) if holds_run(out) else None) as unfinished:
-        surface: Any = (
-            stored
-            or prior
-            or build_prior(
-                dataset.survey(),
-                PriorSettings(gaussians=gaussians, seed=mission.seed),
-                source=source,
-                shown=_seed_frames(dataset, mission) if source == "random" else None,
-                on_stage=lambda stage: progress(f"prior: {stage}", 0, 1),
-            )
+        surface = given or build_prior(
+            dataset.survey(),
+            PriorSettings(gaussians=gaussians, seed=mission.seed),
+            source=source,
+            shown=_seed_frames(dataset, mission) if source == "random" else None,
+            on_stage=lambda stage: progress(f"prior: {stage}", 0, 1),
         )
         if folder is None:
             save_prior(unfinished / "prior", surface)

@@ -104,7 +104,8 @@ class NbvSettings(ModelSettings, Mission):
     prior: Path
     """Folder of the prior."""
     policy: str = "directional-i"
-    """Policy that scores candidate views: a name, or FILE.py:FUNCTION of your own."""
+    """Policy that scores candidate views: a name, or FILE.py:FUNCTION of your own. Default from
+    random points: farthest."""
     evaluate_every: Annotated[int, Field(ge=0)] = 0
     """Measure PSNR each time after this many views; 0: only at the end. Does not affect choices."""
 
