@@ -15,7 +15,7 @@ from mgs.errors import InputError
 from mgs.fit.evidence import Images
 from mgs.fit.fitting import Fit
 from mgs.fit.objective import objective
-from mgs.fit.poses import ALIKE, ROUND_PASSES, ROUNDS, pose_steps, tau
+from mgs.fit.poses import INDEPENDENT, ROUND, ROUNDS, pose_steps, spread, tau
 from mgs.fit.settings import PoseNoise, TrainSettings
 from mgs.fit.stopping import DivergedError, StopReason
 from mgs.gaussians import Gaussians
@@ -91,11 +91,13 @@ def learn(
 def refine_poses(scene: Scene, noise: PoseNoise) -> tuple[Frame, ...]:
     """All frames with refined poses: fits and Gauss-Newton steps of the poses (`mgs.fit.poses`)
     take turns. Raises InputError if a fit diverges or a frame cannot be read."""
-    given = frames = scene.frames
+    frames = scene.frames
     settings = scene.settings
-    train = settings.train.model_copy(update={"passes": ROUND_PASSES, "tolerance": 0.0})
-    cameras = [frame.camera for frame in given]
-    lam = (ALIKE * settings.pixel_noise / tau(noise, cameras, scene.centre)) ** 2
+    train = settings.train.model_copy(update=ROUND)
+    poses = [frame.camera for frame in frames]
+    std = most = tau(noise, poses, scene.centre)
+    pixels = np.array([[camera.width * camera.height] for camera in poses])
+    variance = settings.pixel_noise**2 * pixels / INDEPENDENT
     model = old = scene.start(frames)
     for k in range(ROUNDS):
         start = scene.start(frames)
@@ -109,7 +111,8 @@ def refine_poses(scene: Scene, noise: PoseNoise) -> tuple[Frame, ...]:
         cameras = [frame.camera for frame in frames]
         targets, weight = scene.targets(frames, gains), train.alpha_weight
         goal = objective(model, cameras, targets, cache=scene.cache, alpha_weight=weight)
-        moved = pose_steps(goal, as_drjit(model), [frame.camera for frame in given], lam)
+        moved = pose_steps(goal, as_drjit(model), poses, variance / std**2)
+        std = spread(poses, moved, most)
         pairs = zip(frames, moved, strict=True)
         frames = tuple(replace(frame, camera=camera) for frame, camera in pairs)
     return frames

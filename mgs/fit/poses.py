@@ -28,12 +28,18 @@ from mgs.gaussians import Gaussians
 from mgs.splat.projection import camera_array, moved
 from mgs.splat.recording import frozen
 
-ROUNDS, ROUND_PASSES = 6, 3
-"""Steps of the poses, and passes of the fit before each. Chosen constants."""
+ROUNDS = 6
+"""Steps of the poses. A chosen constant."""
 
-ALIKE = 5.0
-"""sigma over the setting `pixel_noise`. Errors of a model are alike over some 5 x 5 pixels, which
-count as one. With 1, views move where images hardly say. A chosen constant."""
+ROUND = {"passes": 3, "tolerance": 0.0, "density": "fixed"}
+"""Settings of the fit before each, of a fixed number of Gaussians. Chosen constants."""
+
+INDEPENDENT = 50
+"""Pixels of an image that count as independent, whatever its size: errors of a model are alike over
+large parts of it, and pull at its pose together. With more, exact poses move. A chosen constant."""
+
+LEAST = 1e-3
+"""Least factor of `spread`. A chosen constant."""
 
 
 def tau(noise: PoseNoise, cameras: Sequence[Camera], centre: np.ndarray) -> np.ndarray:
@@ -41,6 +47,17 @@ def tau(noise: PoseNoise, cameras: Sequence[Camera], centre: np.ndarray) -> np.n
     distances = np.linalg.norm([camera.position - centre for camera in cameras], axis=1)
     turn = np.full((len(cameras), 3), np.radians(noise.degrees))
     return np.hstack([turn, np.outer(noise.distance * distances, np.ones(3))])
+
+
+def spread(given: Sequence[Camera], cameras: Sequence[Camera], most: np.ndarray) -> np.ndarray:
+    """Standard deviation [V,6] of motions as found: `most` [V,6] times the root mean square of
+    motion / most, up to 1, of the turn of each view and of its shift.
+
+    Under it in place of `most`, views that the images hardly pull come to rest where they were.
+    """
+    motions = [motion_between(*pair) for pair in zip(given, cameras, strict=True)] / most
+    factors = np.sqrt(np.mean(motions.reshape(-1, 2, 3) ** 2, axis=2))
+    return most * np.repeat(factors.clip(LEAST, 1), 3, axis=1)
 
 
 def motion_between(old: Camera, new: Camera) -> np.ndarray:
