@@ -236,6 +236,9 @@ def test_more_bytes_are_better_and_each_packet_improves(tmp_path):
         sizes.append(change(load_gaussians(path), encoder.g))
     assert sizes[0] > 3 * sizes[-1]
     assert np.mean(np.diff(sizes) <= 0) >= 0.8
+    tops = replace(file, payloads={k: data for k, data in file.payloads.items() if k[0] == 0})
+    nothing = replace(encoder.g, logit_opacities=np.full(300, -20, np.float32))
+    assert change(tops.model, encoder.g) < 0.07 * change(nothing, encoder.g)
 
 
 def test_what_is_cut_off_or_broken_is_lost_alone(tmp_path):

@@ -89,7 +89,8 @@ def in_order(gains: Mapping[Key, float], sizes: Mapping[Key, int]) -> list[Key]:
         if group == "position":
             colour = tile, "colour", 0
             both = sizes[key] + sizes.get(colour, 0)
-            rates[key] = np.inf if tile == 0 else gains.get(colour, 0.0) / both
+            shown = gains.get(key, 0.0) + gains.get(colour, 0.0)
+            rates[key] = np.inf if tile == 0 else shown / both
             continue
         before = [(tile, "position", 0), (tile, group, layer - 1)]
         rates[key] = min([rate(key), *(rates[one] for one in before if one in rates)])
