@@ -14,7 +14,7 @@ from refusals import refused
 
 from mgs.errors import InputError
 from mgs.reports import story
-from mgs.reports.video import camera_path, write_film
+from mgs.reports.video import camera_path, path_among, write_film
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +36,19 @@ def test_a_turntable_goes_around_the_object_and_looks_at_it(loaded):
         pixel = camera.project(np.zeros((1, 3)))[0][0]
         np.testing.assert_allclose(pixel, camera.K[:2, 2], atol=1e-6)
         assert (camera.width % 2, camera.height % 2) == (0, 0)
+
+
+def test_a_path_among_cameras_stays_near_them_and_looks_as_they_do(loaded):
+    taken = loaded.cameras
+    cameras = path_among(taken, 60, 30)
+    eyes, given = (np.array([c.position for c in one]) for one in (cameras, taken))
+    away = np.linalg.norm(eyes[:, None] - given, axis=2)
+    gap = np.linalg.norm(given[0] - given[1])
+    assert away.min(axis=1).max() < 0.6 * gap
+    steps = np.linalg.norm(np.diff(eyes, axis=0, append=eyes[:1]), axis=1)
+    assert steps.max() < 2 * np.median(steps)
+    for camera, near in zip(cameras, away.argmin(axis=1), strict=True):
+        assert camera.world_to_camera[2, :3] @ taken[near].world_to_camera[2, :3] > 0.9
 
 
 def grey(values):

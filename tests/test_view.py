@@ -26,7 +26,7 @@ from mgs.camera import Camera, look_at
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset
 from mgs.reports.evaluation import evaluate_run
-from mgs.run.folder import open_run
+from mgs.run.folder import Run, open_run
 from mgs.splat import render
 from mgs.splat_ply import write_ply
 from mgs.view import layers
@@ -105,6 +105,16 @@ def test_what_the_kernel_draws(run):
     assert (low, high) == pytest.approx((depth[seen].min(), depth[seen].max()))
     informed = subject.scalars["information"]
     assert drawn["information"][2] == (0, pytest.approx(np.quantile(informed, 0.999)))
+
+
+def test_a_whole_scene_opens_at_a_camera(run, monkeypatch):
+    pytest.importorskip("viser", reason="viser is not installed")
+    monkeypatch.setattr(Run, "of_scene", True)
+    viewer = Viewer(run, port=0)
+    first, camera = viewer.server.initial_camera, viewer.subject.taken[0].frame.camera
+    viewer.close()
+    np.testing.assert_allclose(first.position, camera.position)
+    np.testing.assert_allclose(first.look_at - first.position, camera.world_to_camera[2, :3])
 
 
 def test_a_world_of_large_numbers_is_shown_smaller(run):

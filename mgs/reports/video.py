@@ -1,7 +1,8 @@
 """Films of a run: a turntable, and how the model came to be, view by view.
 
 A turntable turns about the median of the Gaussians' means, at the median distance and height of the
-dataset's cameras. Films are MP4, or without any package beside Pillow GIF and animated PNG.
+dataset's cameras. A film of a whole scene moves among the cameras taken. Films are MP4, or without
+any package beside Pillow GIF and animated PNG.
 """
 
 from __future__ import annotations
@@ -13,12 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from mgs.camera import Camera, look_at
 from mgs.data.dataset import Dataset
 from mgs.errors import InputError
 from mgs.files import atomic_path
 from mgs.plotting import painted
+from mgs.policy.tour import flying_order, legs
 from mgs.reports.diagnostics import VISIBLE, picture, run_scalars, view_maps
 from mgs.run.folder import Run
 
@@ -55,11 +58,34 @@ def camera_path(dataset: Dataset, means: np.ndarray, count: int, width: int) -> 
     return [replace(shape, world_to_camera=look_at(eye, centre)) for eye in places]
 
 
+def path_among(cameras: Sequence[Camera], count: int, width: int) -> list[Camera]:
+    """Cameras on a smooth closed path through given ones, at equal distances. count: of cameras.
+    width: of their images, pixels."""
+    eyes = np.stack([camera.position for camera in cameras])
+    order = flying_order(legs(eyes, eyes[0, :2]), 0, range(1, len(eyes)), 0)
+    tour = [0, *order, 0]
+    poses = np.stack([cameras[k].camera_to_world[:3, 1:].T.ravel() for k in tour])  # down, ahead
+    along = np.cumsum([0, *np.linalg.norm(np.diff(eyes[tour], axis=0), axis=1)])
+    at = np.linspace(0, along[-1], count, endpoint=False)
+    path = np.column_stack([np.interp(at, along, column) for column in poses.T])
+    path = gaussian_filter1d(path, count / len(tour) / 2, axis=0, mode="wrap")
+    shape = cameras[0].resized(width + width % 2)
+    shape = replace(shape, height=shape.height + shape.height % 2)  # encoders need even numbers
+    return [
+        replace(shape, world_to_camera=look_at(eye, eye + ahead, -down))
+        for down, ahead, eye in path.reshape(-1, 3, 3)
+    ]
+
+
 def path_frames(run: Run, beside: str | None, count: int, width: int) -> Film:
-    """Frames of a turntable; with beside="uncertainty", the map of what is unknown to the right."""
+    """Frames of a turntable, or of a whole scene among its cameras; with beside="uncertainty", the
+    map of what is unknown to the right."""
     model = run.state.gaussians
     scalars = {"uncertainty": run_scalars(run)["uncertainty"]} if beside else {}
-    for camera in camera_path(run.dataset, model.means, count, width):
+    path = camera_path(run.dataset, model.means, count, width)
+    if run.of_scene:
+        path = path_among([frame.camera for frame in run.taken], count, width)
+    for camera in path:
         maps = view_maps(model, camera, scalars)
         right = [_unknown(maps)] if beside else []
         yield _side_by_side(picture(maps), *right)

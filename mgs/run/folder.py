@@ -132,6 +132,11 @@ class Run:
         return label(self.settings.policy, self.settings.budget)
 
     @property
+    def of_scene(self) -> bool:
+        """Whether its model is of a whole scene, not of one object: no surface and no masks."""
+        return self.prior.kind == "random" and not self.dataset.outlined
+
+    @property
     def planned(self) -> int:
         """Number of seeds and of views to choose."""
         return self.settings.seeds + self.settings.budget

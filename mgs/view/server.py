@@ -149,6 +149,10 @@ class Viewer:
         direction /= max(float(np.linalg.norm(direction)), 1e-9)
         first.look_at = centre
         first.position = centre + size / (FILLED * np.tan(first.fov / 2)) * direction
+        if subject.of_scene:  # there is no outside: begin where a picture was taken
+            camera = subject.taken[0].frame.camera
+            first.position = camera.position
+            first.look_at = camera.position + camera.world_to_camera[2, :3]
         if (mesh := subject.mesh) is not None:
             vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
             look: dict[str, Any] = {"color": (150, 160, 175), "visible": False}

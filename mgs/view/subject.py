@@ -45,7 +45,7 @@ class Subject:
 
     gaussians: the model; None before the first finished step. scalars: name -> [N], of SCALARS;
     empty for a PLY. views: of the dataset, in its order; empty for a PLY. unit: of lengths;
-    a PLY's unit is "unit". scale: all lengths over those of the world.
+    a PLY's unit is "unit". scale: all lengths over those of the world. of_scene: as `Run.of_scene`.
     """
 
     title: str
@@ -55,6 +55,7 @@ class Subject:
     mesh: Mesh | None = None
     unit: str = "m"
     scale: float = 1.0
+    of_scene: bool = False
 
     @property
     def model(self) -> Gaussians:
@@ -142,6 +143,7 @@ def _read_run(run: Run, follow: bool) -> Subject:
         gaussians=run.gaussians,
         scalars={scalar: scalars[scalar] for scalar in SCALARS},
         views=_views(run),
+        of_scene=run.of_scene,
     )
 
 
