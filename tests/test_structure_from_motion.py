@@ -147,7 +147,10 @@ def placed(frames, tmp_path_factory):
         image.save(root / f"{frame.name}.jpg", exif=exif, quality=98)
     shutil.copy(root / "view 00.jpg", root / "z copy.jpg")
     Image.new("RGB", (WIDTH, HEIGHT), "grey").save(root / "blank.jpg")
-    (root / "cut off.jpg").write_bytes((root / "view 01.jpg").read_bytes()[:100])
+    whole = (root / "view 01.jpg").read_bytes()
+    for name, part in {"cut off": whole[:100], "half": whole[: len(whole) // 2]}.items():
+        (root / f"{name}.jpg").write_bytes(part)
+    (root / "phone.heic").write_bytes(bytes(100))
     source = read_source(root, unpack=root.parent / "again")
     return import_source(read_source(root), root.parent / "d"), source
 
@@ -187,11 +190,15 @@ def test_poses_of_photographs_repeat(placed):
 
 
 def test_photographs_that_are_left_out_are_named_with_the_reason(placed):
-    assert sum(placed[1].left_out.values()) == 3
+    assert sum(placed[1].left_out.values()) == 5
     notes = " ".join(placed[1].notes)
-    for name, why in {"z copy": "copies", "blank": "blurred", "cut off": "cannot be read"}.items():
-        assert f"{name}.jpg, that" in notes
-        assert why in notes
+    for names, why in {
+        "z copy.jpg": "are copies",
+        "blank.jpg": "are blurred",
+        "cut off.jpg, half.jpg": "cannot be read",
+        "phone.heic": "are HEIC or raw: convert them to JPEG",
+    }.items():
+        assert f"{names}, that {why}" in notes
 
 
 def test_a_distance_gives_the_scale(placed):
@@ -216,7 +223,7 @@ def test_photographs_that_cannot_be_placed_are_refused(case, frames, tmp_path, c
             write_png(root / f"noise{k}.png", pixels)
     source = root / frames[0].image_path.name if case == "file" else root
     assert exit_code("import", source, "--out", tmp_path / "d") == 2
-    words = {"one": "holds 1 photo", "apart": "can be placed", "file": "the folder of all"}
+    words = {"one": "1 can be used", "apart": "can be placed", "file": "the folder of all"}
     assert words.get(case, "holds no photographs") in said(capsys)[1]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]
 

@@ -17,7 +17,7 @@ from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, frame_name, natural
 from mgs.data.structure import Matcher
 from mgs.data.world import PLUS_Z
 from mgs.errors import InputError
-from mgs.images import exif_orientation, image_size
+from mgs.images import exif_orientation, read_rgba
 from mgs.progress import report
 
 KIND = "photographs"
@@ -41,6 +41,9 @@ GPS_ERROR = 0.1
 """Largest median distance of cameras from their positions by GPS, over the extent of these, for
 GPS to give the scale."""
 
+UNREAD = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw")
+"""Endings of pictures of phones and cameras that are left out with a line."""
+
 NAMED = 10
 """Most photographs that a line names."""
 
@@ -48,7 +51,8 @@ NAMED = 10
 def photographs_in(source: Path) -> list[Path]:
     """Pictures in a folder and the folders in it, or in its folder `images`; none if it is none."""
     root = source / "images" if (source / "images").is_dir() else source
-    paths = [path for path in root.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES]
+    endings = (*PICTURE_SUFFIXES, *UNREAD)
+    paths = [path for path in root.rglob("*") if path.suffix.lower() in endings]
     return sorted((path for path in paths if path.is_file()), key=natural)
 
 
@@ -71,7 +75,7 @@ def read_photographs(
     paths, dropped = _usable(paths)
     if len(paths) < FEWEST:
         raise InputError(
-            f"{source}: holds {len(paths)} photographs that can be used; take at least {FEWEST}, "
+            f"{source}: of its photographs {len(paths)} can be used; take at least {FEWEST}, "
             f"better 20, that overlap{_and_names(dropped)}"
         )
     matcher = Matcher(paths, folder)
@@ -108,8 +112,11 @@ def _usable(paths: Sequence[Path]) -> tuple[list[Path], dict[str, str]]:
     """Photographs that can be read and are no copies, and why the others are left out, by name."""
     usable, dropped, seen = [], dict[str, str](), dict[str, str]()
     for path in paths:
+        if path.suffix.lower() in UNREAD:
+            dropped[path.name] = "that are HEIC or raw: convert them to JPEG"
+            continue
         try:
-            image_size(path)
+            read_rgba(path)
         except InputError:
             dropped[path.name] = "that cannot be read"
             continue

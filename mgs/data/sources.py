@@ -19,7 +19,7 @@ from mgs.data.dataset import finite_number, posed_camera, read_records, timestam
 from mgs.data.lens import Lens
 from mgs.data.metashape import is_metashape, read_metashape
 from mgs.data.photographs import KIND as PHOTOGRAPHS
-from mgs.data.photographs import photographs_in, read_photographs
+from mgs.data.photographs import UNREAD, photographs_in, read_photographs
 from mgs.data.rgbd_folders import (
     is_open3d,
     is_rtabmap,
@@ -133,6 +133,8 @@ def _recognised(
         )
     if source.suffix.lower() in PICTURE_SUFFIXES and source.is_file():
         raise InputError(f"{source}: is one picture; give the folder of all photographs")
+    if source.suffix.lower() in UNREAD and source.is_file():
+        raise InputError(f"{source}: is HEIC or raw; convert all photographs to JPEG")
     path = source if source.is_file() else source / "transforms.json"
     split_path = source / TRAINING
     folder = unpack or source.with_name(f"{source.name}.unpacked")
