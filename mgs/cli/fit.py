@@ -44,9 +44,8 @@ def fit(
     - passes: Default: 30 with adaptive density or free means from photographs, else 10.
     - means: Default: free from photographs or with adaptive density, else frozen.
     - sh: Default: 3 with adaptive density, 1 with free means from photographs, else 0.
-    - density: fixed, split (divide the Gaussians that images pull at most) or adaptive, whose
-      defaults are all those of 3DGS. Default: split of whole scenes without --gaussians, else
-      fixed.
+    - density: The defaults of adaptive are those of 3DGS. Default: split of whole scenes without
+      --gaussians, else fixed.
     - loss: Default: squared with frozen means, l1-dssim with free ones from photographs.
     """
     from mgs.cli.terminal import Terminal

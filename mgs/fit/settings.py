@@ -65,7 +65,7 @@ class TrainSettings(BaseModel):
     most_gaussians: Annotated[int, Field(ge=1, le=2**25)] = 200_000
     """Number of Gaussians beyond which a density control adds none."""
     loss: str = "squared"
-    """Loss: squared (difference of linear RGB), or l1-dssim (0.8 L1 + 0.2 D-SSIM of sRGB: 3DGS)."""
+    """Loss: squared (difference of pixels), or l1-dssim (0.8 L1 + 0.2 D-SSIM of sRGB: 3DGS)."""
     optimiser: str = "natural"
     """Optimiser of the fit: natural (gradient divided by Fisher information) or adam."""
     passes: Annotated[int, Field(ge=1)] = PASSES
