@@ -210,7 +210,7 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
     ],
     (nothing, BUILD): [
         ("7 photographs without depth are too few; take at least 8", photographs(7)),
-        ("the photographs do not overlap", apart),
+        ("the photographs are not of one object", apart),
         ("points lie in one cluster above the ground; give masks", no_object),
     ],
     (bare, f"{BUILD} --source random --poisson-depth 6"): [("has no surface", nothing)],

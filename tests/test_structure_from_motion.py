@@ -5,6 +5,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+import pycolmap
 import pytest
 import synthetic
 from PIL import ExifTags, Image
@@ -19,6 +20,7 @@ from mgs.data.frames import Frame
 from mgs.data.importers import import_source
 from mgs.data.sources import read_source
 from mgs.errors import InputError
+from mgs.files import read_json
 from mgs.fit.poses import displaced, motion_between
 from mgs.images import write_png
 from mgs.prior.build import build_prior
@@ -104,7 +106,7 @@ def test_a_survey_that_looks_at_no_one_place_starts_from_its_points(tmp_path):
     frames = views(tmp_path / "s", [Camera(K, WIDTH, HEIGHT, pose) for pose in poses])
     write_transforms(tmp_path / "s", frames)
     command("import", tmp_path / "s", "--out", tmp_path / "d", "--up", "0,0,1")
-    with pytest.raises(InputError, match="do not overlap"):
+    with pytest.raises(InputError, match="not of one object"):
         check_photographs(load_dataset(tmp_path / "d").frames, of_object=True)
     prior = build_prior(tmp_path / "d", source="random")
     assert prior.numbers["triangulated"] > 200
@@ -244,3 +246,39 @@ def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, monkeypatch):
     command("import", root, "--out", out)
     assert len(load_dataset(out)) == len(frames)
     assert not (tmp_path / "d.unpacked").exists()
+
+
+def test_photographs_alone_are_one_command_to_the_next_picture(
+    frames, tmp_path, capsys, monkeypatch
+):
+    """Photographs of one side ask for another; one more, first by name, joins the same model."""
+    root, site, found = tmp_path / "photos", tmp_path / "photos.site", []
+    few = ("--dome", 12, "--gaussians", 500)
+    root.mkdir()
+    for frame in frames[:11]:
+        shutil.copy(frame.image_path, root)
+    extract = pycolmap.extract_features
+    monkeypatch.setattr(
+        "pycolmap.extract_features",
+        lambda *files, image_names, **options: (
+            found.extend(image_names),
+            extract(*files, image_names=image_names, **options),
+        ),
+    )
+    command("suggest", root, *few)
+    (view,) = read_json(site / "next/suggestions.json")["plan"]
+    assert f"1: {view['way']}" in said(capsys)[0]
+    assert "round the object to the" in view["way"]
+    assert len(found) == 11
+    shutil.copy(frames[11].image_path, root / "a new one.png")
+    command("suggest", root, *few)
+    assert len(found) == 12
+    assert read_json(site / "next/suggestions.json")["images"] == 12
+    data = load_dataset(site / "dataset").frames
+    assert data[0].name == "a new one"
+    turns = [
+        motion_between(one.camera, other.camera)[:3]
+        for pair in ((data[1], data[0]), (frames[0], frames[11]))
+        for one, other in [pair]
+    ]
+    assert np.degrees(np.linalg.norm(turns[0] - turns[1])) < 0.5

@@ -18,6 +18,7 @@ from mgs.camera import Camera, heading_and_pitch, look_at
 from mgs.data import flight_plan
 from mgs.data.dataset import load_cameras, load_dataset
 from mgs.data.world import World, unit_up
+from mgs.prior.build import Prior
 from mgs.reports.suggestion import write_suggestion
 from mgs.run.candidates import Site, inside, place_poses, read_poses
 from mgs.run.folder import open_run
@@ -95,6 +96,12 @@ def test_candidates_of_one_pose_are_one_and_those_that_see_nothing_none(run, sit
         ("sees nothing of the object", 1),
         ("the same as one before", 1),
     ]
+
+
+def test_gains_of_a_model_without_a_surface_are_no_guide(run, monkeypatch, capsys):
+    monkeypatch.setattr(Prior, "kind", "random")
+    command("suggest", run, "--dome", 5)
+    assert "nothing tells seen from unseen" in said(capsys)[0]
 
 
 def test_a_coarse_model_keeps_the_best(run, site, monkeypatch):

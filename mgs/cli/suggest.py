@@ -15,6 +15,7 @@ from mgs.cli.progress import progress_bar
 from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
+from mgs.progress import listening
 from mgs.run.settings import FlightLimits, Positive, SearchLimits, validated
 
 if TYPE_CHECKING:
@@ -31,6 +32,12 @@ DOME = 100
 
 SHOWN = 10
 """Rows of the table of one view to take; suggestions.json has all."""
+
+SITE, NEXT = ".site", "next"
+"""End of the name of a folder beside photographs alone, and the default --out in it."""
+
+PASSES = 2
+"""Passes of the fit to photographs alone: a view is chosen by less model than it is rendered by."""
 
 FILES = ("suggestions.json", "suggestions.png", "transforms.json")
 """Names in the folder --out."""
@@ -86,16 +93,18 @@ def suggest(
 
     Given a dataset, fits a model to all its images and scores 100 poses on a dome, or the
     candidates that you choose; they need no images. Given a run, uses its model as it is; its
-    candidates are by default the frames that it has not taken. With --views K it plans K views
-    together and puts them into flying order, from the first image and back to it. Lengths are in
-    the dataset's unit.
+    candidates are by default the frames that it has not taken. Given photographs alone, places
+    them first, in SOURCE.site; the same command again takes the photographs since then. With
+    --views K it plans K views together and puts them into flying order, from the first image and
+    back to it. Lengths are in the dataset's unit.
 
-    - source DATASET|RUN: Dataset folder, or folder of a run.
+    - source DATASET|RUN|PHOTOGRAPHS: Dataset folder, folder of a run, or of photographs alone.
     - poses: Candidates: a transforms.json without images, or a CSV with columns x,y,z.
     - dome N: Candidates: poses on a dome.
     - views N|auto: Views to plan together, in flying order; with a limit of the flight, at most.
       auto: as few as have the share `enough` of the gain of all candidates.
-    - out: New folder for suggestions.json, transforms.json and suggestions.png.
+    - out: New folder for suggestions.json, transforms.json and suggestions.png. Default:
+      SOURCE.site/next of photographs alone, else none.
     - plan: Flight plan to write: .plan, .waypoints or .kml; repeatable. Needs --origin, or
       photographs with GPS.
     - origin: Where the world's origin is: LAT,LON,ALT or, if +Y is not north, ...,BEARING.
@@ -104,29 +113,35 @@ def suggest(
     - gaussians N|auto: Build a prior of this many Gaussians.
     """
     from mgs.data.flight_plan import check_plan_path, parse_origin
+    from mgs.data.on_site import holds_photographs
 
     console = Terminal()
-    place = parse_origin(origin) if origin else _place(source) if plan else None
     for path in plan or ():
         check_plan_path(path)
         check_new_file(path, force)
-    if plan and place is None:
-        raise InputError(
-            "suggest: `plan` needs `origin`, the place of the world's 0 as LAT,LON,ALT, which "
-            "only photographs with GPS have"
-        )
     values = parse_settings(settings, suggest)
     asked = validated(Candidates, values)
     own = ("flight", "enough", "certificate")
     changes = {key: values[key] for key in own if key in values} | not_none(policy=policy)
     count = parse_gaussians(views, "views") or 1
+    fit: dict[str, Any] = {"prior": prior, "gaussians": parse_gaussians(gaussians)}
+    fit["policy"] = policy
+    if holds_photographs(source):
+        site = source.resolve().with_name(f"{source.resolve().name}{SITE}")
+        source = _placed(source, site, console)
+        out, force = out or site / NEXT, force or out is None
+        fit["train"] = {"passes": PASSES}
+    place = parse_origin(origin) if origin else _place(source)
+    if plan and place is None:
+        raise InputError(
+            "suggest: `plan` needs `origin`, the place of the world's 0 as LAT,LON,ALT, which "
+            "only photographs with GPS have"
+        )
     ours = Ours(FILES, [path for path in (source, poses, prior) if path]) if force else None
     if out is not None:
         check_new_folder(out, ours)
     runtime.start()
     with TemporaryDirectory() as scratch, progress_bar("reading", console) as progress:
-        fit: dict[str, Any] = {"prior": prior, "gaussians": parse_gaussians(gaussians)}
-        fit |= {"policy": policy}
         run = _run(source, Path(scratch) / "run", fit, progress)
         if plan and run.dataset.unit != "m":
             raise InputError(
@@ -157,9 +172,20 @@ def suggest(
                 write_suggestion(unfinished, run, result)
         for path in plan or ():
             _write_plan(path, run, result, place, asked.flight)
-    _print(console, result, run, crossed)
+    _print(console, result, run, crossed, place)
     for written in [*([out] if out else []), *(plan or ())]:
         console.print(f"wrote {written}", soft_wrap=True)
+
+
+def _placed(photographs: Path, site: Path, console: Terminal) -> Path:
+    """Dataset of photographs alone, in the folder `site`."""
+    from mgs.data.on_site import dataset_at
+
+    with progress_bar("reading", console) as progress, listening(progress):
+        dataset, notes = dataset_at(photographs, site)
+    for note in notes:
+        console.print(note, soft_wrap=True)
+    return dataset.root
 
 
 def _place(source: Path) -> Any:
@@ -258,8 +284,9 @@ def _write_plan(path: Path, run: Run, result: Suggestion, place: Any, limits: Fl
     write_flight_plan(path, stops, place, limits.hover, limits.speed)
 
 
-def _print(console: Terminal, result: Suggestion, run: Run, crossed: str) -> None:
+def _print(console: Terminal, result: Suggestion, run: Run, crossed: str, place: Any) -> None:
     """Print what was dropped, the views as a table, and the flight."""
+    from mgs.data.flight_plan import Stop
     from mgs.policy.criteria import GAIN_UNIT
 
     if run.prior.kind == "random":
@@ -278,6 +305,11 @@ def _print(console: Terminal, result: Suggestion, run: Run, crossed: str) -> Non
     for number, view in enumerate(rows, 1):
         table.add_row(str(number), view.name, *_cells(view, run.dataset.unit))
     console.print(table)
+    north = place.bearing if place else 0.0
+    for number, view in enumerate(result.plan, 1):
+        bearing, _ = Stop(view.camera.position, "", view.camera).heading_and_pitch(north)
+        facing = f"; bearing {bearing:.0f}°" if place else ""
+        console.print(f"{number}: {view.way}{facing}", soft_wrap=True)
     unit = run.dataset.unit
     plan = f"{len(result.plan)} view{'s' if len(result.plan) > 1 else ''}"
     console.print(

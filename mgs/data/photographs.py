@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
@@ -17,6 +18,7 @@ from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, frame_name, natural
 from mgs.data.structure import Matcher
 from mgs.data.world import PLUS_Z
 from mgs.errors import InputError
+from mgs.files import read_json, write_json
 from mgs.images import exif_orientation, read_rgba
 from mgs.progress import report
 
@@ -138,12 +140,18 @@ def _pairs(count: int) -> list[tuple[int, int]]:
 
 
 def _models(matcher: Matcher, count: int) -> list[Any]:
-    """Reconstructions of the photographs, the largest first; those of a call before, if any."""
+    """Reconstructions of the photographs, the largest first; those of a call before, if any. Where
+    that had fewer photographs and one model, the others are registered to it."""
     import pycolmap
 
     folder = matcher.folder / "models"
-    if not (folder / "done").is_file():
-        folder.mkdir(exist_ok=True)
+    done = folder / "done.json"
+    if not done.is_file() or read_json(done) != count:
+        before = [path for path in folder.glob("*") if path.is_dir()]
+        first = before[0] if done.is_file() and len(before) == 1 else None
+        if first is None:
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
         options = pycolmap.IncrementalPipelineOptions(
             min_model_size=FEWEST, extract_colors=False, random_seed=0
         )
@@ -153,13 +161,14 @@ def _models(matcher: Matcher, count: int) -> list[Any]:
         pycolmap.incremental_mapping(
             matcher.database,
             matcher.folder,
-            folder,
+            first or folder,
             options=options,
+            input_path=first or "",
             next_image_callback=lambda: report(
                 "placing photographs", min(next(placed), count), count
             ),
         )
-        (folder / "done").touch()
+        write_json(done, count)
     models = [pycolmap.Reconstruction(path) for path in sorted(folder.iterdir()) if path.is_dir()]
     models = [model for model in models if model.num_reg_images() >= FEWEST]
     return sorted(models, key=lambda model: -model.num_reg_images())

@@ -59,7 +59,7 @@ class Matcher:
 
     pictures: files. cameras: of pycolmap, one for each picture, by default as EXIF says; equal ones
     are taken as one camera.
-    folder: of the database, which a later Matcher of the same pictures continues.
+    folder: of the database, which a later Matcher of the same pictures, or of more, continues.
     """
 
     def __init__(self, pictures: Sequence[Path], folder: Path, cameras: Sequence[Any] = ()) -> None:
@@ -68,16 +68,23 @@ class Matcher:
 
         pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
         self.folder, self.database = folder, folder / "database.db"
-        # Names of any characters become plain ones.
-        self.names = [f"{place:06d}{path.suffix}" for place, path in enumerate(pictures)]
         about = [[str(path.resolve()), path.stat().st_mtime_ns] for path in pictures]
         record = folder / "pictures.json"
-        if not record.is_file() or read_json(record) != about:
+        known = read_json(record) if record.is_file() else []
+        if any(picture not in about for picture in known):
+            known = []
+        order = [*known, *(picture for picture in about if picture not in known)]
+        # Names of any characters become plain ones.
+        places = [order.index(picture) for picture in about]
+        self.names = [f"{k:06d}{path.suffix}" for k, path in zip(places, pictures, strict=True)]
+        if not known:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
+        if order != known:
             for name, path in zip(self.names, pictures, strict=True):
-                _link_upright(path, folder / name)
-            write_json(record, about)
+                if not (folder / name).exists():
+                    _link_upright(path, folder / name)
+            write_json(record, order)
         reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
         self.cameras = cameras or [
             pycolmap.infer_camera_from_image(folder / name, reader) for name in self.names

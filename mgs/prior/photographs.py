@@ -94,8 +94,9 @@ def check_photographs(frames: Sequence[Frame], of_object: bool) -> None:
     inside = [bool(in_image(frame.camera, *frame.camera.project(point))[0]) for frame in frames]
     if np.mean(inside) < LEAST_OVERLAP:
         raise InputError(
-            f"prior: the photographs do not overlap: of {len(frames)} cameras only {sum(inside)} "
-            "have in their image what all look at; walk around the object, or check the poses"
+            f"prior: the photographs are not of one object: of {len(frames)} cameras only "
+            f"{sum(inside)} have in their image what all look at; walk around the object, or check "
+            "the poses"
         )
 
 

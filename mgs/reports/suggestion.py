@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -106,9 +107,9 @@ def draw_suggestion(path: str | Path, run: Run, suggestion: Suggestion) -> None:
             window = crop(maps["A"] >= VISIBLE)
             top, below = (figure.add_subplot(grid[row, k]) for row in (0, 1))
             top.imshow(picture(maps)[window])
-            top.set_title(f"{k}: {view.name}\ngain {view.information_gain:.3f}")
+            top.set_title(f"{k}: {view.name}\n{fill(view.way, 28)}", fontsize=8)
             shown = show_map(below, maps, "uncertainty", window, "cividis", vmin=0, vmax=1)
-            below.set_title(f"unknown {100 * view.unknown:.0f} %")
+            below.set_title(f"unknown {100 * view.unknown:.0f} %, gain {view.information_gain:.3f}")
             top.set_axis_off()
             for axis in (top, below):
                 axis.set_anchor("N")
@@ -136,7 +137,11 @@ def _from_above(axis: Any, run: Run, suggestion: Suggestion) -> None:
     def level(points: Any) -> np.ndarray:
         return np.atleast_2d(points)[:, :2]
 
-    images = level([frame.camera.position for frame in taken_in_order(run)])
+    frames = taken_in_order(run)
+    images = level([frame.camera.position for frame in frames])
+    for frame, place in zip(frames, images, strict=True):
+        if any(frame.name in view.way for view in suggestion.plan[:MOST_PICTURES]):
+            axis.text(*place, frame.name, fontsize=7)
     ranked = level([view.camera.position for view in suggestion.ranking])
     gains, label = [view.information_gain for view in suggestion.ranking], f"gain ({GAIN_UNIT})"
     if suggestion.certificate:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mgs.camera import Camera, look_at
 from mgs.data.clouds import towards
 from mgs.data.dataset import finite_number, load_cameras
+from mgs.data.frames import Frame
 from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.world import UPRIGHT, Thing, World
 from mgs.errors import InputError
@@ -35,6 +36,9 @@ MOST_POSES = 5000
 
 SAME_PLACE, SAME_VIEW = 1e-3, 1.0
 """Distance over that from the object, and angle in degrees, below which a pose counts as taken."""
+
+FELT = 0.05
+"""Least move that is named, over the distance from the object; as an angle, radians."""
 
 Named = tuple[str, Camera]
 
@@ -160,6 +164,34 @@ def place_poses(
     digits = len(str(len(offsets) - 1))
     eyes = site.centre + offsets
     return [(f"{shape}_{i:0{digits}d}", site.camera(eye)) for i, eye in enumerate(eyes)]
+
+
+def way_to(camera: Camera, images: Sequence[Frame], site: Site, unit: str) -> str:
+    """How a person finds a pose: the images it lies between, and the way from the nearest of them.
+    Lengths are in metres, or of another unit in percent of that image's distance from the object.
+    """
+    eyes = np.stack([frame.camera.position for frame in images]) - camera.position
+    away = np.linalg.norm(eyes, axis=1)
+    near = int(away.argmin())
+    where, words = images[near].name, list[str]()
+    opposite = eyes @ eyes[near] < -away * away[near] / 2
+    if opposite.any():
+        where = f"between {where} and {images[int(np.where(opposite, away, np.inf).argmin())].name}"
+    start, end = images[near].camera.position - site.centre, camera.position - site.centre
+    far = float(np.linalg.norm(start))
+    turn = np.arctan2(start[0] * end[1] - start[1] * end[0], start[:2] @ end[:2])
+    if abs(turn) >= FELT:
+        side = "right" if turn > 0 else "left"
+        words.append(f"{abs(np.degrees(turn)):.0f}° round the object to the {side}")
+    moves = [
+        (far - np.linalg.norm(end), "nearer", "farther"),
+        (end[2] - start[2], "higher", "lower"),
+    ]
+    for length, positive, negative in moves:
+        if abs(length) >= FELT * far:
+            size = f"{abs(length):.1f} m" if unit == "m" else f"{abs(length) / far:.0%}"
+            words.append(f"{size} {positive if length > 0 else negative}")
+    return f"{where}: {', '.join(words) or 'there'}"
 
 
 def _lattice(count: int, radius: float, elevations: tuple[float, float]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -29,7 +29,7 @@ from mgs.policy.certificate import Certificate
 from mgs.policy.directional import squared_weights
 from mgs.prior.build import Prior
 from mgs.progress import Progress, listening, no_progress, report
-from mgs.run.candidates import Named, Site, refusals
+from mgs.run.candidates import Named, Site, refusals, way_to
 from mgs.run.choosing import plan_flight, rated
 from mgs.run.flight import allowed, flight_of, free, reachable
 from mgs.run.folder import Run
@@ -55,8 +55,8 @@ class View:
     score: the policy's. information_gain: Eq. 7 (`mgs.policy.criteria.d_optimal`). unseen, unknown:
     share of what it shows, by squared blending weight, that no image shows, and mean share of the
     prior's variance that is left there. distance: from the last image taken. azimuth, elevation:
-    from the middle of the object, degrees; azimuth 0 is +X of the upright world. planned: place in
-    the order of choice, from 1; 0 if not planned.
+    from the middle of the object, degrees; azimuth 0 is +X of the upright world. way: as `way_to`.
+    planned: place in the order of choice, from 1; 0 if not planned.
     """
 
     name: str
@@ -68,6 +68,7 @@ class View:
     distance: float
     azimuth: float
     elevation: float
+    way: str
     planned: int = 0
 
 
@@ -145,7 +146,8 @@ def suggest(
         if views == "auto":
             most = enough_views(scene, state, rule, mission)
             mission = mission.model_copy(update={"budget": most, "batch": max(most, 2)})
-        describe = _describer(scene, state, flyable, weights)
+        in_words = partial(way_to, images=images, site=site, unit=run.dataset.unit)
+        describe = _describer(scene, state, flyable, weights, in_words)
         rated_views = rated(scene, state, rule, stops)
         ranking = [describe(appraised(scene, state, view, score)[0]) for view, score in rated_views]
         plan, way = _plan(scene, state, rule, mission, describe)
@@ -201,7 +203,11 @@ def _weights(scene: Scene, state: State, taken: int) -> dict[int, NDArray[np.flo
 
 
 def _describer(
-    scene: Scene, state: State, poses: Sequence[Named], weights: dict[int, Any]
+    scene: Scene,
+    state: State,
+    poses: Sequence[Named],
+    weights: dict[int, Any],
+    way: Callable[[Camera], str],
 ) -> Callable[..., View]:
     """A function (choice, place in the plan or 0) -> `View`."""
     unseen = ~criteria.observed(state.surface, scene.surface_lam)
@@ -221,6 +227,7 @@ def _describer(
             distance=float(np.linalg.norm(positions[choice.view] - positions[taken - 1])),
             azimuth=float(np.degrees(np.arctan2(y, x)) % 360),
             elevation=float(np.degrees(np.arcsin(z / np.linalg.norm(offset)))),
+            way=way(camera),
             planned=planned,
         )
 
