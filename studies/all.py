@@ -19,7 +19,10 @@ from studies.frame.output import read_rows
 
 RESULTS = Path(__file__).parent.parent / "docs/results"
 
+LOOSER = "scale and rotation four times as free"
+
 STAGES = {
+    "fits-training": ("fits", "--training", "--variant", "loss=squared", "--variant", LOOSER),
     "fits": ("fits", "--rocks", "8"),
     "certificate": ("certificate", "--rocks", "12"),
     "setups": ("setups", "--rocks", "8"),

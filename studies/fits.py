@@ -22,7 +22,7 @@ from mgs.seeds import generator
 from studies.frame.case import ROCKS
 from studies.frame.claim import Row
 from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
-from studies.frame.program import WORKERS, Study, Work, study_of
+from studies.frame.program import WORKERS, Options, Study, Work, study_of
 from studies.frame.sweep import Cell
 from studies.setups import (
     SETUPS,
@@ -70,7 +70,7 @@ VARIANTS = {
     "passes=5": Variant({"passes": 5}),
     "passes=20": Variant({"passes": 20}),
     "passes=40, tolerance=0": Variant({"passes": 40, "tolerance": 0.0}),
-    "loss=l1-dssim": Variant({"loss": "l1-dssim"}),
+    "loss=squared": Variant({"loss": "squared"}),
     "scale and rotation four times as free": Variant(model={"prior_std": wider(4)}),
     "pixel_noise=0.04": Variant(model={"pixel_noise": 0.04}),
     "--sh 1": Variant(model={"sh": 1}),
@@ -82,13 +82,24 @@ VARIANTS = {
 """Variants by their names in the table."""
 
 
-def cells_of(size: SetupSize) -> list[Cell]:
-    """Cells of every variant on every rock, with datasets and priors."""
+VARIANT: Options = {
+    "--variant": {
+        "action": "append",
+        "choices": list(VARIANTS),
+        "metavar": "NAME",
+        "help": "Only this variant beside the default; repeatable.",
+    }
+}
+
+
+def cells_of(size: SetupSize, names: Sequence[str] | None = None) -> list[Cell]:
+    """Cells of every variant, or of those named, on every rock, with datasets and priors."""
+    variants = {n: v for n, v in VARIANTS.items() if n in (DEFAULT, *(names or VARIANTS))}
     cells: dict[str, Cell] = {}
     for rock in size.rocks:
         spiral = spiral_of(rock, size)
         for pool, counts in POOLS.items():
-            for name, variant in VARIANTS.items():
+            for name, variant in variants.items():
                 plain = case_of(rock, SETUPS[pool], size)
                 case = replace(plain, settings={**plain.settings, **variant.prior})
                 for count in counts:
@@ -178,7 +189,13 @@ def write(work: Work) -> list[Path]:
 
 
 STUDY = Study(
-    "fits", __doc__, write, SIZES, lambda work: cells_of(work.size), ROCKS | WORKERS, sized
+    "fits",
+    __doc__,
+    write,
+    SIZES,
+    lambda work: cells_of(work.size, work.options.variant),
+    ROCKS | VARIANT | WORKERS,
+    sized,
 )
 
 if __name__ == "__main__":

@@ -153,7 +153,7 @@ def test_a_fit_takes_a_loss_of_its_own_and_says_what_is_wrong_with_images(datase
     frames = mgs.load_dataset(dataset).frames[:2]
     model, cameras = tiny.initial([]), [frame.camera for frame in frames]
     images = [frame.rgb() for frame in frames]
-    few = mgs.TrainSettings(passes=2, tolerance=0)
+    few = mgs.TrainSettings(passes=2, tolerance=0, loss="squared")
 
     def squared(drawn, pixels, weights, size, linear):
         return (drawn - pixels) * (drawn - pixels)

@@ -127,7 +127,8 @@ def test_slopes_are_those_of_the_reference(scene, monkeypatch):
     monkeypatch.setattr(density, "ADAPTION_FROM", 0)
     monkeypatch.setattr(density, "ADAPTION_STEPS", 1)
     monkeypatch.setattr(fitting, "slopes_of", lambda sums, *_: found.append(sums) or 1 / 0)
-    train = TrainSettings(means="free", density="adaptive", rates=RATES | {"mean": 0.0}, passes=4)
+    control = {"density": "adaptive", "loss": "squared", "passes": 4}
+    train = TrainSettings(means="free", rates=RATES | {"mean": 0.0}, **control)
     with pytest.raises(ZeroDivisionError):
         fit_gaussians(model, [camera], [target], train)
     ((norms, drawn),) = found

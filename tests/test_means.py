@@ -95,7 +95,7 @@ def test_one_step_is_natural_on_the_gradient_of_the_objective(cameras, targets):
     start, rng = ball(0.02), np.random.default_rng(1)
     for _ in range(2):
         begun = ball(0.02 + 0.01 * rng.standard_normal(N))
-        train = settings("free", 1, 0.002)
+        train = settings("free", 1, 0.002).model_copy(update={"loss": "squared"})
         goal = objective(begun, cameras[:1], targets[:1], start, LAM, means="free")
         model = as_drjit(begun)
         g, d = (np.asarray(part(model)[-1]) for part in (goal.gradient, goal.diagonal))

@@ -43,7 +43,7 @@ from mgs.splat_ply import read_ply
 from studies.bench import surface_camera, surface_gaussians
 
 VIEWS = 8
-SETTINGS = NbvSettings(dataset="data", prior="prior")
+SETTINGS = NbvSettings(dataset="data", prior="prior", train={"loss": "squared"})
 
 
 def model(n=500):

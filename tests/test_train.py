@@ -69,9 +69,8 @@ def derivative(start: Gaussians, camera: Camera, target: np.ndarray, i: int) -> 
 
 def test_fit_lowers_the_loss_a_hundredfold_and_reports_it(truth, cameras, targets):
     start, rates = grey(truth), rates_of(0.05, 0.01, 0.01, 0.02)
-    found = fit_gaussians(
-        start, cameras, targets, TrainSettings(passes=60, tolerance=0.0, rates=rates)
-    )
+    settings = TrainSettings(passes=60, tolerance=0.0, rates=rates, loss="squared")
+    found = fit_gaussians(start, cameras, targets, settings)
     assert found.stop_reason == "pass-limit"
     assert (found.passes, found.iterations) == (60, 180)
     after = mean_square(found.gaussians, cameras, targets)
@@ -99,7 +98,7 @@ def test_alpha_as_a_channel_makes_alpha_right(truth, cameras, targets):
 def test_one_step_is_adam_on_the_gradient_of_the_summed_squared_error(truth, cameras, targets):
     """The first step is minus the rate times g / (|g| + epsilon)."""
     start = grey(truth)
-    settings = TrainSettings(optimiser="adam", passes=1, rates=rates_of(0.02))
+    settings = TrainSettings(optimiser="adam", passes=1, rates=rates_of(0.02), loss="squared")
     found = fit_gaussians(start, cameras[:1], targets[:1], settings)
     step = (found.gaussians.sh - start.sh)[:, 0, 0]
     for i in np.argsort(-np.abs(step))[:3]:
@@ -118,7 +117,8 @@ def test_one_step_is_natural_on_the_gradient_of_the_objective(truth, cameras, ta
         logit_opacities=truth.logit_opacities - 0.3,
         sh=np.full_like(truth.sh, 0.2),
     )
-    settings, camera, target = TrainSettings(passes=1, rates=rates_of(0.01)), cameras[0], targets[0]
+    settings = TrainSettings(passes=1, rates=rates_of(0.01), loss="squared")
+    camera, target = cameras[0], targets[0]
     found = fit_gaussians(begun, [camera], [target], settings, start=start, lam=lam)
     prior = sum(
         weight * ((getattr(begun, name) - getattr(start, name)) ** 2).sum()
@@ -152,7 +152,7 @@ def test_what_no_image_shows_stays_where_the_prior_put_it(truth, cameras, target
 def test_colours_learn_one_more_sh_degree_after_some_steps(truth, cameras, targets, degree):
     """As in 3DGS; here after each pass."""
     start = grey(truth).with_degree(2)
-    train = TrainSettings(passes=degree + 1, tolerance=0, sh_steps=len(cameras))
+    train = TrainSettings(passes=degree + 1, tolerance=0, sh_steps=len(cameras), loss="squared")
     learned = (fit_gaussians(start, cameras, targets, train).gaussians.sh != start.sh).any(
         axis=(0, 2)
     )
@@ -176,7 +176,7 @@ def faster(factor: float, **values) -> TrainSettings:
 
 
 def test_a_fit_whose_loss_rises_has_diverged(truth, cameras, targets):
-    found = fit_gaussians(grey(truth), cameras, targets, faster(1000))
+    found = fit_gaussians(grey(truth), cameras, targets, faster(1000, loss="squared"))
     assert found.stop_reason == StopReason.DIVERGED
     assert found.losses[0] == pytest.approx(mean_square(grey(truth), cameras, targets), rel=1e-5)
     assert min(found.losses[-5:]) > 1.5 * found.losses[0]

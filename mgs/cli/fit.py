@@ -46,7 +46,6 @@ def fit(
     - sh: Default: 3 with adaptive density, 1 with free means from photographs, else 0.
     - density: The defaults of adaptive are those of 3DGS. Default: split of whole scenes without
       --gaussians, else fixed.
-    - loss: Default: squared with frozen means, l1-dssim with free ones from photographs.
     """
     from mgs.cli.terminal import Terminal
     from mgs.run.nbv import start_fit

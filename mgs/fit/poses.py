@@ -31,8 +31,9 @@ from mgs.splat.recording import frozen
 ROUNDS = 6
 """Steps of the poses. A chosen constant."""
 
-ROUND = {"passes": 3, "tolerance": 0.0, "density": "fixed"}
-"""Settings of the fit before each, of a fixed number of Gaussians. Chosen constants."""
+ROUND = {"passes": 3, "tolerance": 0.0, "density": "fixed", "loss": "squared"}
+"""Settings of the fit before each: of a fixed number of Gaussians, by the loss of the steps. Chosen
+constants."""
 
 INDEPENDENT = 50
 """Pixels of an image that count as independent, whatever its size: errors of a model are alike over

@@ -64,8 +64,9 @@ class TrainSettings(BaseModel):
     or adaptive (add and remove as 3DGS)."""
     most_gaussians: Annotated[int, Field(ge=1, le=2**25)] = 200_000
     """Number of Gaussians beyond which a density control adds none."""
-    loss: str = "squared"
-    """Loss: squared (difference of pixels), or l1-dssim (0.8 L1 + 0.2 D-SSIM of sRGB: 3DGS)."""
+    loss: str = "l1-dssim"
+    """Loss: l1-dssim (0.8 L1 + 0.2 D-SSIM of sRGB values, as 3DGS), or squared (difference of the
+    values as the model blends them)."""
     optimiser: str = "natural"
     """Optimiser of the fit: natural (gradient divided by Fisher information) or adam."""
     passes: Annotated[int, Field(ge=1)] = PASSES

@@ -63,7 +63,7 @@ from mgs.survey.fusion import focus
 FREE_PASSES = 30
 """Passes of a fit of free means to all images. A chosen constant."""
 
-FREE_TRAIN = {"passes": FREE_PASSES, "decay": 0.02, "tolerance": 0.0, "loss": "l1-dssim"}
+FREE_TRAIN = {"passes": FREE_PASSES, "decay": 0.02, "tolerance": 0.0}
 """`TrainSettings` of such a fit, chosen on two rocks (docs/fit.md). All passes are made, as the
 last ones, with low rates, average over the images."""
 

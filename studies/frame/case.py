@@ -64,8 +64,23 @@ FRESH = tuple(
 """Rocks that chose no setting: of each scene the first seeds from 11 on with which the rock is
 wholly in every view, one of each scene first. Three scenes are new with them."""
 
+TRAINING = tuple(
+    Rock(scene, seed, index)
+    for index, (scene, seed) in enumerate(
+        (
+            *(("boulder", 1), ("strata", 1), ("obsidian", 2)),
+            *(("pebbles", 2), ("low-sun", 2), ("contact-binary", 1)),
+        )
+    )
+)
+"""Rocks on which settings are chosen."""
+
 ROCKS: Options = {
     "--rocks": {"type": at_least(1), "help": "Number of rocks."},
+    "--training": {
+        "action": "store_true",
+        "help": "The rocks on which settings are chosen, in place of those that judge.",
+    },
     "--mesh": {
         "action": "append",
         "default": [],
@@ -76,7 +91,7 @@ ROCKS: Options = {
 
 
 def rocks_of(options: Namespace, count: int) -> tuple[Rock, ...]:
-    """Rocks of the options --rocks and --mesh; `count` of FRESH by default.
+    """Rocks of the options --rocks, --training and --mesh; `count` of FRESH by default.
 
     Raises InputError if there are fewer, two meshes have one name, or a mesh cannot be read or is
     one too many.
@@ -91,8 +106,8 @@ def rocks_of(options: Namespace, count: int) -> tuple[Rock, ...]:
         if mesh.stem in [rock.scene for rock in rocks]:
             raise mgs.InputError(f"--mesh {mesh}: {NAMESAKE}")
         rocks.append(Rock(mesh.stem, 0, k, mesh.resolve(), file_digest(mesh)))
-    these: Sequence[Rock] = rocks or FRESH
-    asked = options.rocks or (len(rocks) or count)
+    these: Sequence[Rock] = rocks or (TRAINING if options.training else FRESH)
+    asked = options.rocks or len(rocks) or (len(these) if options.training else count)
     if asked > len(these):
         raise mgs.InputError(f"--rocks {asked}: there are 1 to {len(these)}")
     return tuple(these[:asked])
