@@ -10,6 +10,7 @@ import gzip
 import os
 import struct
 import warnings
+import zlib
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -47,6 +48,12 @@ of streams and offset of their table."""
 
 SPZ_ANTIALIASED, SPZ_EXTENSIONS = 1, 2
 """Flags of the header."""
+
+GZIP_RATIO = 1032
+"""Most bytes that a byte of gzip can stand for."""
+
+SPZ_EXTENSION_BYTES = 1 << 20
+"""Most bytes of the extensions of a file up to version 3."""
 
 SPZ_AXES = 0xADBE0003
 """Type of the extension that names the axes (`_axes`)."""
@@ -186,13 +193,33 @@ def _axes(number: int) -> tuple[int, int, int]:
     return (1 if number & 1 else -1, -1 if number & 2 else 1, 1 if number & 4 else -1)
 
 
+def _spz_end(head: bytes) -> int:
+    """Bytes of an SPZ up to version 3 before its extensions, from its header."""
+    _, version, n, degree = SPZ_HEADER.unpack_from(head)[:4]
+    return int(16 + n * ((20 if version == 3 else 19) + 3 * ((degree + 1) ** 2 - 1)))
+
+
+def _unzipped(data: bytes) -> bytes:
+    """Contents of a gzip file of SPZ. Raises ValueError if its header says more than so small a
+    file can hold, or less than it does, before they take memory."""
+    stream = zlib.decompressobj(zlib.MAX_WBITS + 16)
+    head = stream.decompress(data, SPZ_HEADER.size)
+    size = _spz_end(head) + SPZ_EXTENSION_BYTES
+    if _spz_end(head) > GZIP_RATIO * len(data):
+        raise ValueError("its header says more than it can hold")
+    contents = stream.decompress(stream.unconsumed_tail, size)
+    if stream.unconsumed_tail:
+        raise ValueError("it unpacks to more than its header says")
+    return head + contents
+
+
 def _spz_marks(data: bytes) -> tuple[bool, int]:
     """Whether the contents of an SPZ are antialiased, and the number of their axes. Raises errors
     of many types for damaged ones."""
-    _, version, n, degree, _, flags, _, end = SPZ_HEADER.unpack_from(data)
+    _, version, _, _, _, flags, _, end = SPZ_HEADER.unpack_from(data)
     start, axes = 32, RUB
     if version < 4:
-        start = 16 + n * ((20 if version == 3 else 19) + 3 * ((degree + 1) ** 2 - 1))
+        start = _spz_end(data)
         end = len(data)
     rest = data[start:end] if flags & SPZ_EXTENSIONS else b""
     while len(rest) >= 9:
@@ -212,7 +239,7 @@ def _read_spz(path: Path) -> Gaussians:
     codec = _spz_codec(path)
     with reading(path), parsing(path, "SPZ", "export it again"), NamedTemporaryFile() as copy:
         data = path.read_bytes()
-        data = gzip.decompress(data) if data.startswith(SPZ_MAGIC[0]) else data
+        data = _unzipped(data) if data.startswith(SPZ_MAGIC[0]) else data
         magic, version, n = SPZ_HEADER.unpack_from(data)[:3]
         if version == 1:
             halves = np.frombuffer(data, "<f2", 3 * n, 16).reshape(n, 3).astype(np.float32)

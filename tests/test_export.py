@@ -285,6 +285,15 @@ def test_scales_that_are_logarithms_are_refused(tmp_path):
         load_gaussians(tmp_path / "x.glb")
 
 
+def test_an_spz_that_unpacks_to_more_than_its_header_says(tmp_path):
+    pytest.importorskip("gsply_cpp")
+    written(tmp_path, "spz", gaussians(0))
+    (path,) = tmp_path.iterdir()
+    path.write_bytes(gzip.compress(gzip.decompress(path.read_bytes()) + bytes(1 << 21)))
+    with pytest.raises(InputError, match="more than its header says"):
+        load_gaussians(path)
+
+
 def test_an_spz_of_version_1_has_positions_of_float16(tmp_path):
     """Its encoder: the streams in their order, after the published description."""
     pytest.importorskip("gsply_cpp")
