@@ -134,7 +134,7 @@ class Run:
     @property
     def of_scene(self) -> bool:
         """Whether its model is of a whole scene, not of one object: no surface and no masks."""
-        return self.prior.kind == "random" and not self.dataset.outlined
+        return not self.dataset.outlined and self.prior.kind == "random"
 
     @property
     def planned(self) -> int:
