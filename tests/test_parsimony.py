@@ -168,7 +168,7 @@ def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, ellipsoids):
     assert auto["choice"] == parsimony.AUTOMATIC
     assert 3 * auto["gaussians"] <= auto["parameters"] < number["parameters"]
     kinds = {"colour", "directional", "scale", "rotation", "opacity"}
-    assert set(auto["shares"]) == kinds
+    assert kinds - {"directional"} <= set(auto["shares"]) <= kinds
     assert auto["number"] == number["psnr_inside"]
     pruned = [row for row in record["rows"] if row["choice"] == parsimony.PRUNED]
     assert all(one["actual"] <= one["noise"] * PIXEL_NOISE for one in pruned)
