@@ -10,6 +10,7 @@ import pytest
 import synthetic
 from PIL import ExifTags, Image
 from program import command, exit_code, said
+from refusals import refused
 from scipy.ndimage import map_coordinates
 
 from mgs.camera import Camera, look_at
@@ -282,3 +283,10 @@ def test_photographs_alone_are_one_command_to_the_next_picture(
         for one, other in [pair]
     ]
     assert np.degrees(np.linalg.norm(turns[0] - turns[1])) < 0.5
+    kept = (site / "photographs").rename(tmp_path / "kept")
+    (site / "photographs").symlink_to(kept)
+    (root / "a new one.png").unlink()
+    assert "leads out of" in refused(capsys, ["suggest", root, *few], kept)
+    shutil.rmtree(site)
+    kept.rename(site)
+    assert "photos.site" in refused(capsys, ["suggest", root, *few], site)

@@ -11,11 +11,21 @@ from mgs.data.importers import import_source
 from mgs.data.photographs import photographs_in
 from mgs.data.sources import read_source
 from mgs.data.structure import WIDEST
-from mgs.files import atomic_path, folder_locked, in_the_way
+from mgs.files import (
+    atomic_path,
+    below,
+    folder_locked,
+    in_the_way,
+    parsing,
+    read_json,
+    remove_file,
+    write_json,
+)
 from mgs.images import unlimited_headers
 
-COPIES, DATASET = "photographs", "dataset"
-"""Folders at a site: reduced copies of the photographs, and the dataset of them."""
+COPIES, DATASET, RECORD = "photographs", "dataset", "copies.json"
+"""Folders at a site: reduced copies of the photographs, and the dataset of them; names of the
+copies, by which the site is known and which alone are removed."""
 
 DOWNSCALE = 3
 """Width of the copies over that of the dataset's images, which candidates are rated by."""
@@ -34,19 +44,24 @@ def dataset_at(folder: Path, site: Path) -> tuple[Dataset, Sequence[str]]:
 
     Raises InputError as `read_source`, and if `site` was made by something else.
     """
-    if site.exists() and not (site / COPIES).is_dir():
+    record = site / RECORD
+    if site.exists() and not record.is_file():
         raise in_the_way(site)
     with folder_locked(site):
-        root, names = site / COPIES, set[Path]()
-        for path in photographs_in(folder):
-            names.add(root / path.relative_to(folder))
-            _copy_reduced(path, root / path.relative_to(folder))
-        for path in set(photographs_in(root)) - names:
-            path.unlink()
+        root, data = below(site, COPIES), below(site, DATASET)
+        with parsing(record, "list of copies", f"delete {site}"):
+            before = [str(name) for name in read_json(record)] if record.is_file() else []
+        names = [str(path.relative_to(folder)) for path in photographs_in(folder)]
+        write_json(record, sorted({*before, *names}))
+        for name in set(before) - set(names):
+            remove_file(root, root / name)
+        for name in names:
+            _copy_reduced(folder / name, below(root, Path(name).parent) / Path(name).name)
+        write_json(record, names)
         source = read_source(root, unpack=site)
         up, _ = source.up_or_estimate()
-        shutil.rmtree(site / DATASET, ignore_errors=True)
-        result = import_source(source, site / DATASET, downscale=DOWNSCALE, up=up)
+        shutil.rmtree(data, ignore_errors=True)
+        result = import_source(source, data, downscale=DOWNSCALE, up=up)
     return result, source.notes
 
 
