@@ -123,6 +123,8 @@ class Checks:
         if start.opacities.max() < 0.5:  # random points: no surface to compare with
             for name in ("prior", "pose", "coverage"):
                 indicators.pop(name, None)
+        if state.choices:  # few passes, whose loss falls with the rates: good runs by up to 25 %
+            indicators.pop("unconverged", None)
         before_this = next(
             (step["indicators"] for step in reversed(steps[:-1]) if "indicators" in step), None
         )

@@ -191,11 +191,9 @@ def step_indicators(
     """
     indicators = {"means": drift}
     if len(losses) >= 2 and min(losses) > 0 and np.isfinite(losses).all():
-        # Not of later fits: their few passes fall with the rates, up to 25 % a pass in good runs.
-        if not len(gains):
-            window, lowest = min(2, len(losses) - 1), np.minimum.accumulate(losses)
-            rest = lowest[-1] / lowest[-1 - window]
-            indicators["unconverged"] = float(1 - rest ** (1 / window))
+        # Lowest losses: a fit that starts from a fitted model rises first, then falls.
+        window, lowest = min(2, len(losses) - 1), np.minimum.accumulate(losses)
+        indicators["unconverged"] = float(1 - (lowest[-1] / lowest[-1 - window]) ** (1 / window))
         indicators["worse"] = min(losses[1:]) / losses[0] - 1
     if views:
         pixels = np.array([view.pixels for view in views])
@@ -242,7 +240,7 @@ class Detector:
 
 DETECTORS: dict[str, Detector] = {
     "unconverged": Detector(
-        0.15,  # six training rocks: up to 0.07, and 0.18 with two passes
+        0.15,  # two training rocks: up to 0.07, and 0.18 with two passes
         "the fit was stopped while its loss still fell by {share:.1f} % a pass (limit "
         "{most:.1f} %); raise `train.passes`",
     ),
