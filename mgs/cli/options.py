@@ -49,7 +49,9 @@ def describe(command: Any, docstring: str, keys: Sequence[Row]) -> None:
     come first. A switch that is off by default has no form that turns it off. `keys` of the command
     are the settings that are no option.
     """
-    shared, settings = _items(SHARED)[1], {key.removeprefix("train."): row for key, *row in keys}
+    train_first = sorted(keys, key=lambda row: not row[0].startswith("train."))  # `seed` wins
+    settings = {key.removeprefix("train."): row for key, *row in train_first}
+    shared = _items(SHARED)[1]
     command.help, items = _items(docstring)
     for parameter in command.params:
         name = parameter.name
