@@ -26,7 +26,6 @@ STAGES = {
     "fits": ("fits", "--rocks", "8"),
     "certificate": ("certificate", "--rocks", "12"),
     "setups": ("setups", "--rocks", "8"),
-    "rate": ("rate", "--rocks", "6"),
     "table1": ("table1",),
     "flights": ("flights", "--rocks", "12"),
     "survey": ("survey", "--rocks", "8"),
@@ -35,8 +34,8 @@ STAGES = {
     "stress": ("stress",),
     "table1-paper": ("table1", "--scale", "paper", "--batch", "5"),
 }
-"""Studies and their arguments by folder. `studies.blender` and `studies.photographs` need the data
-of others and are run by hand."""
+"""Studies and their arguments by folder. Three need programs or data of others and are run by hand:
+`studies.rate`, `studies.blender` and `studies.photographs`."""
 
 QUICK = {name: (name, "--rocks", "1") for name in ("fits", "certificate")}
 
@@ -45,7 +44,7 @@ ENOUGH = 0.01
 
 
 def run(out: Path, quick: bool) -> int:
-    """Run the stages; the exit code of the first that fails, or of the comparison."""
+    """Run the stages; return the exit code of the first that fails, or of the comparison."""
     code = 0
     for name, (study, *arguments) in (QUICK if quick else STAGES).items():
         command = [sys.executable, "-m", f"studies.{study}", str(out / name), *arguments]
@@ -54,7 +53,7 @@ def run(out: Path, quick: bool) -> int:
             return failed
         if not quick:
             for path in sorted((RESULTS / name).iterdir()):
-                shutil.copyfile(out / name / path.name, path)  # what pages show, no more
+                shutil.copyfile(out / name / path.name, path)  # only files that docs/results has
             continue
         rows, differences = compared(out / name / f"{study}.csv", RESULTS / name / f"{study}.csv")
         print(f"{rows} rows in docs/results, largest difference {max(differences, default=0):.2g}")
@@ -63,7 +62,7 @@ def run(out: Path, quick: bool) -> int:
 
 
 def compared(path: Path, usual: Path) -> tuple[int, list[float]]:
-    """Number of rows of a file that another has too, by their words; differences of numbers."""
+    """Count the rows that two files share (`words`); list the differences of their numbers."""
     others = {words(row): row for row in read_rows(usual)}
     pairs = [(row, others[words(row)]) for row in read_rows(path) if words(row) in others]
     return len(pairs), [
@@ -75,13 +74,13 @@ def compared(path: Path, usual: Path) -> tuple[int, list[float]]:
 
 
 def words(row: Row) -> frozenset[tuple[str, object]]:
-    """What names a row: its words and whole numbers, without its origin."""
+    """Words and whole numbers of a row, which name it, without its origin."""
     origin = ("command", "commit")
     return frozenset((k, v) for k, v in row.items() if isinstance(v, str | int) and k not in origin)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Program; the exit code."""
+    """Run the program; return its exit code."""
     parser = ArgumentParser(prog="python -m studies.all", description=__doc__)
     parser.add_argument("out", type=Path, help="Folder of all studies; run again to continue.")
     parser.add_argument("--quick", action="store_true", help="One rock, compared; minutes.")

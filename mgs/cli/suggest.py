@@ -37,7 +37,7 @@ SITE, NEXT = ".site", "next"
 """End of the name of a folder beside photographs alone, and the default --out in it."""
 
 PASSES = 2
-"""Passes of the fit to photographs alone: a view is chosen by less model than it is rendered by."""
+"""Passes of the fit to photographs alone: enough to choose a view by, too few to show."""
 
 FILES = ("suggestions.json", "suggestions.png", "transforms.json")
 """Names in the folder --out."""

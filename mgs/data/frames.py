@@ -143,7 +143,7 @@ def as_asked(frame: Frame) -> Frame:
 
 
 def moves(given: Sequence[Frame], frames: Sequence[Frame]) -> dict[str, dict[str, float]]:
-    """How far the pose of each frame moved, by name: degrees, and length in the dataset's unit."""
+    """Move of each frame's pose, by name: degrees, and length in the dataset's unit."""
     found = {}
     for old, new in zip(given, frames, strict=True):
         motion = old.camera.world_to_camera @ new.camera.camera_to_world

@@ -1,4 +1,4 @@
-"""Photographs that become more while someone takes them, as a dataset (`mgs suggest FOLDER`)."""
+"""A growing folder of photographs as a dataset (`mgs suggest FOLDER`)."""
 
 from __future__ import annotations
 

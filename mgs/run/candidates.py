@@ -167,7 +167,7 @@ def place_poses(
 
 
 def way_to(camera: Camera, images: Sequence[Frame], site: Site, unit: str) -> str:
-    """How a person finds a pose: the images it lies between, and the way from the nearest of them.
+    """Words by which a person finds a pose: the images around it, and the way from the nearest.
     Lengths are in metres, or of another unit in percent of that image's distance from the object.
     """
     eyes = np.stack([frame.camera.position for frame in images]) - camera.position
