@@ -26,6 +26,9 @@ WEIGHT_MIN = 1e-4
 GUIDES = 6
 """Channels of albedo and normal."""
 
+RAYS = 2**22
+"""Camera rays traced at once: bounds the memory of their channels to some 200 MB."""
+
 
 class RockLayer(mi.SamplingIntegrator):
     """Integrator that repeats another one's channels for the rock alone.
@@ -90,9 +93,41 @@ def render_layers(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Render once: channels of the inner integrator [H,W,C], the same for the rock alone, and the
     share of samples [H,W]."""
-    image = np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))
+    sensor = scene.sensors()[0]
+    sampler, (width, height) = sensor.sampler().clone(), sensor.film().size()
+    most = max(RAYS // (width * height), 1)
+    each = next(n for n in range(min(spp, most), 0, -1) if spp % n == 0)
+    sampler.set_sample_count(spp)
+    sampler.set_samples_per_wavefront(each)
+    sampler.seed(seed, width * height * each)
+    image = np.zeros((height, width, 1), np.float32)
+    for _ in range(spp // each):
+        image = image + _sums(scene, sensor, sampler, integrator, spp, each)
+        sampler.advance()
+        sampler.schedule_state()
+    image /= np.float32(spp)
     channels = image.shape[-1] // 2
     return image[..., :channels], image[..., channels:-1], image[..., -1]
+
+
+def _sums(
+    scene: Any, sensor: Any, sampler: Any, integrator: Any, spp: int, each: int
+) -> np.ndarray:
+    """Sums of `each` of `spp` samples per pixel, float32 [H,W,C], with `mi.render`'s samples.
+
+    Unlike its film, whose threads add to a pixel in any order, the sums do not depend on threads.
+    """
+    width, height = sensor.film().size()
+    pixel = dr.arange(mi.UInt32, width * height * each) // each
+    row = pixel // width
+    place = mi.Point2f(pixel - row * width, row) + sampler.next_2d()
+    ray, _ = sensor.sample_ray_differential(0, 0, place / mi.Vector2f(width, height), 0.5)
+    ray.scale_differential(mi.Float(spp**-0.5))
+    rgb, _, aovs = integrator.sample(scene, sampler, ray)
+    channels = [*rgb, *aovs]
+    dr.eval(channels)  # otherwise each sum below would trace the rays again
+    sums = np.broadcast_arrays(*(dr.block_sum(channel, each).numpy() for channel in channels))
+    return np.stack(sums, -1).reshape(height, width, -1)
 
 
 def with_coverage(values: np.ndarray, share: np.ndarray, coverage: np.ndarray) -> np.ndarray:
