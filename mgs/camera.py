@@ -1,10 +1,7 @@
-"""Pinhole cameras, and the coordinate systems used everywhere in mgs.
+"""Pinhole cameras with OpenCV axes (x right, y down, z forward) in a world in metres, +Z up.
 
-- World: metres, +Z up.
-- Camera: OpenCV axes (x right, y down, z forward).
-- Pixels: (u, v) from the image's corner, so the centre of the first pixel is (0.5, 0.5).
-- Depth: z-depth in metres, along the camera's z axis and not along the ray; 0 is "no return".
-"""
+Pixels (u, v) count from the image's corner: the first centre is (0.5, 0.5). Depth is z-depth along
+the camera's z axis, metres; 0 is "no return"."""
 
 from __future__ import annotations
 
@@ -194,7 +191,6 @@ class Camera:
         return self._posed(R @ np.transpose(turn), t, self.film and self.film.turned(turn))
 
     def _posed(self, R: ArrayLike, t: ArrayLike, film: Camera | None) -> Camera:
-        """Same camera with another pose and film."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = R, t
         return Camera(self.K, self.width, self.height, pose, film, self.corner)

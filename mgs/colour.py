@@ -1,5 +1,4 @@
-"""Colour: linear RGB inside the program, sRGB in PNG files, spherical harmonics of linear RGB in
-Gaussians."""
+"""Colour: linear RGB inside the program and in spherical harmonics, sRGB in PNG files."""
 
 from __future__ import annotations
 
@@ -7,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 SH_C0 = 0.28209479177387814
-"""Spherical harmonic of degree 0, 1 / (2 sqrt(pi)). A Gaussian whose only coefficient is sh0 has
-the colour 0.5 + SH_C0 sh0: 3DGS adds 0.5, so zero coefficients are grey."""
+"""Spherical harmonic of degree 0, 1 / (2 sqrt(pi)). As in 3DGS, a colour is 0.5 + SH_C0 sh0."""
 
 
 def srgb_from_linear(linear: ArrayLike) -> NDArray[np.float32]:

@@ -1,13 +1,7 @@
-"""Quality of a model: its renders against the images of a dataset, as numbers (`mgs.metrics`) and
-pictures.
+"""Quality of a model: its renders against images, as numbers (`mgs.metrics`) and pictures.
 
-The truth is `Frame.target`: the rock in front of black, which the model was trained on. PSNR and
-SSIM compare sRGB values in [0,1]. Over the full frame they flatter, because any model gets the
-black right; those inside the mask are over the rock's pixels only.
-
-Views come in three sets: all views of the dataset; held-out views, which are those the model was
-never trained on; and the test views (`Dataset.test_views`), the same for every model.
-"""
+The truth is `Frame.target`: the rock in front of black. Metrics of the full frame flatter, because
+any model gets the black right. Held-out views are those that the model was never trained on."""
 
 from __future__ import annotations
 
@@ -145,7 +139,6 @@ def psnr_over(
 
 
 def _psnr_means(values: Mapping[str, np.ndarray], prefix: str = "") -> dict[str, float]:
-    """Mean of each array over the views that have it, if there are some; names with a prefix."""
     numbers = {key: column[~np.isnan(column)] for key, column in values.items()}
     return {prefix + key: float(column.mean()) for key, column in numbers.items() if len(column)}
 
@@ -155,10 +148,7 @@ def _compared(
     compare: Callable[..., dict[str, float]],
     at_once: int,
 ) -> Iterator[dict[str, float]]:
-    """Yield compare(view, *arrays) of each pair of a view and its rendered arrays, in their order.
-
-    Up to `at_once` views are compared in threads, all but one while the next view is rendered.
-    """
+    """Yield compare(view, *arrays) of each view and its rendered arrays, in order, from threads."""
     queue: deque[Future[dict[str, float]]] = deque()
     with ThreadPoolExecutor(at_once) as pool:
         for view, arrays in renders:
@@ -225,7 +215,6 @@ def evaluate_model(
 def _measured(
     view: tuple[Frame, Path | None], rgb: np.ndarray, alpha: np.ndarray, depth: np.ndarray
 ) -> dict[str, float]:
-    """METRICS and SURFACE_METRICS of one view; writes its picture into the folder."""
     frame, folder = view
     (truth, weight), mask = frame.target(), frame.mask()
     true_depth = frame.depth() if frame.depth_path else None
@@ -240,8 +229,7 @@ def _measured(
 
 
 def _means(views: list[dict[str, Any]], whole: list[dict[str, Any]]) -> dict[str, Any]:
-    """Number of views, and the mean of each metric over the views that have it, None without such a
-    view. whole: the set of the views; SURFACE_METRICS that none of it has are left out."""
+    """Number of views, and the mean of each metric over those that have it, else None."""
     surface = [name for name in SURFACE_METRICS if any(name in view for view in whole)]
     means: dict[str, Any] = {"count": len(views)}
     for name in (*METRICS, *surface):
@@ -251,7 +239,6 @@ def _means(views: list[dict[str, Any]], whole: list[dict[str, Any]]) -> dict[str
 
 
 def _without_nan(view: dict[str, Any]) -> dict[str, Any]:
-    """A view's numbers with None in place of NaN, which JSON cannot hold."""
     return {
         key: None if isinstance(value, float) and math.isnan(value) else value
         for key, value in view.items()

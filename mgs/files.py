@@ -1,8 +1,5 @@
-"""Atomic reading and writing of files and folders.
-
-Output goes to a temporary name in the same folder and is renamed when complete. A process that is
-killed meanwhile leaves the temporary file, but never an incomplete file under the real name.
-"""
+"""Atomic reading and writing of files and folders: output gets a temporary name in the same folder
+and is renamed when complete, so a killed process leaves no incomplete file."""
 
 from __future__ import annotations
 
@@ -211,8 +208,7 @@ LARGEST = 1 << 25
 
 
 LARGEST_TOML, LONGEST_LINE = 1 << 16, 1 << 12
-"""Most bytes of a TOML file and of a line. The time of Python's parser grows with the cube of the
-keys of a line, as a.a.a.a = 1."""
+"""Most bytes of a TOML file and of a line: Python's parser is cubic in keys a.a.a.a."""
 
 
 def read_bytes(path: str | Path, what: str = "file", most: int = LARGEST) -> bytes:
@@ -396,8 +392,7 @@ def atomic_folder(path: str | Path, ours: Ours | None = None) -> Iterator[Path]:
 
 
 def _check_leftover(folder: Path) -> None:
-    """Raise InputError unless a folder is missing or empty, or has a lock file of mgs, as what a
-    killed process left."""
+    """Raise InputError unless a folder is missing, empty, or left by a killed process."""
     if not os.path.lexists(folder):
         return
     if not folder.is_symlink() and folder.is_dir():
@@ -451,7 +446,6 @@ def scratch_folder(path: str | Path, resumable: bool = False) -> Iterator[Path]:
 
 
 def _clear(folder: Path) -> None:
-    """Remove everything in a folder but its lock."""
     with suppress(OSError):
         for entry in folder.iterdir():
             if entry.is_dir() and not entry.is_symlink():
@@ -487,8 +481,7 @@ LOCK = ".lock"
 """File in a folder that the process that works in it has locked."""
 
 MARK = "mgs "
-"""Start of a lock file, before the number of the process: it proves that mgs made the folder's
-leftovers."""
+"""Start of a lock file, before the number of the process: mgs made the folder's leftovers."""
 
 _held: set[Path] = set()
 """Folders that this process has locked."""
@@ -528,8 +521,7 @@ def working_in(folder: str | Path) -> Iterator[None]:
 
 
 def _lock(path: Path) -> TextIO:
-    """Open and lock the file, and write this process's id into it. Raises InputError if another
-    process has locked it, or if it is no lock file: a link, or a file with other contents."""
+    """Open and lock the file, and write this process's id into it."""
     if os.path.lexists(path) and not _is_lock(path, or_empty=True):
         raise in_the_way(path)
     while True:  # until the locked file is the one of this name

@@ -1,8 +1,5 @@
-"""The Gaussians of a model and the meaning of their parameters.
-
-`Gaussians` is a plain dataclass, so Dr.Jit traverses its fields (a PyTree). Fields are NumPy arrays
-everywhere except inside `mgs.splat`, where they are Dr.Jit tensors.
-"""
+"""The Gaussians of a model. Fields are NumPy arrays everywhere except inside `mgs.splat`, where
+they are Dr.Jit tensors: Dr.Jit traverses the fields of a plain dataclass."""
 
 from __future__ import annotations
 
@@ -21,18 +18,15 @@ MAX_SH_DEGREE = 3
 """Highest degree of spherical harmonics, as in 3DGS."""
 
 MAX_GAUSSIANS = 2**25
-"""Most Gaussians of a model. Kernels index buffers with 32 bits: 48 colour coefficients of each
-Gaussian stay below 2^31."""
+"""Most Gaussians of a model: 32 bits index their 48 colour coefficients."""
 
 SH_MAX = 1e6
-"""Largest magnitude of a colour coefficient, linear RGB. Gradients and Fisher information grow with
-the square of colours, summed over pixels. Up to this limit they stay within float32, and the sun is
-only about 1e5 times as bright as a surface that it lights."""
+"""Largest colour coefficient, linear RGB: sums of its squares over pixels stay within float32. The
+sun is about 1e5 times as bright as a surface that it lights."""
 
 LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
 """Parameters that are always learned, in the order of their columns in the Fisher information: 3K
-(K colour coefficients for each of r, g, b), 3, 4 and 1 columns. Means are learned on request
-(`learned`)."""
+(K coefficients for each of r, g, b), 3, 4 and 1. Means are learned on request (`learned`)."""
 
 ARRAYS = ("means", "log_scales", "quats", "logit_opacities", "sh")
 """Parameters of `Gaussians`: its fields that are arrays."""

@@ -39,8 +39,7 @@ UNKNOWN_DEPTH = 0xFFFF
 """Value of 16 bits with which depth cameras, as the Kinect, mark that they measured nothing."""
 
 PNG_LEVEL = 1
-"""zlib level, 1 to 9. Against Pillow's default of 6, a render of 0.56 Mpixel is as large and is
-written in 62 instead of 236 ms; a smooth photo of 3 Mpixel is 7 % larger."""
+"""zlib level, 1 to 9: files as large as by Pillow's 6, or 7 % larger, in a quarter of the time."""
 
 
 def around(mask: np.ndarray, margin: int) -> tuple[slice, ...]:
@@ -104,10 +103,7 @@ def unlimited_headers() -> Iterator[None]:
 
 
 def _open_image(path: Path, decode: bool = True) -> tuple[Any, bytes]:
-    """Pillow image, decoded or its header alone, and the bytes of its file.
-
-    Raises InputError if it is missing, unreadable, damaged, or too large.
-    """
+    """Pillow image, decoded or its header alone, and the bytes of its file. Raises InputError."""
     from PIL import Image, UnidentifiedImageError
 
     with reading(path, "image"):
@@ -208,7 +204,6 @@ def read_depth(path: str | Path, unit: float = 1e-3, float_unit: float = 1.0) ->
 
 
 def _depth_channel(path: Path) -> np.ndarray:
-    """Channel of an EXR that is its depth, float32 [H,W]. Raises InputError as `read_depth`."""
     channels = read_exr(path)
     depths = [name for name in channels if name.rpartition(".")[2].lower() in ("z", "depth")]
     if len(depths) == 1 or len(channels) == 1:
@@ -330,7 +325,6 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def _exr_size(path: Path) -> tuple[int, int]:
-    """Width and height in the header of an EXR file, pixels. Raises InputError as `image_size`."""
     import OpenEXR
 
     with reading(path, "EXR file"), path.open("rb") as opened:

@@ -1,7 +1,4 @@
-"""Steps of the loop at the model: capture views, fit to them, and sum their information.
-
-`learn` makes each `State` from the one before. No image of another view is ever read.
-"""
+"""Steps of the loop at the model: capture views, fit to them, and sum their information."""
 
 from __future__ import annotations
 

@@ -17,12 +17,10 @@ from mgs.errors import InputError
 Value = TypeVar("Value")
 
 IMAGE_BYTES = 1 << 30
-"""Most memory of arrays of one kind that are kept for reuse, bytes: 218 target images of 640x480,
-or five of 12 megapixels. Others are read or computed again at each use."""
+"""Most memory of arrays of one kind that are kept for reuse, bytes: 218 images of 640x480."""
 
 VIEW_BYTES = 1 << 29
-"""Most memory of the information of views about one model that are kept for several choices, bytes:
-122 views of 100,000 Gaussians. That of others is computed again for each choice."""
+"""Most memory of views' information about one model, bytes: 122 views of 100,000 Gaussians."""
 
 KEPT_BYTES = 1 << 29
 """Memory of a process, bytes, up to which what is freed is kept for reuse, which is faster."""
@@ -89,8 +87,7 @@ def decoding(path: Path) -> Iterator[None]:
 
 
 def _held(kind: int) -> float:
-    """Bytes of this process: 0, of its address space; 1, in memory. Infinity if the system does not
-    report them."""
+    """Bytes of this process: 0, its address space; 1, in memory. Infinity if unknown."""
     try:
         pages = Path("/proc/self/statm").read_text(encoding="ascii").split()
     except OSError:

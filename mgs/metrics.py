@@ -1,5 +1,4 @@
-"""Quality of a rendered view as an image (PSNR and SSIM of sRGB values) and as a surface (alpha and
-depth)."""
+"""Quality of a rendered view as an image (PSNR, SSIM of sRGB) and as a surface (alpha, depth)."""
 
 from __future__ import annotations
 
@@ -29,10 +28,8 @@ METRICS = (
     "psnr_corrected",
     "psnr_mask_corrected",
 )
-"""Metrics of `compare`, as in metrics.json; PSNR in dB. Over the whole image; `_mask`, over the
-rock's mask; `_inside`, over the pixels that the rock covers wholly, without its outline.
-`_corrected`: after the render is brought to the exposure and white balance of the truth
-(`colour_corrected`)."""
+"""Metrics of `compare`, as in metrics.json; PSNR in dB. `_mask`: over the rock's mask; `_inside`:
+over the pixels that the rock covers wholly; `_corrected`: after `colour_corrected`."""
 
 OPAQUE = 0.9
 """A pixel wholly on the rock is see-through if the model's alpha is below this."""
@@ -196,5 +193,4 @@ def compare_surface(
 
 
 def _mean(values: np.ndarray) -> float:
-    """Mean of the values, NaN if there are none."""
     return float(values.mean()) if values.size else math.nan

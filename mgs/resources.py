@@ -1,7 +1,4 @@
-"""Data files that come with mgs: the folders `scenes` and `plugins`.
-
-In an installed wheel they lie inside the package, in a checkout beside it.
-"""
+"""Data files that come with mgs: inside the package of a wheel, beside that of a checkout."""
 
 from __future__ import annotations
 

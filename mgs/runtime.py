@@ -1,12 +1,7 @@
 """Start of Dr.Jit and Mitsuba: find a usable libLLVM, then set Mitsuba's variant unless one is set.
 
-Everything in mgs that computes with Dr.Jit calls `start` first. On a processor Dr.Jit compiles
-kernels with the system's libLLVM. A version older than 19 aborts the process inside a kernel
-("Cannot select: fminimum") without an exception, so it is checked before any kernel runs.
-
-Up to `start` this module needs only Python's standard library: tools/setup.sh uses it before
-anything is installed.
-"""
+libLLVM older than 19 aborts the process inside a kernel without an exception, so it is checked
+before any kernel runs. tools/setup.sh uses this module before anything is installed."""
 
 from __future__ import annotations
 
@@ -28,8 +23,7 @@ VARIANT_VARIABLE = "MGS_VARIANT"
 """Environment variable that names another variant, such as cuda_ad_rgb for an NVIDIA GPU."""
 
 MIN_LLVM = 19
-"""Least major version of libLLVM. 14 and 15 cannot compile the minimum and maximum of floats; 19
-and 22 are known to work."""
+"""Least major version of libLLVM. 14 and 15 cannot compile the minimum and maximum of floats."""
 
 LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 """Environment variable from which Dr.Jit takes the path of libLLVM."""
@@ -115,10 +109,7 @@ def _candidates() -> list[str]:
 
 
 def _installed(folders: tuple[str, ...], pattern: str) -> list[str]:
-    """Real paths of the files in the folders that match the pattern, highest version first.
-
-    As in Dr.Jit, numbers within names are compared as numbers: 19 comes before 9.
-    """
+    """Real paths of files that match, highest version first; as in Dr.Jit, 19 comes before 9."""
     paths = [path for folder in folders for path in glob.glob(f"{folder}/{pattern}")]
 
     def version(path: str) -> list[tuple[int, int, str]]:
@@ -155,7 +146,6 @@ _checked: set[str] = set()
 
 
 def _set_variant(name: str) -> None:
-    """Set Mitsuba's variant. Raises InputError as `start`."""
     import drjit as dr
     import mitsuba as mi
 
@@ -176,7 +166,7 @@ def _set_variant(name: str) -> None:
 
 
 def _choose_libllvm() -> None:
-    """Point Dr.Jit to a usable libLLVM. Raises InputError as `find_libllvm`."""
+    """Point Dr.Jit to a usable libLLVM."""
     library = find_libllvm()
     if "/" in library.path:
         os.environ[LIBRARY_VARIABLE] = library.path
@@ -187,12 +177,8 @@ ORDER_OPTION = b"-enable-misched=false"
 
 
 def _keep_order() -> None:
-    """Keep LLVM's machine scheduler from reordering instructions; results do not change.
-
-    The kernels of `mgs.splat` are long straight code that finishes one pixel before the next needs
-    registers. The scheduler mixes pixels and spills registers: up to a seventh more instructions
-    (docs/splatting.md). A libLLVM without the option ignores it.
-    """
+    """Keep LLVM's machine scheduler from reordering instructions; results do not change. It would
+    spill registers: up to a seventh more instructions (docs/splatting.md)."""
     with contextlib.suppress(InputError, AttributeError, OSError):
         library = ctypes.CDLL(find_libllvm().path)
         arguments = (ctypes.c_char_p * 2)(b"mgs", ORDER_OPTION)
@@ -200,7 +186,6 @@ def _keep_order() -> None:
 
 
 def _check_libllvm() -> None:
-    """Raise InputError if Dr.Jit has loaded no libLLVM, or one that is too old."""
     import drjit as dr
 
     version = dr.detail.llvm_version()
@@ -217,7 +202,6 @@ def _check_libllvm() -> None:
 
 
 def _prepare_variant() -> None:
-    """Prepare the variant that is set. Raises InputError if it cannot run the kernels of mgs."""
     import drjit as dr
     import mitsuba as mi
 

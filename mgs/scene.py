@@ -1,8 +1,4 @@
-"""`Scene`, which stays fixed in a run, and `State`, which each step makes anew. Neither is mutated.
-
-A scene is frames, a surface, and how a model of them is fitted. A state is the views taken, the
-model fitted to them, and their Fisher information. No image of another view is ever read.
-"""
+"""`Scene`, which stays fixed in a run, and `State`, which each step makes anew."""
 
 from __future__ import annotations
 

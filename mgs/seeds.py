@@ -1,7 +1,4 @@
-"""Random numbers: each part of the program derives its own seed from the root seed of a run.
-
-A new part draws under a new name, so it changes the draws of no other.
-"""
+"""Random numbers: each part of the program derives its own seed from the run's, by name."""
 
 from __future__ import annotations
 

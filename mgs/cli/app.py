@@ -1,8 +1,4 @@
-"""The program `mgs`: its commands, and how they end.
-
-The files beside this one have the commands. A file is imported when its command is used, and a
-command imports what is slow to import when it is called.
-"""
+"""The program `mgs`: its commands, and how they end. A command is imported when it is used."""
 
 from __future__ import annotations
 
@@ -74,7 +70,6 @@ class _Command(TyperCommand):
     keys: Sequence[Row] = ()
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print the help of the command."""
         super().format_help(ctx, formatter)
         if self.keys:
             from mgs.cli.printing import settings_table
@@ -110,7 +105,6 @@ class _Program(TyperGroup):
         self.commands: Any = _Commands()
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print the help of the program."""
         self.commands = {name: TyperCommand(name, help=row[1]) for name, row in COMMANDS.items()}
         super().format_help(ctx, formatter)
 
@@ -119,7 +113,6 @@ app = typer.Typer(name="mgs", cls=_Program, add_completion=False, pretty_excepti
 
 
 def _print_version(on: bool) -> None:
-    """Callback of --version."""
     if on:
         from mgs.cli.terminal import echo
 
@@ -179,7 +172,6 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _print_warning(message: Any, category: type, filename: str, line: int, *_: Any) -> None:
-    """Print a Notice as one line of ours, other warnings as Python does."""
     text = f"mgs: {printable(str(message))}\n" if category is Notice else None
     sys.stderr.write(text or warnings.formatwarning(message, category, filename, line))
 
@@ -204,8 +196,7 @@ def _hint(arguments: Sequence[str]) -> str:
 
 
 def _system_error(error: OSError) -> str:
-    """Line for an error of the system. If the standard output failed, what it still buffers is
-    dropped, so that Python does not fail again at its end."""
+    """Line for an error of the system. What a failed standard output still buffers is dropped."""
     name = str(error.filename or "standard output")
     if error.filename is None:
         with contextlib.suppress(OSError, ValueError):

@@ -39,7 +39,6 @@ def doctor() -> None:
 
 
 def _software() -> list[Row]:
-    """Python and packages."""
     rows = []
     for name, version in versions().items():
         mend = "install mgs again (`make setup`, or `pip install .`)"
@@ -61,7 +60,6 @@ def _software() -> list[Row]:
 
 
 def _machine() -> list[Row]:
-    """Processor, memory, variant and, for one of LLVM, libLLVM."""
     gib = 1024**3 / os.sysconf("SC_PAGE_SIZE")
     total, free = os.sysconf("SC_PHYS_PAGES") / gib, os.sysconf("SC_AVPHYS_PAGES") / gib
     memory = f"{total:.1f} GiB, {free:.1f} GiB free"
@@ -82,7 +80,6 @@ def _machine() -> list[Row]:
 
 
 def _resources() -> list[Row]:
-    """Folders of data files that come with mgs."""
     rows = []
     for name, pattern in (("scenes", "*.toml"), ("plugins", "*.py")):
         try:

@@ -165,7 +165,6 @@ def import_data(
 
 
 def _points(cloud: SparseCloud) -> str:
-    """Number of points, and their reprojection error if known."""
     text = f"{len(cloud.points):,} points"
     if cloud.error is None or cloud.track is None:
         return text
@@ -174,7 +173,6 @@ def _points(cloud: SparseCloud) -> str:
 
 
 def _advice(source: Source, result: Dataset) -> Iterator[str]:
-    """Lines on what the user should know or may want to do."""
     from mgs.images import exif_exposure
 
     if source.no_cloud:
@@ -212,7 +210,6 @@ def _advice(source: Source, result: Dataset) -> Iterator[str]:
 def _print_summary(
     console: Terminal, source: Source, tests: Source | None, result: Dataset, more: str
 ) -> None:
-    """Print what was imported of what was listed, and in which world."""
     frames, apart = result.frames, len(tests.shots) if tests else 0
     total = len(source.shots) + source.left_out.total()
     without = ", ".join(f"{count} {reason}" for reason, count in source.left_out.items())

@@ -167,7 +167,6 @@ def simplify(
 
 
 def _pruned(result: PrunedRun, noise: float) -> list[str]:
-    """Describe a pruned run."""
     share = 1 - result.after / result.before
     lines = [
         f"{result.before:,} Gaussians, {result.after:,} stay: {share:.0%} are left out",
@@ -183,7 +182,6 @@ def _pruned(result: PrunedRun, noise: float) -> list[str]:
 
 
 def _refitted(result: RefittedRun) -> list[str]:
-    """Describe a refitted run."""
     model, left_out = result.lean, result.lean.left_out
     share = model.parameters / result.before
     shares = ", ".join(f"{kind} {mask.mean():.0%}" for kind, mask in model.learned.items())

@@ -69,7 +69,6 @@ def print_quality(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _heading(key: str, new: bool) -> str:
-    """Heading of a column: metric and set of views. new: some views were held out."""
     views, _, metric = key.partition(".")
     if not metric:
         return {"coverage": "cover", "images": "n"}[key]

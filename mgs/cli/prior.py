@@ -26,8 +26,7 @@ FILES = ("prior.json", "mesh.ply", "points.ply", "prior.png")
 """Names in a folder of this command."""
 
 OUTLINE = 0.05
-"""Disagreement of the outlines of mesh and masks, share of the covered pixels, beyond which a line
-says so."""
+"""Disagreement of the outlines of mesh and masks, share of pixels, beyond which a line says so."""
 
 WHY = {
     "depth": ": the dataset has depth images",
@@ -207,7 +206,6 @@ def _built(
 
 
 def _table(numbers: dict[str, Any]) -> Table:
-    """Table of the numbers of prior.json."""
     table = Table("step", "number", title="Mesh prior")
     resolution, unit = numbers.get("resolution", {}), numbers["unit"]
     shown = numbers | numbers.get("truth", {}) | {"up": _up(numbers)}
@@ -229,7 +227,6 @@ def _table(numbers: dict[str, Any]) -> Table:
 
 
 def _up(numbers: dict[str, Any]) -> str:
-    """The up vector, and its angle from the ground plane's normal, if any."""
     from mgs.data.world import degrees_between, unit_up
 
     up = unit_up(numbers["up"])

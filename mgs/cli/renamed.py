@@ -16,8 +16,7 @@ NBV = ["nearest", "travel", "stop_gain", "stop_uncertainty", "stop_psnr", "train
 NBV += ["warm_passes", "train.means", "sh", "exposure=true", "estimator", "lam", "evaluate_every"]
 NBV += ["capture.timeout", "capture.tries", "capture.failure", "capture.distance"]
 SUGGEST = ["ring", "grid", "radius", "elevations", "safe_distance"]
-"""Settings that were options: the table of one that took KIND=NUMBER ends with a dot, and one that
-took no value has it."""
+"""Settings that were options. Ends with a dot: took KIND=NUMBER. With a value: took none."""
 
 OTHERS = {
     "flight.length": "--flight-length",
@@ -33,7 +32,6 @@ OTHERS = {
 
 
 def _old(keys: Iterable[str]) -> dict[str, str]:
-    """Old options of settings -> the settings."""
     last = {key: key.partition("=")[0].strip(".").rpartition(".")[2] for key in keys}
     return {OTHERS.get(key, f"--{word.replace('_', '-')}"): key for key, word in last.items()}
 
@@ -46,8 +44,7 @@ OPTIONS = {
     "prior": SEED | {"--from": "--source"},
     **dict.fromkeys(("synth-orbit", "survey", "demo"), SEED),
 }
-"""Command -> its old options -> what replaces them: an option, a setting of --set, its table where
-the value was KIND=NUMBER, or a setting with its value where there was none."""
+"""Command -> its old options -> an option or a setting, of the forms above, that replaces them."""
 
 
 COMMANDS = {"prune": ["simplify"], "refit": ["simplify", "--method", "refit"]}

@@ -46,7 +46,6 @@ def report(
 
 
 def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
-    """Write the figures and the table, and print the table."""
     from mgs.reports.runs import compare_runs
     from mgs.reports.tables import comparison_rows
     from mgs.reports.writing import report as compared_in
@@ -72,7 +71,6 @@ def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
 
 
 def _write_page(runs: list[Path], html: Path) -> None:
-    """Write the page, and print its size."""
     from mgs.reports.page import write_page
 
     with progress_bar() as bar:

@@ -94,7 +94,6 @@ def _export_compact(
     shared: bool,
     force: bool,
 ) -> None:
-    """Write the model of each run in the format mgs."""
     from mgs import runtime
     from mgs.reports.compacting import compact_run
     from mgs.run.folder import open_run
@@ -125,7 +124,6 @@ def _bytes(text: str) -> int:
 
 
 def _export_views(runs: list[Path], kind: str, out: Path | None, every: bool, force: bool) -> None:
-    """Write the views of each run as a folder. Raises InputError as `check_new_folder`."""
     from mgs.reports.chosen_views import NAMES, write_views
     from mgs.run.folder import open_run
 
@@ -139,8 +137,7 @@ def _export_views(runs: list[Path], kind: str, out: Path | None, every: bool, fo
 
 
 def _in_srgb(model: Path, linear: Gaussians) -> Gaussians:
-    """Gaussians of a linear model, of this file or run folder, for sRGB blending. Prints what that
-    costs."""
+    """Gaussians of a linear model for sRGB blending; prints what that costs."""
     from mgs.reports.evaluation import compare_models
     from mgs.reports.exporting import as_imported, in_srgb, refit_in_srgb
     from mgs.run.folder import open_run
@@ -167,8 +164,7 @@ def _in_srgb(model: Path, linear: Gaussians) -> Gaussians:
 def _targets(
     sources: list[Path], defaults: list[Path], out: Path | None, force: bool
 ) -> list[tuple[Path, Path]]:
-    """Pairs of what is read and the file to write. Raises InputError as `check_new_file`, and where
-    one --out is given for several."""
+    """Pairs of what is read and the file to write."""
     if out is not None and len(sources) > 1:
         raise InputError(f"--out {out}: is one file for {len(sources)}; leave it out")
     targets = [out] if out is not None else defaults

@@ -178,7 +178,6 @@ def suggest(
 
 
 def _placed(photographs: Path, site: Path, console: Terminal) -> Path:
-    """Dataset of photographs alone, in the folder `site`."""
     from mgs.data.on_site import dataset_at
 
     with progress_bar("reading", console) as progress, listening(progress):
@@ -285,7 +284,6 @@ def _write_plan(path: Path, run: Run, result: Suggestion, place: Any, limits: Fl
 
 
 def _print(console: Terminal, result: Suggestion, run: Run, crossed: str, place: Any) -> None:
-    """Print what was dropped, the views as a table, and the flight."""
     from mgs.data.flight_plan import Stop
     from mgs.policy.criteria import GAIN_UNIT
 

@@ -67,7 +67,6 @@ def survey(
 
 
 def _table(numbers: dict[str, Any]) -> Table:
-    """Table of the numbers of survey.json."""
     from mgs.survey.flight import STAGES
 
     rows = {

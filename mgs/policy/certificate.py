@@ -1,14 +1,10 @@
 """Upper bounds for the best k of C candidate views. Pure NumPy, float64 (docs/certificate.md).
 
-Weights x between 0 and 1 relax the choice of views (Joshi and Boyd 2009). A criterion f is concave
-in them (`mgs.policy.relaxation`), so its tangent at any x bounds every set S of k:
+A criterion f is concave in weights x of the views, so its tangent at any x bounds every set S of k:
 
     f(S) <= f(x) + max over sets T of k of  grad f(x)^T (1_T - x)
 
-The maximum takes the k largest entries of the gradient, the prices of the views. `upper_bound`
-looks for the x whose bound is least. A bad x makes the bound loose, never wrong. `best_set` closes
-the rest of the gap by branch and bound.
-"""
+The maximum takes the k largest entries of the gradient, the prices of the views."""
 
 from __future__ import annotations
 
@@ -172,8 +168,7 @@ def _moved(x: Floats, lo: Floats, hi: Floats, k: int) -> Floats:
 def _fixed(
     bound: Bound, lo: Floats, hi: Floats, k: int, enough: float
 ) -> tuple[Floats, Floats, float]:
-    """lo and hi with the views fixed whose other choice has a bound of at most `enough`; and the
-    largest of these bounds."""
+    """Fix the views whose other choice has a bound of at most `enough`; also the largest bound."""
     free = np.flatnonzero(hi > lo)
     order = free[np.argsort(-bound.prices[free], kind="stable")]
     room, lo, hi, ceiling = k - int(lo.sum()), lo.copy(), hi.copy(), 0.0

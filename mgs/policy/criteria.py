@@ -1,9 +1,5 @@
-"""Criteria: scores of a view from Fisher information alone. Pure NumPy functions in one table.
-
-Notation, after the paper's Eq. 7 and POp-GS: H [N,P] is the diagonal of J^T J summed over the
-training views, F [N,P] that of one candidate, lam [P] the regularisation (`regularisation`), and
-l = N P the number of parameters.
-"""
+"""Criteria: scores of a view from Fisher information alone (docs/nbv.md). H [N,P] is the diagonal
+of J^T J summed over the training views, F [N,P] that of a candidate, lam [P] the regularisation."""
 
 from __future__ import annotations
 
@@ -21,26 +17,20 @@ PIXEL_NOISE = 0.02
 """sigma_e, standard deviation of a pixel's residual, linear RGB (34 dB). A chosen constant."""
 
 PRUNE_NOISE = PIXEL_NOISE / 5
-"""Root mean square change of pixel values that `mgs simplify` may make, linear RGB. It costs about
-0.1 dB (docs/parsimony.md). A chosen constant."""
+"""Change of pixel values that `mgs simplify` may make, rms, linear RGB: about 0.1 dB. Chosen."""
 
 DIRECTIONAL_STD = 0.03
-"""tau of colour coefficients of degrees above 0, where degree 0 has 1 (`PRIOR_STD`). Small, because
-a rock looks almost the same from all sides. A chosen constant (docs/parsimony.md)."""
+"""tau of colours of degrees above 0: rocks look alike from all sides. A chosen constant."""
 
 LEARN_LOSS = 0.05
-"""Increase of the fit's objective, dB, that a refit may cause by leaving out parameters. On
-held-out views the loss is one to two times that (docs/parsimony.md). A chosen constant."""
+"""Increase of the objective, dB, that a refit may cause (docs/parsimony.md). A chosen constant."""
 
 PRIOR_STD = {"colour": 1.0, "scale": 0.125, "rotation": 0.0625, "opacity": 2.0}
-"""tau: standard deviation of each parameter around its start before any image, in its own unit.
-
-colour: 0.28 linear RGB. scale: 13 %. rotation: 7 degrees. Both are small, as the mesh gives size
-and orientation: with a larger tau, Gaussians grow into needles (docs/fit.md)."""
+"""tau: standard deviation of each parameter around its start, in its own unit. Those of scale and
+rotation (7 degrees) are small: with larger ones, Gaussians grow into needles (docs/fit.md)."""
 
 MEAN_STD = 0.5
-"""tau of learned means, as a multiple of the spacing of the prior's samples. A chosen constant.
-`mgs nbv` multiplies it by the spacing, so `prior_std` is in metres."""
+"""tau of learned means over the spacing of the samples, metres in `prior_std`. Chosen."""
 
 GAIN_UNIT = "½ nat per parameter"
 """Unit of `d_optimal` with the lambda of `regularisation`: 2/l times mutual information in nats."""

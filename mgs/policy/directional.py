@@ -1,29 +1,13 @@
-"""Directional optimality: what a view says about the surface's colour in every direction. Pure
-NumPy, float64. Runs use `mgs.policy.pool_gains`, which is faster and tested against this module.
+"""Directional optimality (docs/nbv.md) in plain NumPy; `mgs.policy.pool_gains` is its fast twin.
 
-The fit gives each Gaussian one colour, but real colours depend on the direction: relief smaller
-than a Gaussian shades and hides parts of it. So these criteria give each Gaussian j of the prior's
-surface a colour sum_k c_k y_k(d) along the direction d, with real spherical harmonics y of degree
-L, K = (L + 1)^2 coefficients per channel. They measure how well the views determine the
-coefficients c. Before any image these are independent, with standard deviation tau_0 for degree 0
-and tau tau_0 for higher degrees. No image and no fit is needed.
-
-W_vj: squared blending weights of Gaussian j in view v, summed over its pixels. y_vj: y of the
-direction from v to j. The view adds W_vj y_vj y_vj^T to the information. The posterior covariance
-of one channel's coefficients is sigma_e^2 S_j with
+The prior's Gaussian j has the colour sum_k c_k y_k(d) along d, with K = (L + 1)^2 spherical
+harmonics y. W_vj: its squared blending weights in view v, y_vj: y of the direction from v to j.
 
     S_j = (Lambda + sum over the views taken of W_vj y_vj y_vj^T)^-1
-    Lambda = diag(sigma_e^2 / tau_l^2)
+    D:  3/2 sum_j log(1 + W_cj y_cj^T S_j y_cj)  nats, three channels being equal
+    I:  sum_j W_cj (S_j y_cj)^T M_j (S_j y_cj) / (1 + W_cj y_cj^T S_j y_cj)  in sigma_e^2
 
-A candidate c changes S_j by a matrix of rank one, which gives its gains in closed form (matrix
-determinant lemma, Sherman-Morrison formula):
-
-- D, information about the coefficients, in nats, three channels being equal:
-  3/2 sum_j log(1 + W_cj y_cj^T S_j y_cj)
-- I, decrease of the predicted variance of the colours in a dome of poses around the object, for one
-  channel, in units of sigma_e^2. With M_j = sum over the dome of W_vj y_vj y_vj^T it is
-  sum_j W_cj (S_j y_cj)^T M_j (S_j y_cj) / (1 + W_cj y_cj^T S_j y_cj)
-"""
+with M_j = sum over the dome of W_vj y_vj y_vj^T, by the Sherman-Morrison formula."""
 
 from __future__ import annotations
 
@@ -154,7 +138,6 @@ def in_parts(count: int, part: Callable[[slice], Result]) -> list[Result]:
 def _gains(
     points: Array, prior: Array, degree: int, taken: Views, candidates: Views, dome: Views | None
 ) -> NDArray[np.float64]:
-    """`gains` of some of the Gaussians. prior: Lambda [K,K]."""
     S = np.linalg.inv(prior + information(points, taken, degree))
     y, W = basis(points, candidates, degree), candidates.seen.T.astype(np.float64)
     Sy = y @ S

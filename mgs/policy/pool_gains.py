@@ -1,21 +1,15 @@
 """Gains of `mgs.policy.directional` for a pool of poses, updated when a view is taken.
 
-With the symbols of that module, two numbers are kept for each pose c and Gaussian j that it sees:
-g = y_c^T S_j y_c, and for I-optimality q = y_c^T S_j M_j S_j y_c. The gains are then
-3/2 log(1 + W g) nats, and W q / (1 + W g). Let a new view see j along y with the squared weights W,
-and let u = S_j y, w = S_j M_j u and k = W / (1 + W y^T u). By the Sherman-Morrison formula
+Kept are g = y_c^T S_j y_c and q = y_c^T S_j M_j S_j y_c of each pose c and Gaussian j that it sees.
+The gains are 3/2 log(1 + W g) nats, and W q / (1 + W g). A new view sees j along y with squared
+weights W. By the Sherman-Morrison formula, with u = S_j y, w = S_j M_j u, k = W / (1 + W y^T u):
 
     S_j changes by -k u u^T
     g changes by -k (u^T y_c)^2
     q changes by -2 k (u^T y_c) (w^T y_c) + k^2 (y^T w) (u^T y_c)^2
 
-so a choice costs two dot products for each pose and Gaussian, and no matrix is inverted. All is
-float64, because variances fall by many orders of magnitude. Each number is written by one lane, so
-results depend on the views and their order only, and a resumed run has the same bits.
-
-Memory traffic dominates. So the upper triangle alone is kept of each matrix, as one array [N] for
-each entry: one kernel reads S and M once, and writes S once.
-"""
+All is float64: variances fall by many orders of magnitude. Each number is written by one lane, so a
+resumed run has the same bits. Of a matrix the upper triangle is kept, an array [N] an entry."""
 
 from __future__ import annotations
 
@@ -34,8 +28,7 @@ from mgs.policy.directional import Views, in_parts, information, of_points, prec
 from mgs.splat.recording import one_at_a_time
 
 BYTES_OF_ENTRY, BYTES_OF_PAIR = 16, 40
-"""Bytes of one entry of both matrices for a Gaussian, and of a pair of a pose and a Gaussian. S, g
-and q exist twice during an update."""
+"""Bytes of an entry of both matrices, and of a pair of pose and Gaussian."""
 
 
 def fits(points: Array, pool: Views, degree: int) -> bool:
@@ -135,8 +128,7 @@ class PoolGains:
         self._update(u, w, k, both)
 
     def _update(self, u: Any, w: Any, k: Any, both: Any) -> None:
-        """Update g and q. u, w: [N*K]; k: [N], 0 where the view misses a Gaussian; both: k^2 y^T w
-        [N]."""
+        """Update g and q. u, w: [N*K]; k: [N], 0 where the view misses it; both: k^2 y^T w [N]."""
 
         def change(k_of: Any, g: Any, q: Any) -> Any:
             y = self._harmonics(self.of, self.by)
@@ -182,7 +174,6 @@ def _times(matrix: list[Any], vector: list[Any]) -> list[Any]:
 
 
 def _interleaved(vector: list[Any]) -> Any:
-    """Interleave K arrays [N] as one [N*K]."""
     n, K = len(vector[0]), len(vector)
     packed, first = dr.zeros(mi.Float64, n * K), dr.arange(mi.UInt32, n) * K
     for b, values in enumerate(vector):

@@ -35,8 +35,7 @@ TOLERANCE = 1e-3
 """Gap at which `upper_bound` stops, as a share of the bound."""
 
 STEPS, EXCHANGES, CUTS = 30, 3000, 300
-"""Most Newton steps of a bound, exchanges of weight in each, and cutting planes. Chosen
-constants."""
+"""Most Newton steps of a bound, exchanges of weight in each, and cutting planes. Chosen."""
 
 SUFFICIENT = 1e-3
 """Least share of the predicted ascent that a step of the line search must reach."""
@@ -195,7 +194,6 @@ class Relaxation:
         return x
 
     def _at(self, x: Floats, some: slice) -> tuple[Floats, Floats]:
-        """z and A(x)."""
         z = self.vectors(some)
         return z, self.base[some] + (z * x[:, None]).transpose(0, 2, 1) @ z
 
@@ -226,11 +224,8 @@ def _largest(prices: Floats, lo: Floats, hi: Floats, k: int) -> Floats:
 
 
 def _newton_step(H: Floats, slope: Floats, x: Floats, lo: Floats, hi: Floats) -> Floats:
-    """Maximise slope^T d - d^T H d / 2 for x + d in the box and sum d = 0.
-
-    Exchanges weight between the pair of views that gains most, again and again, as solvers of
-    support vector machines do. H: [C,C].
-    """
+    """Maximise slope^T d - d^T H d / 2 for x + d in the box and sum d = 0, H [C,C], by exchanges of
+    weight between the pair of views that gains most, as solvers of support vector machines do."""
     y, g, diagonal = np.array(x), np.array(slope), np.diagonal(H)
     small = 1e-9 * float(np.abs(slope).max())
     least = 1e-9 * float(diagonal.max()) + small  # a flat direction is followed to the box

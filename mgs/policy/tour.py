@@ -1,11 +1,6 @@
-"""Tours of a flight: lengths of legs, 2-opt, and plans within a limit. Pure NumPy.
+"""Tours of a flight: lengths of legs, 2-opt, and plans within a limit. Metres.
 
-A tour is a list of poses, the indices of rows of a matrix of legs. Its two ends stay where they
-are: where the camera is, and its home. Positions are in metres, with +Z up.
-
-A plan grows by cost-benefit greedy insertion (`grown`). Where the gain of a set of views is known
-without a fit, it is then improved by ruin and recreate (`planned_tour`).
-"""
+A tour is a list of poses, indices of rows of a matrix of legs. Its two ends stay where they are."""
 
 from __future__ import annotations
 
@@ -59,8 +54,7 @@ def legs(positions: Array, axis: Array, radius: float = 0.0) -> NDArray[np.float
 
 
 def _around(level: Array, out: Array, clear: Array) -> tuple[Array, Array]:
-    """Sum of both tangents to the circle, metres, and the arc between them, radians [V,V]; the arc
-    is 0 where the straight leg is free. level: [V,2] from the axis. out: its length [V]."""
+    """Both tangents to the circle, metres, and the arc between them, radians [V,V]; else 0."""
     radii = np.stack(np.broadcast_arrays(out[:, None], out[None]))
     safe = np.maximum(radii, 1e-12)
     cosine = np.clip((level @ level.T) / (safe[0] * safe[1]), -1, 1)

@@ -94,8 +94,6 @@ class Visibility:
     def _planned(
         self, taken: tuple[int, ...], candidates: tuple[int, ...], count: int, model: Model
     ) -> Sequence[int]:
-        """Candidates to take next, as a set of at most `count` (`planned_views`); all where there
-        are no `plan_gains`."""
         state = self.plan_gains(model) if count < len(candidates) else None
         if state is None:
             return candidates
@@ -110,9 +108,6 @@ class Visibility:
         nearest: int,
         model: Model,
     ) -> list[int]:
-        """At most `count` candidates to take next, in order, each among the `nearest` to the one
-        before (`planned_path`); none where there are no `plan_gains`."""
-
         def reach(views: Sequence[int]) -> list[int]:
             rest = [i for i in candidates if i not in views]
             near = nearest_poses(self.positions[rest], self.positions[views[-1]], nearest)
@@ -138,11 +133,9 @@ class Visibility:
         return PoolGains(self.points[some], pool, self.lam, degree, tau, dome)
 
     def _seen(self, frame: int) -> Array:
-        """Squared blending weights of the Gaussians in one view [N]."""
         return squared_weights(self.exact(self.cameras[frame]))
 
     def _pool(self) -> Views:
-        """All cameras of the run, and what they see."""
         seen = []
         for frame in range(len(self.cameras)):
             self.progress(frame, len(self.cameras))
@@ -150,7 +143,6 @@ class Visibility:
         return Views(self.positions, np.stack(seen))
 
     def _dome(self) -> Views:
-        """A dome of cameras around the rock, and what they see."""
         cameras = dome_cameras(self.cameras[0], self.positions, self.centre)
         seen = np.stack([squared_weights(self.exact(camera)) for camera in cameras])
         return Views(np.array([camera.position for camera in cameras]), seen)

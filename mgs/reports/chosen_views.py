@@ -62,8 +62,7 @@ def _points(gaussians: Gaussians) -> np.ndarray:
 
 
 def _copied(out: Path, frame: Frame, mask: str) -> Frame:
-    """Copy the image of a frame and write its mask; return the frame with these files. mask: ending
-    of the mask's name, beside that of the image."""
+    """Copy the image of a frame and write its mask with this ending; return the new frame."""
     image = out / "images" / f"{frame.name}{frame.image_path.suffix}"
     copy_file(frame.image_path, image)
     frame = replace(frame, on_demand=False, image_path=image, depth_path=None)
@@ -75,7 +74,6 @@ def _copied(out: Path, frame: Frame, mask: str) -> Frame:
 
 
 def _write_nerfstudio(out: Path, frames: Sequence[Frame], points: np.ndarray, world: World) -> None:
-    """transforms.json, images, masks, depth in 16 bits, and points.ply."""
     deepest = max((frame.depth().max() for frame in frames if frame.depth_path), default=0.0)
     step = max(STEP, float(deepest) / (2**16 - 1))
     copies = []
@@ -93,8 +91,6 @@ def _write_nerfstudio(out: Path, frames: Sequence[Frame], points: np.ndarray, wo
 
 
 def _write_colmap(out: Path, frames: Sequence[Frame], points: np.ndarray, world: World) -> None:
-    """images, masks/NAME.png.png, and sparse/0 as text: pinhole cameras, poses, points."""
-
     def numbers(*values: float) -> str:
         return " ".join(repr(float(value)) for value in values)
 

@@ -27,8 +27,7 @@ VIEWS = 16
 """Most views, evenly spread over those taken, in which errors are weighed."""
 
 NOISES = (PRUNE_NOISE, 4 * PRUNE_NOISE)
-"""Changes of the views taken that pruning may make (`mgs.fit.pruning.prune`) where positions are
-sent, since each Gaussian then costs a byte or more. The one with the better model is taken."""
+"""Changes by pruning where positions are sent, of which the best is taken."""
 
 
 @dataclass(frozen=True)
@@ -142,8 +141,8 @@ def _slope(linear: np.ndarray) -> np.ndarray:
 def _fitted(
     encoder: Encoder, size: int | None, enough: Callable[[Gaussians], bool] | None
 ) -> Compact | None:
-    """File of the finest steps that fit into `size` bytes, or the coarsest that give `enough`; None
-    if there is none. Too small a size is filled with the first packets."""
+    """File of the finest steps that fit into `size` bytes, or the coarsest that give `enough`, or
+    None. Too small a size is filled with the first packets."""
     low, high = np.log(SCALES)
     for _ in range(HALVINGS):
         middle = (low + high) / 2

@@ -1,19 +1,5 @@
-"""Maps of what the training views of a run say about its model: for views (EXR, PNG) and for
-Gaussians (PLY).
-
-H [N,P] is the diagonal of the Fisher information, summed over the training views; lam [P] is that
-of the prior (`mgs.policy.criteria.regularisation`). Every Gaussian has these scalars:
-
-- `fisher.colour`, `fisher.scale`, `fisher.rotation`, `fisher.opacity`, and `fisher.mean` if the run
-  learns means: sum of H over its parameters of that kind, in (pixel value / parameter)^2.
-- `information`: 1/2 sum_k log(1 + H_k / lam_k) over its parameters k, nats.
-- `uncertainty`: mean over its parameters of lam_k / (H_k + lam_k), the variance that is left over
-  the variance of the prior: 1 if nothing is known, 0 if everything is.
-- `unobserved`: 1 if no training view sees its place on the surface, else 0
-  (`mgs.policy.criteria.observed` of the Gaussians before training).
-
-A map of a scalar v is sum w v / sum w in each pixel, with blending weights w; 0 where none is.
-"""
+"""Maps of what the training views of a run say about its model (docs/evaluation.md), in views (EXR,
+PNG) and of Gaussians (PLY). A map of a scalar is its mean in each pixel by blending weights."""
 
 from __future__ import annotations
 
@@ -47,11 +33,10 @@ DECADES = 4
 
 
 def run_scalars(run: Run) -> dict[str, np.ndarray]:
-    """The scalars of the module's docstring of the model of a run, name -> [N].
+    """Scalars of the model of a run (docs/evaluation.md), name -> [N].
 
-    H is about the fitted model, by the run's estimator. What is observed is judged by the exact
-    information about the Gaussians before training, [S,P], which are on the surface.
-    """
+    H is about the fitted model, by the run's estimator. `unobserved` is of the Gaussians before
+    training."""
     from mgs.splat import groups
 
     H, settings, degree = run.state.H, run.settings, run.state.gaussians.sh_degree
@@ -188,9 +173,7 @@ def show_map(
 
 
 def _norm(channel: str, data: np.ndarray) -> Any:
-    """Colour scale of a channel: logarithmic for Fisher information, which spans many powers of
-    ten; from 0 to 1 for `uncertainty` and `unobserved`; else from the least to about the largest of
-    the visible values [M]."""
+    """Colour scale of a channel with visible values [M]."""
     from matplotlib.colors import LogNorm, Normalize
 
     if channel in ("uncertainty", "unobserved") or len(data) == 0:

@@ -89,8 +89,7 @@ def drawn_test_view(run: Run, model: Gaussians) -> tuple[Path, float]:
 
 
 def _informed(run: Run) -> dict[str, dict[str, int]]:
-    """Number of parameters by kind ("of"), and number of those about which the views say more than
-    the prior ("informed", H > lambda)."""
+    """Parameters by kind ("of"), and those with H > lambda ("informed")."""
     from mgs.splat import groups
 
     state, settings = run.state, run.settings

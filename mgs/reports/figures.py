@@ -1,8 +1,5 @@
-"""Figures of reports: each function takes plain data and writes one file, a PNG, PDF or SVG.
-
-A label is what a report calls a run: its policy, and its folder if several runs have the same
-policy. Every function raises InputError if its file cannot be written.
-"""
+"""Figures of reports: each function takes plain data and writes one file, a PNG, PDF or SVG. Raises
+InputError if it cannot be written. A label is what a report calls a run."""
 
 from __future__ import annotations
 
@@ -28,8 +25,7 @@ STYLES: tuple[tuple[str, str | tuple[int, int, int]], ...] = (
     ("#009E73", "^"), ("#8888ee", "H"), ("#553355", (6, 1, 0)), ("#bbbb77", (4, 1, 0)),
     ("#7755dd", "8"), ("#8c510a", "*"), ("#000000", "X"),
 )  # fmt: skip
-"""Colours and markers of lines. Seven colours are those of Okabe and Ito. The others were chosen so
-that colour-blind readers can tell all of them apart."""
+"""Colours and markers of lines, all of which colour-blind readers can tell apart."""
 
 POLICY_STYLE = dict(zip(POLICIES, STYLES, strict=False))
 """Style of each policy, the same in every figure."""
@@ -128,7 +124,6 @@ def draw_cameras(
 
 
 def _draw_length(axis: Axes, unit: str) -> None:
-    """Draw a bar of a round length into the lower left corner of axes."""
     from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
     longest = float(np.ptp(axis.get_xlim())) / 4
@@ -214,5 +209,4 @@ def comparison_figure(
 
 
 def _in_lines(text: str) -> str:
-    """Wrap text to lines that fit above one column."""
     return "\n".join(textwrap.wrap(literal(text), 34))

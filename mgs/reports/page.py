@@ -1,9 +1,4 @@
-"""The report as one HTML page that opens from the disk and loads nothing: `mgs report --html`.
-
-Everything is taken from the files of the runs and of their dataset. Only pictures are drawn, of the
-models that the run folders hold. A run may be unfinished or not measured; the page says what is
-missing.
-"""
+"""The report as one HTML page that opens from the disk and loads nothing: `mgs report --html`."""
 
 from __future__ import annotations
 
@@ -146,13 +141,11 @@ def compared_frames(runs: Sequence[Run]) -> list[Frame]:
 
 
 def _spread(frames: Sequence[Frame]) -> list[Frame]:
-    """Up to COMPARED of the frames, spread evenly."""
     count = min(COMPARED, len(frames))
     return [frames[i * len(frames) // count] for i in range(count)]
 
 
 def _section(label: str, run: Run) -> dict[str, Any]:
-    """Section of one run: its views in the order they were taken, orbit, and times."""
     return {
         "label": label,
         "views": [_view(label, run, k, frame) for k, frame in enumerate(run.taken)],
@@ -162,8 +155,7 @@ def _section(label: str, run: Run) -> dict[str, Any]:
 
 
 def _view(label: str, run: Run, k: int, frame: Frame) -> dict[str, Any]:
-    """The k-th view that a run took: facts, pictures (names in the album, captions, alternative
-    texts), and the position of its camera in the plot."""
+    """Facts, pictures (name in the album, caption, alternative text) of the k-th view taken."""
     seeds, view, quality = run.settings.seeds, frame.name, psnr_of(run, frame.name)
     step = run.steps[max(0, k - seeds + 1)]
     role = f"seed {k + 1} of {seeds}" if k < seeds else f"step {step['step']}"
@@ -190,7 +182,6 @@ def _view(label: str, run: Run, k: int, frame: Frame) -> dict[str, Any]:
 
 
 def _compared(runs: Mapping[str, Run], frame: Frame) -> dict[str, Any]:
-    """Pictures for either side of the divider at a view: the truth, and the renders of all runs."""
     view = frame.name
     sides = [{"label": "truth", "name": f"truth/{view}", "alt": f"Truth at {view}."}]
     for label, run in runs.items():
@@ -203,8 +194,6 @@ def _compared(runs: Mapping[str, Run], frame: Frame) -> dict[str, Any]:
 
 
 def _plots(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
-    """Plots that compare runs: the paper's figures, and every metric that was measured after steps
-    or of views."""
     gain, covered = step_curves(runs, "information_gain"), step_curves(runs, "coverage", 100)
     added = {
         label: (x[1:], [b - a for a, b in pairwise(y)])
@@ -242,7 +231,6 @@ def _plots(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
 
 
 def _fill_in(**values: Any) -> str:
-    """Fill in the template beside this file."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
     from plotly.offline import get_plotlyjs

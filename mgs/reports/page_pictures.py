@@ -1,9 +1,4 @@
-"""Pictures of the report page: truth, render, error and uncertainty of views, small enough for a
-page.
-
-They show the model that a run folder holds now; a run keeps none of earlier steps. The maps of
-uncertainty are by the exact Fisher information, at that model, of the views taken until then.
-"""
+"""Pictures of the report page: truth, render, error and uncertainty of views, of the last model."""
 
 from __future__ import annotations
 
@@ -22,8 +17,7 @@ from mgs.reports.diagnostics import VISIBLE, view_maps
 from mgs.run.folder import Run
 
 PIXELS = 40e6
-"""Most pixels of all pictures of a page together. WebP takes 0.1 to 0.2 bytes for a pixel of a
-rock, so this is 4 to 8 MB. With more views or runs, the pictures become smaller."""
+"""Most pixels of all pictures of a page: 4 to 8 MB of WebP."""
 
 WIDEST = 640
 """Most pixels across a picture."""
@@ -83,8 +77,7 @@ class Album:
         return limit
 
     def _small(self, image: np.ndarray) -> np.ndarray:
-        """The window of an image, uint8 [H,W,3] or float32 [H,W], no wider than the album's
-        width."""
+        """The window of an image, uint8 [H,W,3] or float32 [H,W], at most as wide as the album."""
         from PIL import Image
 
         picture = Image.fromarray(np.ascontiguousarray(image[self.window]))

@@ -1,9 +1,5 @@
-"""Interactive plots of the report page, as Plotly takes them: dictionaries of plain data.
-
-Every plot has `title`, `alt` (for readers who do not see it), `data` (traces), `layout` and, but
-for the orbit, `numbers` (its table). The script of the page adds colours of light and dark, and the
-size.
-"""
+"""Plots of the report page as Plotly takes them: `title`, `alt`, `data`, `layout`, and as a table
+`numbers`. The script of the page adds the size and the colours of light and dark."""
 
 from __future__ import annotations
 
@@ -226,7 +222,6 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
 
 
 def _model_points(model: Gaussians) -> dict[str, Any]:
-    """Trace of up to POINTS Gaussians of a model in their colours."""
     some = model[:: max(1, -(-len(model) // POINTS))]
     colours = np.round(srgb_from_linear(some.linear_rgb(some.rgb)) * 255).astype(int).tolist()
     marker = {"size": 2, "color": [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in colours]}
@@ -235,7 +230,6 @@ def _model_points(model: Gaussians) -> dict[str, Any]:
 
 
 def _points(name: str, points: np.ndarray, marker: dict[str, Any]) -> dict[str, Any]:
-    """Trace of points [M,3] in 3D."""
     x, y, z = np.reshape(points, (-1, 3)).T.tolist()
     trace = {"type": "scatter3d", "name": name, "x": x, "y": y, "z": z}
     return trace | {"mode": "markers", "marker": marker}
@@ -250,7 +244,6 @@ def corners_at(camera: Camera, depth: float) -> np.ndarray:
 
 
 def _frusta(cameras: Sequence[Camera], length: float) -> dict[str, Any]:
-    """Trace of cameras as wire pyramids of this length."""
     lines: list[list[float | None]] = [[], [], []]
     for camera in cameras:
         corners, eye = corners_at(camera, length), camera.position

@@ -1,7 +1,4 @@
-"""The story of a run: the model after each view, with the camera that took it and what is unknown.
-
-A run keeps only its last model, so the fits are done again, view by view, from the prior on.
-"""
+"""The story of a run: the model after each view. Fits are repeated: a run keeps the last model."""
 
 from __future__ import annotations
 
@@ -56,7 +53,6 @@ def story_frames(run: Run, progress: Progress) -> Film:
 
 
 def _shown_view(run: Run, model: State, unknown: dict[str, np.ndarray]) -> Frame:
-    """The view of `story_frames`, by the model after the first image."""
     tests, frames = run.dataset.test_views(), run.dataset.frames
     new = [frame for i, frame in enumerate(frames) if i not in run.state.taken]
     others = tests.frames if tests is not None else run.dataset.with_images({f.name for f in new})
@@ -72,7 +68,6 @@ def _left(maps: dict[str, np.ndarray]) -> float:
 
 
 def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], view: Frame) -> np.ndarray:
-    """One frame, sRGB uint8 [H,W,3]."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 

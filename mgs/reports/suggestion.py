@@ -69,7 +69,6 @@ def numbers(run: Run, suggestion: Suggestion) -> dict[str, Any]:
 
 
 def _certificate(suggestion: Suggestion) -> dict[str, Any] | None:
-    """The certificate with prices by name of the candidate."""
     if suggestion.certificate is None:
         return None
     names = [view.name for view in suggestion.ranking]
@@ -119,7 +118,6 @@ def draw_suggestion(path: str | Path, run: Run, suggestion: Suggestion) -> None:
 
 
 def _curve(axis: Any, curve: Sequence[Mapping[str, float]], planned: int) -> None:
-    """Draw `mgs.policy.certificate.curve`, and a line at the number of views planned."""
     axis.axvline(planned, color="#dddddd", linewidth=5)
     for key, (name, colour) in CURVES.items():
         shares = [100 * row[key] for row in curve]
@@ -132,8 +130,6 @@ def _curve(axis: Any, curve: Sequence[Mapping[str, float]], planned: int) -> Non
 
 
 def _from_above(axis: Any, run: Run, suggestion: Suggestion) -> None:
-    """Draw images, candidates by gain, and the planned way, from above."""
-
     def level(points: Any) -> np.ndarray:
         return np.atleast_2d(points)[:, :2]
 

@@ -1,9 +1,4 @@
-"""Films of a run: a turntable, and how the model came to be, view by view.
-
-A turntable turns about the median of the Gaussians' means, at the median distance and height of the
-dataset's cameras. A film of a whole scene moves among the cameras taken. Films are MP4, or without
-any package beside Pillow GIF and animated PNG.
-"""
+"""Films of a run: a turntable, or in a whole scene a flight among the cameras."""
 
 from __future__ import annotations
 
@@ -92,13 +87,11 @@ def path_frames(run: Run, beside: str | None, count: int, width: int) -> Film:
 
 
 def _unknown(maps: dict[str, np.ndarray]) -> np.ndarray:
-    """Map of the variance that is left, sRGB in [0,1] [H,W,3]."""
     visible = maps["A"][..., None] >= VISIBLE
     return np.where(visible, painted(maps["uncertainty"], UNKNOWN) / np.float32(255), 0)
 
 
 def _side_by_side(*pictures: np.ndarray) -> np.ndarray:
-    """Pictures [H,W,3] in [0,1] beside each other, uint8, of even height, as encoders need."""
     gap = np.ones((pictures[0].shape[0], GAP, 3), np.float32)
     parts = [part for picture in pictures for part in (gap, picture)][1:]
     frame = np.concatenate(parts, axis=1)
@@ -142,7 +135,6 @@ def _reported(frames: Film, count: int, progress: Callable[[int, int], None]) ->
 
 
 def _ffmpeg() -> Any:
-    """The module imageio_ffmpeg. Raises InputError if it is not installed."""
     try:
         import imageio_ffmpeg
     except ImportError:
@@ -154,8 +146,7 @@ def _ffmpeg() -> Any:
 
 
 def _write_mp4(path: Path, frames: Film, count: int, rate: float) -> None:
-    """Write `count` frames at a rate (1/s) as H.264. Raises OSError if not all are in the file,
-    which ffmpeg does not report."""
+    """Raises OSError if not all frames are in the file, which ffmpeg does not report."""
     first, ffmpeg = next(frames), _ffmpeg()
     size = (first.shape[1], first.shape[0])
     writer = ffmpeg.write_frames(
@@ -173,7 +164,6 @@ def _write_mp4(path: Path, frames: Film, count: int, rate: float) -> None:
 
 
 def _write_animation(path: Path, frames: Film, seconds: Sequence[float], gif: bool) -> None:
-    """Write frames as GIF, each with 256 colours of its own, or as animated PNG."""
     from PIL import Image
 
     pictures = [Image.fromarray(frame) for frame in frames]

@@ -76,7 +76,6 @@ def report(
 
 
 def _draw_choices(paths: Mapping[str, Path], runs: Mapping[str, Run]) -> None:
-    """Draw CHOICES into these files."""
     first = next(iter(runs.values()))
     positions = np.array([frame.camera.position for frame in first.dataset.frames])
     choices = {}
@@ -121,7 +120,6 @@ def shown_view(runs: Sequence[Run]) -> tuple[Frame, str]:
 
 
 def _draw_comparison(path: Path, runs: Mapping[str, Run], frame: Frame, views: str) -> None:
-    """Draw truth and renders of the frame that the key `views` of metrics.json lists."""
     renders, captions = {}, {}
     for label, run in runs.items():
         renders[label] = render_view(run.gaussians, frame.camera)[0]

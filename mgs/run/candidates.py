@@ -1,7 +1,5 @@
-"""Candidate poses of the next pictures: read from a file, or placed around the object.
-
-A candidate needs no image. Files are in the world of the dataset's files, metres.
-"""
+"""Candidate poses of the next pictures, from a file or placed around the object. Files are in the
+world of the dataset's files, metres."""
 
 from __future__ import annotations
 
@@ -195,7 +193,7 @@ def way_to(camera: Camera, images: Sequence[Frame], site: Site, unit: str) -> st
 
 
 def _lattice(count: int, radius: float, elevations: tuple[float, float]) -> NDArray[np.float64]:
-    """About `count` points of a cubic lattice between two elevations and within a radius [M,3]."""
+    """Points of a cubic lattice, about `count`, [M,3]."""
     low, high = np.sin(np.radians(elevations))
     volume = 2 * np.pi / 3 * radius**3 * max(high - low, 0.01)
     step = (volume / count) ** (1 / 3)
@@ -259,7 +257,6 @@ def refusals(
 
 
 def _are_repeated(poses: Sequence[Named]) -> list[bool]:
-    """Whether an earlier candidate has the same pose."""
     keys = [camera.world_to_camera.tobytes() for _, camera in poses]
     return [keys.index(key) < k for k, key in enumerate(keys)]
 
@@ -267,7 +264,6 @@ def _are_repeated(poses: Sequence[Named]) -> list[bool]:
 def _are_taken(
     poses: Sequence[Named], taken: Sequence[Camera], far: np.ndarray
 ) -> NDArray[np.bool_]:
-    """Whether an image was taken from about the same place in about the same direction."""
     eyes = np.stack([camera.position for camera in taken])
     ahead = np.stack([camera.world_to_camera[2, :3] for camera in taken])
     found = np.zeros(len(poses), bool)

@@ -1,5 +1,4 @@
-"""Entries of steps.jsonl that compare renders with images: residual, indicators, warnings, and the
-prediction for the views not taken."""
+"""Entries of steps.jsonl that compare renders with images."""
 
 from __future__ import annotations
 
@@ -21,8 +20,7 @@ from mgs.run.settings import NbvSettings
 from mgs.scene import Scene, State
 
 WINDOW = 3
-"""Number of last fits whose new views give the mean excess of `predicted_psnr`. Chosen among 2 to 8
-on two rocks that judge nothing."""
+"""Number of last fits that give the mean excess of `predicted_psnr`. Chosen on two rocks."""
 
 LEAST_ERROR = 1e-8
 """Least mean squared error that is predicted, 80 dB."""

@@ -1,7 +1,4 @@
-"""Choose the next view: rank candidates by a policy, or plan a flight over some.
-
-No image of a candidate is read.
-"""
+"""Choose the next view: rank candidates by a policy, or plan a flight over some."""
 
 from __future__ import annotations
 

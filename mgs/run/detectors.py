@@ -1,9 +1,5 @@
-"""Detectors: small numbers of each step that grow as a run goes wrong, their limits, the warnings.
-
-`mgs nbv` prints a warning when a number first exceeds its limit, and keeps all in steps.jsonl. The
-limits are 1.3 to 4 times the largest value of good runs (docs/stability.md), unless a comment says
-otherwise. A fit that diverges ends the run (`mgs.fit.stopping`).
-"""
+"""Detectors: numbers of each step that grow as a run goes wrong, and their warnings. Limits are 1.3
+to 4 times the largest value of good runs (docs/stability.md), unless a comment says otherwise."""
 
 from __future__ import annotations
 
@@ -25,8 +21,7 @@ RATIO_QUANTILES = (0.25, 0.5, 0.75)
 """Quantiles of a view's log ratios."""
 
 LEAST_SPREAD = 0.1
-"""Added to the range of these quantiles before a shift is divided by it, so that a fit without any
-residual has no exposure to report."""
+"""Added to the range of these quantiles: a fit without any residual has no exposure to report."""
 
 NEIGHBOURS = 3
 """Number of nearest views with which a view's error is compared."""
@@ -41,8 +36,7 @@ COVERING_VIEWS = 4
 """Fewest views of which a good coverage can be expected."""
 
 MANY_VIEWS = 8
-"""Views from which on a good fit, equal exposures and coverage are expected even if more are to
-come. A chosen constant."""
+"""Views from which on indicators of a good run are expected even if more are to come. Chosen."""
 
 
 @dataclass(frozen=True)
@@ -132,11 +126,8 @@ def view_indicators(
 
 
 def _trend(values: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Part of the views' values [V] that is proportional to the logarithm of their pixels [V].
-
-    Far views fit worse. The slope is the median of those between all near and far views (CLOSER),
-    and 0 if there are none, so that one wrong view hardly changes it.
-    """
+    """Part of the views' values [V] that is proportional to the logarithm of their pixels [V]: far
+    views fit worse. The slope is a median, so that one wrong view hardly changes it."""
     logs = np.log(pixels)
     near, far = np.nonzero(logs[:, None] - logs >= math.log(CLOSER))
     if not len(near):
@@ -154,20 +145,16 @@ def _median(values: np.ndarray, pixels: np.ndarray) -> float:
 def _exposure(ratios: np.ndarray) -> float:
     """Largest common shift of a view's quantiles from those of the median view, over their range.
 
-    ratios: [V,3] of `ViewIndicators`. A change of exposure shifts all quantiles alike. A highlight
-    or a shadow moves some, so the smallest shift counts, or 0 where the signs differ.
-    """
+    ratios: [V,3]. A change of exposure shifts all quantiles alike, a highlight or a shadow only
+    some: the smallest shift counts, or 0 where the signs differ."""
     shifts = ratios - np.median(ratios, axis=0)
     common = np.where(np.abs(np.sign(shifts).sum(axis=1)) == 3, np.abs(shifts).min(axis=1), 0.0)
     return float((common / (ratios[:, 2] - ratios[:, 0] + LEAST_SPREAD)).max())
 
 
 def _outlier(errors: np.ndarray, positions: np.ndarray) -> float:
-    """Largest error of a view over the largest of its neighbours', or over the median if larger.
-
-    Views from near poses are alike, so highlights and shadows that are hard to fit are no outliers.
-    errors: [V]. positions: of the cameras [V,3].
-    """
+    """Largest error of a view [V] over the largest of its neighbours' (views from near poses have
+    the same highlights and shadows), or over the median if larger."""
     away = np.linalg.norm(positions[:, None] - positions, axis=2)
     np.fill_diagonal(away, np.inf)
     near = errors[np.argsort(away, axis=1)[:, :NEIGHBOURS]].max(axis=1)

@@ -1,8 +1,4 @@
-"""Limits of a flight: which poses a camera may take, and how far it still comes.
-
-A flight starts at the first view taken, its home, and ends there. `FlightLimits.length` and `time`
-limit the whole flight, `no_fly` and `clearance` each pose.
-"""
+"""Limits of a flight, which starts at the first view taken, its home, and ends there."""
 
 from __future__ import annotations
 

@@ -1,29 +1,6 @@
-"""The folder of a run: its files, how they are read and written.
+"""The folder of a run. docs/nbv.md lists its files and the keys of steps.jsonl.
 
-- `config.json`: settings, versions and the names of all frames; written first.
-- `checkpoint.npz`: the state after the last finished step, replaced atomically: the commit.
-- `steps.jsonl`: one line a step, written after the checkpoint.
-- `gaussians.ply`: the model, once the run has ended.
-- `policy.py`: source of a policy that is a Python function; read, never run.
-
-A step is one chosen view; of a batch only the last step has a fit. A line of `steps.jsonl` holds:
-
-- `step`: 0 for the seeds. `frame`, `name`: the chosen view; at step 0 `seeds`, `seed_names`.
-- `certificate`: at step 0, bounds of the plan (`mgs.policy.certificate.Certificate`), where a
-  policy plans all views as a set.
-- `images`: number of views taken. `score`: the policy's own number.
-- `information_gain`: Eq. 7 of the chosen view by the run's estimator, whatever the policy.
-- `coverage`: Eq. 9. `uncertainty`: mean variance that is left, over that of the prior.
-- `iterations`, `loss`, `stop_reason`: of the fit.
-- `residual`: rms difference of the new images to the model before, linear RGB.
-- `exposure`: gains (red, green, blue) by frame name, with the setting `exposure`.
-- `prediction`: predicted masked PSNR of the views not taken, dB, and what it is computed from
-  (`mgs.run.checks.predicted_psnr`); if the policy plans all views or `stop_psnr` is set.
-- `indicators`, `warnings`: of `mgs.run.detectors`. `seconds`: by stage.
-- `test_psnr`, `test_psnr_mask`, dB, where it was evaluated; without test views `psnr`, `psnr_mask`
-  over all views, and `held_out_...`.
-- `ended`: in the last line of a run that has ended (`mgs.run.ending.run_end`).
-"""
+`config.json` is written first. `checkpoint.npz` is replaced atomically: the commit of a step."""
 
 from __future__ import annotations
 
@@ -203,7 +180,6 @@ class Run:
         return found
 
     def _repair(self, state: Checkpoint) -> None:
-        """Write gaussians.ply again where it is not the model of the checkpoint, and warn."""
         path, model = self.folder / "gaussians.ply", to_source(state.gaussians, self.dataset.world)
         try:
             intact = read_ply(path) == model
@@ -366,8 +342,7 @@ def frames_of(steps: Sequence[dict[str, Any]]) -> list[int]:
 
 @contextmanager
 def _checkpoint(out: Path) -> Iterator[zipfile.ZipFile | None]:
-    """Context manager: the checkpoint of a run, None before the first step. Errors that damage
-    causes become an InputError."""
+    """Open the checkpoint of a run; None before the first step. Damage becomes an InputError."""
     path = out / CHECKPOINT
     if not path.is_file():
         yield None

@@ -1,10 +1,5 @@
-"""Hashes of a run's inputs. A run is resumed only if its inputs are unchanged.
-
-A record holds the hash of the `prior`; `cameras`, of pose and intrinsics of every frame by name,
-as asked for in a live capture; `files`, of the files of each frame taken, by name and kind;
-`policy`, of the user's policy file.
-Files of frames that were not taken are never opened.
-"""
+"""Hashes of a run's inputs: a run is resumed only if these are unchanged. Files of frames that were
+not taken are never opened."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Live capture: a pose goes out as a JSON file, and a picture of it comes back.
-
-RUN/dataset has the poses (transforms.json), the pictures taken, undistorted, with masks, and
-captured/NAME.json, the record that is written last. What was received lies in RUN/dataset/flight or
-the watched folder; what was refused is renamed there.
-"""
+"""Live capture: a pose goes out as JSON, and a picture comes back (docs/howto/on-site.md)."""
 
 from __future__ import annotations
 
@@ -54,8 +49,7 @@ BLACK, MOST_BLACK = 2 / 255, 0.95
 """The same of black. Shadows on the Moon are black."""
 
 MOST_BLUR = 0.6
-"""Largest blur by Crete et al. (2007), 0 to 1 (`skimage.measure.blur_effect`). Sharp pictures have
-0.12 to 0.37, the same blurred by 11 pixels of motion 0.6 to 0.7; tiny ones never reach it."""
+"""Largest blur, 0 to 1, by Crete et al. (2007). Sharp pictures have 0.12 to 0.37."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +142,6 @@ def token_of(dataset: Dataset) -> str:
 
 
 def _warn_of_late(files: dict[Path, set[str]]) -> None:
-    """Warn, once each, of files that came after the picture they belong to was read."""
     for out, ends in files.items():
         for end, path in answers(out).items():
             if end not in ends:
@@ -200,7 +193,6 @@ def _received(
     centre: np.ndarray,
     silhouette: Callable[[], Callable[[Camera], np.ndarray]],
 ) -> Frame:
-    """Read, check and commit an answer. Raises InputError where it is refused."""
     image, files = picture(out), answers(out)
     camera, lens = frame.camera, None
     if flown := files.get(".flown.json"):
@@ -242,7 +234,7 @@ def _commit(
     silhouette: Callable[[], Callable[[Camera], np.ndarray]],
     world: World,
 ) -> Frame:
-    """Import a picture into the dataset, check it, and write its record, in this world."""
+    """Import a picture, check it, and write its record, which comes last."""
     remove_file(root, frame.image_path)  # of a picture that was refused or interrupted
     result = import_shot(shot, root, None if shot.mask else silhouette(), 1, lambda: None)
     if result.mask_path is None:

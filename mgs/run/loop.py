@@ -1,8 +1,4 @@
-"""The paper's loop: fit, information, choose, capture, again.
-
-`select_views` is the whole loop, of functions of a `Scene`, a `State` and a policy. Candidates'
-images are never read: until a view is chosen, only its camera is used.
-"""
+"""The paper's loop: fit, information, choose, capture, again. No candidate's image is read."""
 
 from __future__ import annotations
 

@@ -64,15 +64,13 @@ FREE_PASSES = 30
 """Passes of a fit of free means to all images. A chosen constant."""
 
 FREE_TRAIN = {"passes": FREE_PASSES, "decay": 0.02, "tolerance": 0.0}
-"""`TrainSettings` of such a fit, chosen on two rocks (docs/fit.md). All passes are made, as the
-last ones, with low rates, average over the images."""
+"""`TrainSettings` of such a fit: all passes, the last at low rates (docs/fit.md). Chosen."""
 
 FREE_SH = {"points": 1, "hull": 1, "random": 0}
 """`NbvSettings.sh` of such a fit by the source of its prior. Chosen constants (docs/fit.md)."""
 
 LOOSE = {"points": 4.0, "hull": 4.0, "random": 40.0}
-"""Sources of a prior less sure than the images -> factor on its standard deviations in a fit
-of free means to all images. Chosen constants."""
+"""Sources less sure than images -> factor on prior standard deviations in such a fit. Chosen."""
 
 WITHOUT_SURFACE = "farthest"
 """Default policy from random points (docs/results.md, The published protocol)."""
@@ -224,8 +222,7 @@ def start_run(
 
 
 def _seed_frames(dataset: Dataset, mission: NbvSettings) -> list[Frame]:
-    """Frames of the seeds of a run from random points, the only ones whose masks exist by then.
-    Raises InputError for limits of a flight, which need a surface."""
+    """Frames of the seeds of a run from random points, the only ones whose masks exist by then."""
     if mission.flies or mission.flight.no_fly or mission.flight.clearance is not None:
         raise InputError("nbv: limits of a flight need a surface, which a random start lacks")
     positions = np.stack([camera.position for camera in dataset.cameras])
@@ -328,8 +325,7 @@ def _automatic(
 
 
 def _check_surface(prior: Prior, dataset: Dataset, settings: NbvSettings, where: Path) -> None:
-    """Raises InputError where most cameras are nearer to the prior than NEAR: a wrong unit; and
-    where a start at random points cannot be used as these settings ask."""
+    """Raises InputError where most cameras are nearer than NEAR, or the start is unusable."""
     positions = np.stack([frame.camera.position for frame in dataset.frames])
     nearest = float(np.median(cKDTree(prior.points).query(positions)[0]))
     if nearest < NEAR:

@@ -42,16 +42,14 @@ ARGUMENTS: dict[str, Callable[[Scene, State, list[int]], Any]] = {
     "seen_taken": lambda scene, state, views: _seen(scene, state, list(state.taken)),
 }
 """Arguments that are the same for all candidates of a step, by parameter name. seen, seen_taken:
-squared blending weights of the surface's Gaussians in the candidates [C,N] and in the views taken
-[T,N]. `rng` is added by the policy, since it depends on its name."""
+squared blending weights of the surface's Gaussians [C,N], [T,N]. `rng` is added by the policy."""
 
 OF_ONE: dict[str, Callable[[Scene, State, int], Any]] = {
     "F": lambda scene, state, view: scene.information(state, view),
     "surface_F": lambda scene, state, view: scene.surface(state).information(view),
     "candidate": lambda scene, state, view: scene.positions(state.frames)[view],
 }
-"""Arguments of one candidate, by parameter name: its information about the model and about the
-surface, and its camera centre [3]."""
+"""Arguments of one candidate: information about model and surface, and its place [3]."""
 
 OF_THE_FIT = {"scene", "state", "F", "H"}
 """Arguments that depend on the fitted model."""
@@ -140,8 +138,7 @@ def load(name: str) -> Policy:
 
 @contextmanager
 def _users_code(name: str, path: Path | None) -> Iterator[None]:
-    """Context manager: turns every error of a policy's file into an InputError, also SystemExit.
-    path: the file; None for a policy in memory, whose errors stay as they are."""
+    """Turn every error of a policy's file, also SystemExit, into an InputError."""
     try:
         yield
     except BaseException as error:
@@ -192,7 +189,6 @@ class Own:
         return value if name == "geometric" else partial(self._planned, name, value)
 
     def _planned(self, name: str, method: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a method of the object; the result of `plan` becomes a list of views."""
         with _users_code(self.full, self.path):
             result = method(*arguments)
             return [int(view) for view in result] if name == "plan" else result

@@ -118,7 +118,6 @@ def _go_on(
     checkpoint: Checkpoint | None,
     on_step: Callable[[Checkpoint], None],
 ) -> Checkpoint:
-    """Run the loop from a state to its end, and commit every step."""
     settings = recorder.settings
     try:
         for item in select_views(recorder.scene, recorder.policy, settings, state):

@@ -1,7 +1,4 @@
-"""Contents of the JSON files of a run, checked when they are read.
-
-Values are of these types exactly: a text is no number. Files are returned as plain dictionaries.
-"""
+"""Contents of the JSON files of a run, checked when they are read. A text is no number."""
 
 from __future__ import annotations
 
@@ -101,7 +98,7 @@ _FIT = {"iterations", "loss", "stop_reason"}
 
 
 class _Inputs(_Strict):
-    """Hashes of the inputs (`mgs.run.inputs`)."""
+    """Hashes of the inputs: `files` of each frame taken by kind."""
 
     prior: str
     cameras: dict[str, str]
@@ -121,7 +118,6 @@ class Record(_Strict, extra="forbid"):
 
     @model_validator(mode="after")
     def _agree(self) -> Record:
-        """The first line is that of the seeds; each other one is that of one more view."""
         seeds = (self.steps[0].seeds or []) if self.steps else []
         lines = self.steps[1:]
         if self.taken != [*seeds, *(line.frame for line in lines)] or not seeds:

@@ -1,8 +1,4 @@
-"""Settings of a run: validated once, frozen, written whole beside the results.
-
-The docstring of a field is the help of its option or key (`mgs nbv --help`). Needs neither Mitsuba
-nor Dr.Jit.
-"""
+"""Settings of a run, validated once. The docstring of a field is the help of its option."""
 
 from __future__ import annotations
 

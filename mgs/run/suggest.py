@@ -1,9 +1,7 @@
 """`mgs suggest` for programs: rank candidate poses by a run's model, and plan a flight over some.
 
-Choosing a view needs less model than rendering it. So it uses a coarse one: about COARSE of the
-model's Gaussians, larger by the ratio of their spacings, in smaller images in which they are as
-large as before.
-"""
+The model is a coarse one: about COARSE of its Gaussians, larger by the ratio of their spacings, in
+smaller images in which they are as large as before."""
 
 from __future__ import annotations
 
@@ -41,8 +39,7 @@ from mgs.run.worth import certificate, enough_views
 from mgs.scene import Choice, Scene, State
 
 COARSE = 8000
-"""About the most Gaussians on the surface of the model that candidates are rated by. A chosen
-constant."""
+"""About the most Gaussians on the surface by which candidates are rated. A chosen constant."""
 
 FINE = 320
 """Most pixels of an image's width of a model that is not thinned. A chosen constant."""
@@ -169,7 +166,6 @@ def taken_in_order(run: Run) -> list[Frame]:
 
 
 def _settings(run: Run, taken: int, views: int, given: dict[str, Any]) -> NbvSettings:
-    """Settings of the run for a batch of `views` after all views taken."""
     fixed = {"seeds": taken, "budget": views, "batch": max(views, 2)}
     free = dict.fromkeys(["travel", "nearest", "stop_gain", "stop_uncertainty", "stop_psnr"])
     own = run.settings.model_dump()
@@ -180,7 +176,6 @@ def _settings(run: Run, taken: int, views: int, given: dict[str, Any]) -> NbvSet
 
 
 def _check_left(count: int, left: int, dropped: dict[str, int], views: int, flies: bool) -> None:
-    """Raise InputError where too few of `count` candidates are left."""
     reasons = "; ".join(f"{number} {why}" for why, number in dropped.items()) or "none was dropped"
     if not left:
         raise InputError(
@@ -266,20 +261,16 @@ def _plan(
 class _CoarseScene(Scene):
     """A scene whose information is about one model; no image of it is read.
 
-    model: also stands for the Gaussians before training.
-    factor: ratio of the information of an image at its own size to that of a view.
-    """
+    factor: ratio of the information of an image at its own size to that of a view."""
 
     model: Gaussians | None = None
     factor: float = 1.0
 
     def initial(self, frames: Sequence[Frame]) -> Gaussians:
-        """The model."""
         assert self.model is not None
         return self.model
 
     def fisher(self, model: Gaussians, camera: Camera, estimator: str = "exact") -> np.ndarray:
-        """Information [N,P] about the model, measured once for each view."""
         return self._measured((camera, estimator))
 
     @cached_property
@@ -294,10 +285,8 @@ class _CoarseScene(Scene):
 def _coarse_scene(
     run: Run, images: Sequence[Frame], poses: Sequence[Named], settings: NbvSettings
 ) -> tuple[Scene, State]:
-    """Scene of the images taken, then the poses, with a coarse model; and its state.
-
-    The first image counts as the last view taken, since the flight starts there.
-    """
+    """Scene of the images taken, then the poses, with a coarse model; and its state, whose last
+    view is the first image, where the flight starts."""
     prior, rows = coarse_prior(run.prior)
     thinning = len(prior.points) / len(run.prior.points)
     model = _coarse(run.state.gaussians, rows, thinning)
@@ -345,10 +334,8 @@ def coarse_prior(prior: Prior, most: int = COARSE) -> tuple[Prior, NDArray[np.in
 
 
 def _coarse(model: Gaussians, rows: np.ndarray, thinning: float) -> Gaussians:
-    """Gaussians of a fitted model for the samples of a coarse prior: fewer and larger.
-
-    None is black, since the information about a colour that is clamped at 0 would be 0.
-    """
+    """Gaussians of a model for the samples of a coarse prior. None is black: a colour that is
+    clamped at 0 has no information."""
     some = model if thinning == 1 else model[rows]
     grown = some.log_scales - np.float32(0.5 * np.log(thinning))
     return replace(some, log_scales=grown, sh=np.maximum(some.sh, np.float32(-0.49 / SH_C0)))

@@ -1,9 +1,5 @@
-"""Ways in which a pose reaches a camera and its picture comes back: a command, a watched folder.
-
-A transport is a function deliver(pose, out). pose: JSON file of the pose (`mgs.run.live.ask`). It
-returns once the picture is complete in `out` (PNG; or the same stem with .jpg or .jpeg), with its
-companions of COMPANIONS where there are any. It raises InputError or OSError where there is none.
-"""
+"""Transports: functions deliver(pose, out) by which a pose file reaches a camera. They return once
+the picture is complete in `out`, with its COMPANIONS, or raise InputError or OSError."""
 
 from __future__ import annotations
 
@@ -97,7 +93,6 @@ def command(text: str, timeout: float) -> Transport:
 
 
 def _last_line(log: Path) -> str:
-    """Last line of a program's output, after a colon."""
     lines = log.read_bytes()[-LOG_TAIL:].decode(errors="replace").split("\n")
     texts = ["".join(filter(str.isprintable, line)).strip() for line in lines]
     last = next((line for line in reversed(texts) if line), "")

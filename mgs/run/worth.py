@@ -20,8 +20,7 @@ from mgs.run.settings import ENOUGH, Mission
 from mgs.scene import Scene, State
 
 SEARCH_NODES, SEARCH_PAIRS = 40, 2_000_000
-"""Most nodes of a search, and most nodes times pairs of a candidate and a Gaussian: about a second
-on a laptop. Ten seconds prove 3 % more (docs/certificate.md). Chosen constants."""
+"""Most nodes of a search, and nodes times pairs of candidate and Gaussian: about a second."""
 
 CURVE_PAIRS = 3_000_000
 """Most pairs of a candidate and a Gaussian with which the curve of a certificate is computed."""

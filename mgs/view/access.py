@@ -1,9 +1,5 @@
-"""Who may use the viewer, and text that a browser shows as it is.
-
-Every website can open connections to servers on this machine. So a request must name this server as
-its host and, if it comes from a page, as its origin. On an address that others reach, the first
-request must have the token of the printed URL; a cookie carries it on.
-"""
+"""Who may use the viewer. Any website can open connections to servers on this machine, so a request
+must name this server as host and origin. Elsewhere the first must have the printed token."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Layers of the viewer, as colours of Gaussians and as images of the kernel.
-
-A browser draws Gaussians in sRGB, sorted as a whole and without spherical harmonics: an
-approximation, shown while the camera moves. The kernel's images are the model as `mgs.render` draws
-it.
-"""
+"""Layers of the viewer, as colours of Gaussians and as images of the kernel."""
 
 from __future__ import annotations
 

@@ -1,9 +1,5 @@
-"""The viewer: a local web server (viser) that shows a subject, with the kernel's image where a
-camera rests.
-
-viser calls back from its own threads. These only record requests; everything is computed in
-`Viewer.tick`, on the thread that made the viewer, because Mitsuba's variant belongs to a thread.
-"""
+"""The viewer: a local web server (viser). Its threads only record requests; all is computed in
+`Viewer.tick`, on the thread that made the viewer, because Mitsuba's variant belongs to a thread."""
 
 from __future__ import annotations
 
@@ -59,11 +55,8 @@ BLACK = np.zeros((2, 2, 3), np.uint8)
 
 @dataclass
 class _Client:
-    """A browser window.
-
-    splats: its copy of the Gaussians. moved: time of the last movement of its camera. drawn:
-    (moved, version) of the last drawing. covered: whether the kernel's image is shown.
-    """
+    """A browser window. splats: its copy of the Gaussians. moved: time of its camera's last move.
+    drawn: (moved, version) of the last drawing. covered: whether the kernel's image is shown."""
 
     handle: Any
     splats: Any
@@ -128,12 +121,10 @@ class Viewer:
                     client.drawn = state  # but not what it asked for meanwhile
 
     def _stamp(self) -> list[int]:
-        """Times of change of the files that a step or `mgs eval` writes."""
         files = [self.path / name for name in ("checkpoint.npz", "metrics.json")]
         return [file.stat().st_mtime_ns if file.is_file() else 0 for file in files]
 
     def _scene(self) -> None:
-        """Set up background, light, first camera, and mesh."""
         scene, subject, first = self.server.scene, self.subject, self.server.initial_camera
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         scene.set_up_direction((0.0, 0.0, 1.0))
@@ -159,7 +150,6 @@ class Viewer:
             self.mesh = scene.add_mesh_simple("/mesh", vertices, faces, **look)
 
     def _controls(self) -> None:
-        """Add the panel."""
         gui, names = self.server.gui, layers.layers(self.subject)
         self.title = gui.add_markdown("")
         hint = "What is drawn: by the kernel, and by the browser"
@@ -184,16 +174,13 @@ class Viewer:
         self.image = gui.add_image(np.zeros((3, 4, 3), np.uint8), format="jpeg", visible=False)
 
     def _switch(self, label: str, on: bool, shown: Any, hint: str | None = None) -> None:
-        """Add a checkbox that shows and hides a part of the scene."""
         box = self.server.gui.add_checkbox(label, on, hint=hint)
         box.on_update(lambda _: setattr(shown, "visible", box.value))
 
     def _again(self) -> None:
-        """Request that everything is drawn again."""
         self.version += 1
 
     def _renew(self) -> None:
-        """Show a new step."""
         for client in list(self.clients.values()):
             splats, client.splats = client.splats, None
             if splats is not None:
@@ -205,7 +192,6 @@ class Viewer:
         self._again()
 
     def _show_views(self) -> None:
-        """Show title, cameras and the path between the chosen ones."""
         subject, scene = self.subject, self.server.scene
         self.title.content = f"**{plain(subject.title)}**"
         if not subject.views:
@@ -219,7 +205,6 @@ class Viewer:
             scene.add_line_segments("/cameras/way", segments, colors=COLOURS["chosen"], **THIN)
 
     def _show_camera(self, view: View, size: float) -> None:
-        """Show a camera as a pyramid that can be clicked, with the step of a chosen one."""
         camera, name = view.frame.camera, view.frame.name
         wxyz, position = _pose(camera)
         self.frusta[name] = self.server.scene.add_camera_frustum(
@@ -237,7 +222,6 @@ class Viewer:
             self.server.scene.add_label(f"/cameras/views/{name}/step", str(view.step))
 
     def _clicked(self, name: str) -> None:
-        """Select the view of a camera that was clicked."""
         if self.view.value == name:
             self.select(name)
         else:
@@ -265,7 +249,6 @@ class Viewer:
             self.facts.content += f"\n\n{plain(str(error))}"
 
     def _look(self, client: Any) -> None:
-        """Move a browser's camera to that of the selected view."""
         if client is None:  # the window was closed meanwhile
             return
         if self.selected != self.view.value:
@@ -279,7 +262,6 @@ class Viewer:
             client.camera.fov = _vertical_fov(camera)
 
     def _connected(self, handle: Any) -> None:
-        """Handle a browser window that was opened."""
         client = self.clients[handle.client_id] = _Client(handle, None, time.monotonic())
 
         @handle.camera.on_update
@@ -289,18 +271,15 @@ class Viewer:
                 self._uncover(client)
 
     def _disconnected(self, handle: Any) -> None:
-        """Handle a browser window that was closed."""
         self.clients.pop(handle.client_id, None)
 
     def _uncover(self, client: _Client) -> None:
-        """Show the Gaussians as the browser draws them."""
         client.covered = False
         client.handle.scene.set_background_image(BLACK)
         if client.splats is not None:
             client.splats.visible = bool(self.gaussians.value)
 
     def _draw(self, client: _Client) -> None:
-        """Draw the layer for a browser whose camera rests: Gaussians, and the kernel's image."""
         state, subject, names = (client.moved, self.version), self.subject, self.layer.options
         layer = self.layer.value if self.layer.value in names else names[0]
         g = subject.model
@@ -360,5 +339,4 @@ def _pose(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _vertical_fov(camera: Camera) -> float:
-    """Vertical field of view of a camera, radians, with its principal point taken as central."""
     return 2 * math.atan(camera.height / 2 / camera.K[1, 1])

@@ -1,5 +1,4 @@
-"""Contents of the viewer, read from a run folder or a PLY: Gaussians with their scalars, cameras,
-and the mesh of the prior."""
+"""Contents of the viewer, read from a run folder or a PLY."""
 
 from __future__ import annotations
 
@@ -24,8 +23,7 @@ SCALARS = ("information", "uncertainty", "unobserved")
 """Scalars of `mgs.reports.diagnostics` that the viewer shows."""
 
 LARGEST = 40.0
-"""Largest distance of a camera, or of 95 % of the Gaussians, from the middle. Worlds may have any
-unit, but depth in a browser ends at about four times this (`mgs.view.layers.FAR`)."""
+"""Largest distance from the middle; depth in a browser ends at about four times this."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,6 @@ def scaled(subject: Subject) -> Subject:
 
 
 def _read_run(run: Run, follow: bool) -> Subject:
-    """The subject of a run, in the world's lengths."""
     name, prior = run.folder.resolve().name, run.settings.prior
     waiting = Subject(
         f"{name}: no finished step yet",
@@ -148,7 +145,6 @@ def _read_run(run: Run, follow: bool) -> Subject:
 
 
 def _views(run: Run) -> list[View]:
-    """The cameras of the dataset, with facts from the run's steps and metrics."""
     psnr = {view["name"]: view["psnr"] for view in (run.measured or {}).get("views", [])}
     lines = {line["frame"]: line for line in run.steps[1:]}
     views = []
