@@ -68,41 +68,37 @@ class Camera:
         if not whole:
             raise InputError(f"camera: image size {self.width}x{self.height} must be whole pixels")
         # Dr.Jit does not accept NumPy's integers as sizes.
-        object.__setattr__(self, "width", int(self.width))
-        object.__setattr__(self, "height", int(self.height))
-        size = f"camera: image size {self.width}x{self.height} must be"
-        object.__setattr__(self, "K", K)
-        object.__setattr__(self, "world_to_camera", pose)
+        size = {"width": int(self.width), "height": int(self.height)}
+        for name, value in (size | {"K": K, "world_to_camera": pose}).items():
+            object.__setattr__(self, name, value)
+        if problem := self._problem():
+            raise InputError(f"camera: {problem}")
+
+    def _problem(self) -> str:
+        """Reason for which no camera can have these numbers, and its cure; empty if one can."""
+        K, pose, size = self.K, self.world_to_camera, f"image size {self.width}x{self.height}"
         if K.shape != (3, 3) or not np.isfinite(K).all():
-            raise InputError("camera: K must be a finite 3x3 matrix; correct the intrinsics")
+            return "K must be a finite 3x3 matrix; correct the intrinsics"
         if K[0, 0] <= 0 or K[1, 1] <= 0:
-            raise InputError("camera: focal lengths must be positive; correct fl_x and fl_y")
+            return "focal lengths must be positive; correct fl_x and fl_y"
         if K[0, 1] != 0 or K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
-            raise InputError(
-                "camera: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew; "
-                "resample the images"
+            return (
+                "K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew; resample the images"
             )
         if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
-            raise InputError(f"{size} at least 1x1, and at most {MAX_PIXELS:,} pixels in all")
+            return f"{size} must be at least 1x1, and at most {MAX_PIXELS:,} pixels in all"
         if max(self.width, self.height) > MAX_SIDE:
-            raise InputError(f"{size} at most {MAX_SIDE:,} pixels either way")
+            return f"{size} must be at most {MAX_SIDE:,} pixels either way"
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise InputError(
-                "camera: the pose has NaN or infinite entries; correct its transform matrix"
-            )
+            return "the pose has NaN or infinite entries; correct its transform matrix"
         if max(np.abs(K).max(), np.abs(pose).max()) > FURTHEST:
-            raise InputError(
-                f"camera: K or the pose has entries beyond {FURTHEST:g}; correct the focal length "
-                "or the position"
-            )
-        rotation = pose[:3, :3]
-        rigid = (
-            np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
-        )
-        if not rigid or not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-9):
-            raise InputError(
-                "camera: the pose is singular or not rigid; its rotation must be orthonormal"
-            )
+            far = f"K or the pose has entries beyond {FURTHEST:g}"
+            return f"{far}; correct the focal length or the position"
+        R, last = pose[:3, :3], pose[3]
+        rigid = np.allclose(R @ R.T, np.eye(3), atol=1e-4) and np.linalg.det(R) > 0
+        if not rigid or not np.allclose(last, [0, 0, 0, 1], atol=1e-9):
+            return "the pose is singular or not rigid; its rotation must be orthonormal"
+        return ""
 
     def __eq__(self, other: object) -> bool:
         return self.key == other.key if isinstance(other, Camera) else NotImplemented

@@ -17,8 +17,8 @@ import mgs
 from mgs.camera import MAX_PIXELS, MAX_SIDE, Camera
 from mgs.colour import linear_from_pixels, srgb_from_linear
 from mgs.errors import InputError
-from mgs.files import atomic_path, not_writable, reading
-from mgs.memory import check_room, decoding
+from mgs.files import atomic_path, not_writable, parsing, reading
+from mgs.memory import check_room
 
 PNG_BIT_DEPTH = 24
 """Index of the byte of a PNG file that holds the bits of a sample (PNG specification, 11.2.1)."""
@@ -315,11 +315,7 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
 
     path = Path(path)
     _exr_size(path)
-    with (
-        decoding(path),
-        _reading_exr(path),
-        OpenEXR.File(str(path), separate_channels=True) as file,
-    ):
+    with _reading_exr(path), OpenEXR.File(str(path), separate_channels=True) as file:
         channels = file.channels().items()
         return {name: np.asarray(one.pixels, np.float32) for name, one in channels}
 
@@ -350,15 +346,8 @@ def _exr_size(path: Path) -> tuple[int, int]:
 @contextmanager
 def _reading_exr(path: Path) -> Iterator[None]:
     """Context manager: turns errors of OpenEXR into InputError, and hides what it prints."""
-    try:
-        with _silent():
-            yield
-    except InputError:
-        raise
-    except (RuntimeError, OSError, ValueError, TypeError, KeyError) as error:
-        raise InputError(
-            f"{path}: not a readable EXR ({error}); the file is damaged, write it again"
-        ) from None
+    with parsing(path, "EXR", "the file is damaged, write it again"), _silent():
+        yield
 
 
 _redirecting = Lock()

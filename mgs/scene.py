@@ -274,19 +274,16 @@ class Scene:
 
         estimator: a name in `mgs.splat.ESTIMATORS`, by default that of the scene.
         """
+        key = state.frames[view].camera, estimator or self.settings.estimator
         if not self.keep:
-            return self._information(state.gaussians, state.frames[view].camera, estimator)
+            return self.fisher(state.gaussians, *key)
         model, cache = self.memo.get("views", (None, None))
         if model is not state.gaussians:
             # Copies: the kernel's array has padded rows, and Dr.Jit keeps its memory.
-            make = lambda key: np.array(self._information(state.gaussians, *key))  # noqa: E731
+            make = lambda key: np.array(self.fisher(state.gaussians, *key))  # noqa: E731
             cache = kept_within(self.keep, make, lambda F: F.nbytes)
             self.memo["views"] = state.gaussians, cache
-        return cache((state.frames[view].camera, estimator))
-
-    def _information(self, model: Gaussians, camera: Camera, estimator: str | None) -> np.ndarray:
-        name = estimator or self.settings.estimator
-        return self.fisher(model, camera, name)
+        return cache(key)
 
     def surface(self, state: State) -> Visibility:
         """Visibility of the prior's surface from each pose; it depends on poses and prior alone."""
@@ -300,11 +297,8 @@ class Scene:
         def exact(camera: Camera) -> np.ndarray:
             return self.fisher(start, camera, "exact")[:count, :columns]
 
-        def progress(done: int, total: int) -> None:
-            report(Stage.SCORE, done, total)
-
         points, lam = start.means[:count], float(self.surface_lam[0])
-        return Visibility(state.cameras, exact, points, self.centre, lam, progress)
+        return Visibility(state.cameras, exact, points, self.centre, lam)
 
     def positions(self, frames: Sequence[Frame]) -> np.ndarray:
         """Camera centres [V,3], metres."""

@@ -43,7 +43,7 @@ class Height:
 def everything(scene, state, views, seen, seen_taken, points, candidate, centre):
     assert seen.shape == (len(views), len(points))
     assert seen_taken.shape == (len(state.taken), len(points))
-    dome = scene.surface(state).dome()
+    dome = scene.surface(state).dome
     assert len(dome.positions) == len(dome.seen)
     return Height(centre[2])(candidate)
 

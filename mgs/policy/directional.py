@@ -12,7 +12,7 @@ with M_j = sum over the dome of W_vj y_vj y_vj^T, by the Sherman-Morrison formul
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, TypeVar
 
@@ -46,6 +46,10 @@ class Views(NamedTuple):
 
     positions: Array
     seen: Array
+
+    def of(self, views: Sequence[int]) -> Views:
+        """Some of the views."""
+        return Views(self.positions[list(views)], self.seen[list(views)])
 
 
 def squared_weights(F: Array) -> NDArray[np.float32]:

@@ -14,11 +14,6 @@ def azimuths(positions: Array, centre: Array) -> NDArray[np.float64]:
     return np.arctan2(offset[:, 1], offset[:, 0]) % (2 * np.pi)
 
 
-def azimuth_difference(a: Array, b: Array) -> NDArray[np.float64]:
-    """Smallest angle between azimuths (broadcast), radians in [0, pi]."""
-    return np.abs((a - b + np.pi) % (2 * np.pi) - np.pi)
-
-
 def uniform_azimuth(candidates: Array, taken: Array, centre: Array) -> Array:
     """Azimuth gap to the next view taken on the left times that on the right, square radians.
 
@@ -90,7 +85,7 @@ def seed_views(positions: Array, centre: Array, count: int) -> list[int]:
     azimuth, squared = azimuths(positions, centre), angles(positions, positions, centre) ** 2
     seeds = list[int]()
     for target in 2 * np.pi * np.arange(count) / count:
-        distance = _rounded(azimuth_difference(azimuth, target))
+        distance = _rounded(np.abs((azimuth - target + np.pi) % (2 * np.pi) - np.pi))
         distance[seeds] = np.inf
         seeds.append(int(np.argmin(distance)))
     before = None

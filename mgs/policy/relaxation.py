@@ -12,7 +12,7 @@ all sets of k candidates.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, NamedTuple
@@ -52,8 +52,8 @@ class Bound(NamedTuple):
     value: float
     weights: Floats
     prices: Floats
-    gap: float
-    stopped: str
+    gap: float = 0.0
+    stopped: str = "steps"
 
 
 @dataclass(frozen=True)
@@ -165,19 +165,13 @@ class Relaxation:
         """
         if len(self.base) > 2 * len(self.coarse.base):
             x = self.coarse.bound(x, box, tolerance, until).weights
-        k, best, lower = round(float(x.sum())), None, -np.inf
-        (value, slope), reason = self.tangent(x), "steps"
+        return _least(self._ascent(x, box), tolerance, until, enough)
+
+    def _ascent(self, x: Floats, box: tuple[Floats, Floats]) -> Iterator[tuple[float, Bound]]:
+        k, (value, slope) = round(float(x.sum())), self.tangent(x)
         for _ in range(STEPS):
             above = value + float(slope @ (_largest(slope, *box, k) - x))
-            if best is None or above < best.value:
-                best = Bound(above, x, slope, 0.0, reason)
-            lower = max(lower, value)
-            if best.value - lower <= tolerance * best.value or best.value <= enough:
-                reason = "gap"
-                break
-            if time.monotonic() > until:
-                reason = "time"
-                break
+            yield value, Bound(above, x, slope)
             d = _newton_step(self.coarse.curvature(x), slope, x, *box)
             t, ascent = 1.0, float(slope @ d)
             new, after = self.tangent(x + d)
@@ -185,8 +179,6 @@ class Relaxation:
                 t /= 2
                 new, after = self.tangent(x + t * d)
             x, value, slope = x + t * d, new, after
-        assert best is not None
-        return best._replace(gap=(best.value - lower) / max(best.value, 1e-300), stopped=reason)
 
     def _taken(self, views: Iterable[int]) -> Floats:
         x = np.zeros(self.candidates)
@@ -212,6 +204,24 @@ class Relaxation:
         if self.over is None:
             return np.asarray(self.scale * np.linalg.slogdet(A)[1])
         return np.asarray(-self.scale * np.einsum("nkl,nkl->n", S, self.over[some]))
+
+
+def _least(
+    steps: Iterable[tuple[float, Bound]], tolerance: float, until: float, enough: float
+) -> Bound:
+    """Least of the bounds that come with the gain of their weights; stops as `Relaxation.bound`."""
+    best, lower, reason = None, -np.inf, "steps"
+    for gain, bound in steps:
+        lower = max(lower, gain)
+        best = bound if best is None or bound.value < best.value else best
+        if best.value - lower <= tolerance * best.value or best.value <= enough:
+            reason = "gap"
+            break
+        if time.monotonic() > until:
+            reason = "time"
+            break
+    assert best is not None
+    return best._replace(gap=(best.value - lower) / max(best.value, 1e-300), stopped=reason)
 
 
 def _largest(prices: Floats, lo: Floats, hi: Floats, k: int) -> Floats:
@@ -376,14 +386,17 @@ class Coverage:
         Cutting planes: every x tried gives a tangent, and HiGHS finds the next x, where the least
         tangent is largest. Any mean of tangents is a bound; the prices are its slope.
         """
+        return _least(self._cuts(x, box), tolerance, until, enough)
+
+    def _cuts(self, x: Floats, box: tuple[Floats, Floats]) -> Iterator[tuple[float, Bound]]:
         rows, counts = self.shares
         size = round(float(x.sum()))
         most = np.sort(rows * box[1], axis=1)[:, -size:].sum(axis=1)
         rows, counts = rows[most >= 1 - 1e-6], counts[most >= 1 - 1e-6]
-        slopes, heights, best, lower, reason = [], [], None, 0.0, "steps"
+        slopes, heights = [], []
         for _ in range(CUTS):
             share = rows @ x
-            lower = max(lower, value := float(counts @ np.minimum(share, 1)))
+            value = float(counts @ np.minimum(share, 1))
             slopes.append((counts * (share < 1)) @ rows)
             heights.append(value - slopes[-1] @ x)
             solved = linprog(
@@ -397,17 +410,10 @@ class Coverage:
             mean = np.maximum(-solved.ineqlin.marginals, 0)
             mean /= mean.sum()
             prices, x = mean @ slopes, solved.x[:-1]
-            above = float(mean @ heights + prices @ _largest(prices, *box, size))
-            if best is None or above < best.value:
-                best = Bound(above, x, prices, 0.0, reason)
-            if best.value - lower <= tolerance * best.value or best.value <= enough:
-                reason = "gap"
-                break
-            if time.monotonic() > until:
-                reason = "time"
-                break
-        assert best is not None
-        return best._replace(gap=(best.value - lower) / max(best.value, 1e-300), stopped=reason)
+            yield (
+                value,
+                Bound(float(mean @ heights + prices @ _largest(prices, *box, size)), x, prices),
+            )
 
 
 Criterion = Relaxation | Coverage

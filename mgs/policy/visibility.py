@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +14,7 @@ from mgs.policy.criteria import Array
 from mgs.policy.directional import Views, dome_cameras, gains, of_points, squared_weights
 from mgs.policy.plans import planned_path, planned_views
 from mgs.policy.poses import nearest_poses
+from mgs.progress import Stage, report
 
 if TYPE_CHECKING:
     from mgs.policy.pool_gains import PoolGains
@@ -34,13 +35,14 @@ class Visibility:
     - cameras: of the run.
     - exact(camera): exact information about the Gaussians before any training [N,P].
     - points: their means [N,3], metres. centre: middle of the rock [3]. lam: lambda of colours.
-    - progress(done, total): called for each camera in `pool`.
 
     Attributes:
     - positions: camera centres [V,3], metres.
     - seen(frame): squared blending weights in one view [N]. information(frame): `exact` of it.
-    - pool(), dome(): `Views` of all cameras of the run, and of a dome around the rock.
-    - planned(...), path(...): views to take next, as a set (`_planned`) and in order (`_path`).
+    - planned(taken, candidates, count, model): at most `count` views to take next, as a set
+      (`planned_views`); all candidates where there are no `plan_gains`.
+    - path(taken, candidates, count, nearest, model): the same in order, each among the `nearest`
+      to the one before (`planned_path`); none where there are no `plan_gains`.
     """
 
     def __init__(
@@ -50,12 +52,11 @@ class Visibility:
         points: Array,
         centre: Array,
         lam: float,
-        progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> None:
-        self.cameras, self.exact, self.progress = cameras, exact, progress
+        self.cameras, self.exact = cameras, exact
         self.points, self.centre, self.lam = points, centre, lam
         self.positions = np.array([camera.position for camera in cameras])
-        self.seen, self.pool, self.dome = cache(self._seen), cache(self._pool), cache(self._dome)
+        self.seen = cache(lambda frame: squared_weights(exact(cameras[frame])))
         self.planned, self.path = cache(self._planned), cache(self._path)
         self.states: dict[Model, PoolGains] = {}
         # A copy, because the kernel returns part of a larger array.
@@ -81,11 +82,8 @@ class Visibility:
         if state is None or state.taken != list(taken[: len(state.taken)]):
             state = self.plan_gains(model)
             if state is None:
-                pool, dome = self.pool(), self.dome() if over_dome else None
-                before, after = (
-                    Views(pool.positions[list(some)], pool.seen[list(some)])
-                    for some in (taken, candidates)
-                )
+                before, after = self.pool.of(taken), self.pool.of(candidates)
+                dome = self.dome if over_dome else None
                 return gains(self.points, self.lam, degree, tau, before, after, dome)
             self.states[model] = state
         state.take(taken[len(state.taken) :])
@@ -126,23 +124,24 @@ class Visibility:
 
         degree, tau, over_dome = model
         some = slice(None, None, max(len(self.points) // most, 1) if most else None)
-        pool = of_points(self.pool(), some)
+        pool = of_points(self.pool, some)
         if not fits(self.points[some], pool, degree):
             return None
-        dome = of_points(self.dome(), some) if over_dome else None
+        dome = of_points(self.dome, some) if over_dome else None
         return PoolGains(self.points[some], pool, self.lam, degree, tau, dome)
 
-    def _seen(self, frame: int) -> Array:
-        return squared_weights(self.exact(self.cameras[frame]))
-
-    def _pool(self) -> Views:
+    @cached_property
+    def pool(self) -> Views:
+        """All cameras of the run, and what they see."""
         seen = []
         for frame in range(len(self.cameras)):
-            self.progress(frame, len(self.cameras))
+            report(Stage.SCORE, frame, len(self.cameras))
             seen.append(self.seen(frame))
         return Views(self.positions, np.stack(seen))
 
-    def _dome(self) -> Views:
+    @cached_property
+    def dome(self) -> Views:
+        """A dome of cameras around the rock, and what they see."""
         cameras = dome_cameras(self.cameras[0], self.positions, self.centre)
         seen = np.stack([squared_weights(self.exact(camera)) for camera in cameras])
         return Views(np.array([camera.position for camera in cameras]), seen)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from mgs.policy import relaxation as relaxed
-from mgs.policy.directional import Views
 from mgs.policy.relaxation import Relaxation
 from mgs.policy.visibility import FEW
 
@@ -72,12 +71,8 @@ class Directional:
     def relaxation(self, scene: Scene, state: State, views: Sequence[int]) -> Relaxation:
         """Gain of these views together."""
         surface = scene.surface(state)
-        pool = surface.pool()
-        taken, others = (
-            Views(pool.positions[list(some)], pool.seen[list(some)])
-            for some in (state.taken, views)
-        )
-        dome = surface.dome() if self.over_dome else None
+        taken, others = surface.pool.of(state.taken), surface.pool.of(views)
+        dome = surface.dome if self.over_dome else None
         lam, degree, tau = surface.lam, self.degree, self.tau
         return relaxed.directional(surface.points, lam, degree, tau, taken, others, dome)
 
