@@ -58,9 +58,7 @@ def _ply_names(coefficients: int) -> list[str]:
 
 
 def write_ply(
-    path: str | Path,
-    gaussians: Gaussians,
-    marks: Mapping[str, np.ndarray] | None = None,
+    path: str | Path, gaussians: Gaussians, marks: Mapping[str, np.ndarray] | None = None
 ) -> None:
     """Write Gaussians (NumPy fields) as a binary PLY in the layout of 3DGS; the file appears
     complete.
@@ -106,10 +104,7 @@ def read_ply(path: str | Path) -> Gaussians:
 def parse_ply(path: str | Path) -> Gaussians:
     """`read_ply` without its check of the values."""
     path = Path(path)
-    with (
-        reading(path, "file; give a 3DGS PLY"),
-        parsing(path, "3DGS PLY", "export it again"),
-    ):
+    with reading(path, "file; give a 3DGS PLY"), parsing(path, "3DGS PLY", "export it again"):
         ply = _parse_any_comment(path)
     if "vertex" not in ply:
         raise InputError(

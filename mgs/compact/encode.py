@@ -11,34 +11,10 @@ from scipy.spatial import cKDTree
 
 from mgs.compact import allocate
 from mgs.compact.coder import LARGEST, encode, integers
-from mgs.compact.columns import (
-    Start,
-    colour_axes,
-    columns_of,
-    gaussians_of,
-    gradient_of,
-    groups,
-)
-from mgs.compact.container import (
-    ANTIALIASED,
-    LINEAR,
-    SHARED,
-    Header,
-    Key,
-    join,
-    packet,
-    step_codes,
-)
+from mgs.compact.columns import Start, colour_axes, columns_of, gaussians_of, gradient_of, groups
+from mgs.compact.container import ANTIALIASED, LINEAR, SHARED, Header, Key, join, packet, step_codes
 from mgs.compact.decode import IDENTITY, decoded, grid_cells, lone_cells, rows_of
-from mgs.compact.tree import (
-    AXIS_BITS,
-    DEPTH,
-    Tree,
-    cells_of,
-    code_descendants,
-    codes_of,
-    tree_of,
-)
+from mgs.compact.tree import AXIS_BITS, DEPTH, Tree, cells_of, code_descendants, codes_of, tree_of
 from mgs.data.world import PLUS_Z, Vector
 from mgs.gaussians import Gaussians
 

@@ -307,12 +307,7 @@ def _projected(
 
 
 def _depth_error(
-    one: Frame,
-    near: np.ndarray,
-    other: Frame,
-    far: np.ndarray,
-    convention: Convention,
-    zoom: float,
+    one: Frame, near: np.ndarray, other: Frame, far: np.ndarray, convention: Convention, zoom: float
 ) -> float:
     """Median difference, as pixels at this depth, between the depth `far` of a frame and that of
     the points which `one` sees at depth `near`, less those that are hidden; inf if too few are

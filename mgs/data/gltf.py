@@ -46,10 +46,7 @@ class Gltf:
     """
 
     def __init__(
-        self,
-        path: Path,
-        handled: str,
-        resolve: Callable[[str], bytes] | None = None,
+        self, path: Path, handled: str, resolve: Callable[[str], bytes] | None = None
     ) -> None:
         self.path, self.resolve = path, resolve
         data = path.read_bytes()

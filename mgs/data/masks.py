@@ -27,9 +27,7 @@ ACROSS = 6
 
 
 def make_masks(
-    dataset: Dataset,
-    mesh: Mesh,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    dataset: Dataset, mesh: Mesh, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Dataset:
     """Write a mask of a mesh for each frame of a dataset, a contact sheet, and transforms.json; the
     same first for its test views, if they have no masks.

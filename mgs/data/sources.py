@@ -20,14 +20,7 @@ from mgs.data.lens import Lens
 from mgs.data.metashape import is_metashape, read_metashape
 from mgs.data.photographs import KIND as PHOTOGRAPHS
 from mgs.data.photographs import UNREAD, photographs_in, read_photographs
-from mgs.data.rgbd_folders import (
-    is_open3d,
-    is_rtabmap,
-    is_tum,
-    read_open3d,
-    read_rtabmap,
-    read_tum,
-)
+from mgs.data.rgbd_folders import is_open3d, is_rtabmap, is_tum, read_open3d, read_rtabmap, read_tum
 from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, checked, frame_name, turned_by_exif
 from mgs.data.tracks import ROUNDED, Spacing, orthonormal
 from mgs.data.video import VIDEO_SUFFIXES, sharpest_frames

@@ -151,10 +151,7 @@ class Matcher:
                 # First in the database in order, because threads would enter them in any.
                 pycolmap.import_images(*files, image_names=names, options=reader)
                 pycolmap.extract_features(
-                    *files,
-                    image_names=names,
-                    reader_options=reader,
-                    extraction_options=options,
+                    *files, image_names=names, reader_options=reader, extraction_options=options
                 )
                 done += len(some)
 

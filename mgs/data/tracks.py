@@ -32,9 +32,7 @@ WITHOUT_POSE = "without a pose at its time"
 
 
 def posed(
-    times: Collection[float],
-    pose_at: Callable[[float], np.ndarray | None],
-    left_out: Counter[str],
+    times: Collection[float], pose_at: Callable[[float], np.ndarray | None], left_out: Counter[str]
 ) -> list[tuple[float, np.ndarray]]:
     """(time, pose) of the times that have a pose; the others are counted in `left_out`."""
     samples = [(time, pose) for time in times if (pose := pose_at(time)) is not None]

@@ -209,8 +209,7 @@ class Objective:
         """Derivative of Phi by the learned parameters."""
         prior_part = [mi.TensorXf(lam * d.array, d.shape) for d, lam in self.offsets(model)]
         return self._summed(
-            prior_part,
-            lambda photo: _image_gradient(model, self.prior, self.view(model, photo)),
+            prior_part, lambda photo: _image_gradient(model, self.prior, self.view(model, photo))
         )
 
     def diagonal(self, model: Gaussians) -> Vector:

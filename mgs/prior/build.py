@@ -30,12 +30,7 @@ from mgs.errors import InputError
 from mgs.files import atomic_path, check_new_folder, parsing, read_json, write_json
 from mgs.notebook import cloud, html
 from mgs.prior.hull import MOST_PIXELS
-from mgs.prior.photographs import (
-    check_masks,
-    check_photographs,
-    choose_source,
-    surface_of,
-)
+from mgs.prior.photographs import check_masks, check_photographs, choose_source, surface_of
 from mgs.prior.resolution import (
     MOST_GAUSSIANS,
     PIXELS_OF_PHOTOGRAPHS,

@@ -18,13 +18,7 @@ from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame
 from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError
-from mgs.prior.segmentation import (
-    NoSurface,
-    Plane,
-    SegmentedCloud,
-    estimate_normals,
-    ground_plane,
-)
+from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud, estimate_normals, ground_plane
 from mgs.prior.settings import PriorSettings
 from mgs.seeds import derive_seed
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD

@@ -36,13 +36,7 @@ from mgs.splat.derivatives import (
 from mgs.splat.jacobian import vjp
 from mgs.splat.projection import camera_array, project64, projected
 from mgs.splat.recording import frozen, one_at_a_time
-from mgs.splat.rendering import (
-    ListCache,
-    as_colour,
-    as_drjit,
-    by_block,
-    splats_and_lists,
-)
+from mgs.splat.rendering import ListCache, as_colour, as_drjit, by_block, splats_and_lists
 from mgs.splat.walking import pack, packet_count, sums_by_splat
 
 MEANS = {"frozen": 0, "free": 3}
@@ -249,11 +243,7 @@ def _sums(
 
 
 def exact(
-    gaussians: Gaussians,
-    camera: Camera,
-    background: Any,
-    cache: ListCache | None,
-    **options: Any,
+    gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, **options: Any
 ) -> np.ndarray:
     """Exact diagonal of J^T J, in one pass over the image: ten sums per splat, no Jacobian.
 
@@ -285,11 +275,7 @@ def _diagonal(
 
 
 def block(
-    gaussians: Gaussians,
-    camera: Camera,
-    background: Any,
-    cache: ListCache | None,
-    **options: Any,
+    gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, **options: Any
 ) -> np.ndarray:
     """Exact diagonal blocks of J^T J [N,P,P], in one pass over the image: 22 sums per splat, with
     means 34. options: of `_sums`."""

@@ -28,13 +28,7 @@ from mgs.camera import Camera
 from mgs.gaussians import SH_MAX, Gaussians
 from mgs.memory import padded
 from mgs.rotation import QUAT_MIN
-from mgs.splat.constants import (
-    COMPENSATION_MIN,
-    EPS2D,
-    FRUSTUM_MARGIN,
-    LOG_SCALE_RANGE,
-    NEAR,
-)
+from mgs.splat.constants import COMPENSATION_MIN, EPS2D, FRUSTUM_MARGIN, LOG_SCALE_RANGE, NEAR
 from mgs.splat.recording import frozen
 
 LOG2E = 1.4426950408889634
