@@ -33,45 +33,25 @@ from mgs.splat_gltf import read_glb, up_of_glb, write_glb
 from mgs.splat_places import mirrored
 from mgs.splat_ply import parse_ply, write_compressed_ply, write_ply
 
+# Formats that are written, with the endings of their files.
 FORMATS = {"ply": ".ply", "compressed-ply": ".compressed.ply", "glb": ".glb", "spz": ".spz"}
-"""Formats that are written, with the endings of their files."""
-
-SPZ_MAGIC = (b"\x1f\x8b", b"NGSP")
-"""First bytes of SPZ files: up to version 3, which are compressed by gzip, and of 4."""
-
-SPZ_BITS = 23
-"""Bits of the magnitude of an SPZ position, a fixed-point number."""
-
+SPZ_MAGIC = (b"\x1f\x8b", b"NGSP")  # of versions up to 3, compressed by gzip, and of 4
+SPZ_BITS = 23  # bits of the magnitude of an SPZ position, a fixed-point number
+# Magic, version, Gaussians N, SH degree, fractional bits, flags; of version 4 streams, their table.
 SPZ_HEADER = struct.Struct("<4sIIBBBBI")
-"""Magic, version, number of Gaussians N, SH degree, fractional bits, flags, and (version 4) number
-of streams and offset of their table."""
-
-SPZ_ANTIALIASED, SPZ_EXTENSIONS = 1, 2
-"""Flags of the header."""
-
-GZIP_RATIO = 1032
-"""Most bytes that a byte of gzip can stand for."""
-
-SPZ_EXTENSION_BYTES = 1 << 20
-"""Most bytes of the extensions of a file up to version 3."""
-
-SPZ_AXES = 0xADBE0003
-"""Type of the extension that names the axes (`_axes`)."""
-
-RUB = 3
-"""Axes right, up, back: those of an SPZ that names no others."""
-
-UNBOUNDED = 13.8
-"""Logit that stands for an infinite one: an opacity of 1 - 1e-6."""
-
-OTHERS = {
+SPZ_ANTIALIASED, SPZ_EXTENSIONS = 1, 2  # flags of the header
+GZIP_RATIO = 1032  # most bytes that a byte of gzip can stand for
+SPZ_EXTENSION_BYTES = 1 << 20  # most bytes of the extensions of a file up to version 3
+SPZ_AXES = 0xADBE0003  # type of the extension that names the axes (`_axes`)
+RUB = 3  # axes right, up, back: those of an SPZ that names no others
+UNBOUNDED = 13.8  # logit that stands for an infinite one: an opacity of 1 - 1e-6
+OTHERS = {  # formats that are not read
     ".splat": "a .splat",
     ".ksplat": "a .ksplat",
     ".sog": "a SOG",
     ".sogs": "a SOG",
     ".gltf": "a glTF of several",
 }
-"""Endings of formats that are not read."""
 
 
 def load_gaussians(path: str | Path, prior: str | Path | None = None) -> Gaussians:

@@ -25,20 +25,11 @@ from mgs.gaussians import ARRAYS, Gaussians
 from mgs.splat_places import mirrored, moved
 
 EXTENSION = "KHR_gaussian_splatting"
-SPACES = {True: "lin_rec709_display", False: "srgb_rec709_display"}
-"""`Gaussians.linear` -> `colorSpace` of the extension."""
-
-FLOAT, VERTICES = 5126, 34962
-"""Component type of the accessors, and target of the buffer views."""
-
-HANDLED = f"{EXTENSION}|KHR_mesh_quantization|{INSTANCING}"
-"""Pattern of the extensions that are read."""
-
-PLAYCANVAS = "splat-transform"
-"""Generator of files whose x and y point against those of the PLY that they were made of."""
-
-CLEAREST = 1e-6
-"""Opacities are kept this far from 0 and 1 when read, so that their logits are finite."""
+SPACES = {True: "lin_rec709_display", False: "srgb_rec709_display"}  # linear -> `colorSpace`
+FLOAT, VERTICES = 5126, 34962  # component type of the accessors, and target of the buffer views
+HANDLED = f"{EXTENSION}|KHR_mesh_quantization|{INSTANCING}"  # extensions that are read
+PLAYCANVAS = "splat-transform"  # its files have x and y against those of the PLY they were made of
+CLEAREST = 1e-6  # distance of opacities from 0 and 1 when read, so that their logits are finite
 
 
 def _sh_names(coefficients: int) -> list[str]:

@@ -13,14 +13,10 @@ from mgs.gaussians import Gaussians
 from mgs.rotation import rotmat_from_quat
 from mgs.splat.reference import sh_basis
 
+# Coordinates in which each colour coefficient's basis function is odd.
 PARITY = (*("", "y", "z", "x", "xy", "yz", "", "xz"), *("", "y", "xyz", "y", "z", "x", "z", "x"))
-"""Coordinates in which each colour coefficient's basis function is odd."""
-
-UNEVEN = 1e-4
-"""Relative difference of lengths, and cosine between axes, that counts as an error of rounding."""
-
-FAR = 1e4
-"""Coordinate above which float32 is coarser than 1 mm: it is split off as `Gaussians.origin`."""
+UNEVEN = 1e-4  # relative difference of lengths, and cosine between axes: an error of rounding
+FAR = 1e4  # coordinate beyond which float32 is coarser than 1 mm: it goes to `Gaussians.origin`
 
 
 def mirrored(g: Gaussians, signs: tuple[int, int, int]) -> Gaussians:

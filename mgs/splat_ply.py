@@ -23,28 +23,16 @@ from mgs.files import atomic_path, parsing, reading
 from mgs.gaussians import Gaussians
 from mgs.splat_places import settled
 
+# Comment in the header of the files that mgs writes; the layout has no field for the colour space.
+# Most other tools train on sRGB values, so the colours in their files must be blended as sRGB.
 LINEAR_COMMENT = "mgs: colours are linear RGB"
-"""Comment in the header of the files that mgs writes; the layout has no field for the colour space.
-Most other tools train on sRGB values, so the colours in their files must be blended as sRGB."""
-
-ANTIALIASED_COMMENT = "SplatRenderMode: mip"
-"""Comment of antialiased Gaussians (`mgs.gaussians.Gaussians`), as of Brush and PlayCanvas."""
-
+ANTIALIASED_COMMENT = "SplatRenderMode: mip"  # as of Brush and PlayCanvas
+# Of Brush (default, mip, 2dgs), Postshot (0, 1), and mgs 0.1 (antialiased), in lower case.
 RENDER_MODE = re.compile(r"(splatrendermode: |antialiased |mgs: )(\S+)")
-"""Comments about antialiasing, in lower case: of Brush (default, mip, 2dgs), of Postshot (0, 1),
-and of mgs 0.1 (antialiased)."""
-
-CHUNK = 256
-"""Consecutive splats of a compressed PLY that share one row of its element `chunk`."""
-
-PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-"""Properties of a splat in a compressed PLY, one 32-bit word each."""
-
-VECTOR_BITS = ((21, 11), (11, 10), (0, 11))
-"""Lowest bit and number of bits of x, y and z in the word of a packed position or scale."""
-
-TO_ASCII = bytes(byte if byte < 128 else ord("?") for byte in range(256))
-"""Table for `bytes.translate` that replaces bytes that are not ASCII by question marks."""
+CHUNK = 256  # consecutive splats of a compressed PLY that share one row of its element `chunk`
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # 32-bit words
+VECTOR_BITS = ((21, 11), (11, 10), (0, 11))  # of x, y, z in a word: lowest bit, number of bits
+TO_ASCII = bytes(byte if byte < 128 else ord("?") for byte in range(256))  # others become ?
 
 
 def _ply_names(coefficients: int) -> list[str]:

@@ -17,15 +17,11 @@ from mgs.compact.columns import groups
 from mgs.compact.container import FINER, Key
 from mgs.compact.tree import BANDS
 
+# Cost of an error over that of an independent one of its size. A fit moves neighbours together, so
+# what is left out of them adds up. Measured on the demo's boulder.
 COHERENCE = {"colour": 1.75, "directional": 1.75, "scale": 7, "rotation": 14, "opacity": 14}
-"""Cost of an error over that of an independent one of its size. A fit moves neighbours together, so
-what is left out of them adds up. Measured on the demo's boulder."""
-
-ROUND = 0.35
-"""Added before magnitudes are cut to whole steps: below 1/2, since zeros are cheap."""
-
-FLOOR = 1e-12
-"""Least share of the largest h of a column: a step stays finite where no image shows a thing."""
+ROUND = 0.35  # added before magnitudes are cut to whole steps: below 1/2, since zeros are cheap
+FLOOR = 1e-12  # least share of a column's largest h: steps stay finite where no image shows a thing
 
 
 def sensitivity(gradients: np.ndarray, band: np.ndarray) -> np.ndarray:

@@ -16,17 +16,10 @@ from mgs.errors import InputError, missing
 Stream = Callable[[np.ndarray, Any], np.ndarray]
 """(symbols, probability model) -> the symbols: those given, or as many that are read."""
 
-CLASSES = 21
-"""Numbers of bits of a magnitude: 0 to 20."""
-
-LARGEST = (1 << (CLASSES - 1)) - 1
-"""Largest magnitude that is coded."""
-
-FIRST_BLOCK, LAST_BLOCK = 32, 4096
-"""Symbols coded with the same probabilities, first and at most; each block is twice the last."""
-
-UNSEEN = 0.02
-"""Count of a symbol that was never coded."""
+CLASSES = 21  # numbers of bits of a magnitude: 0 to 20
+LARGEST = (1 << (CLASSES - 1)) - 1  # largest magnitude that is coded
+FIRST_BLOCK, LAST_BLOCK = 32, 4096  # symbols coded with the same probabilities, doubled to the last
+UNSEEN = 0.02  # count of a symbol that was never coded
 
 
 def _library() -> Any:

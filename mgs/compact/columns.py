@@ -20,14 +20,9 @@ from mgs.splat.constants import LOG_SCALE_RANGE
 if TYPE_CHECKING:
     from mgs.prior.build import Prior
 
-LOGITS = (-6.0, 7.0)
-"""Range of opacity logits: 0.0025, below ALPHA_MIN, to 0.9991, above ALPHA_MAX."""
-
-FINE = 10
-"""Binary digits of a means' grid below the spacing of a prior."""
-
-UNIT = 20
-"""Binary digits of normals. The grids hide the last bits, in which machines differ."""
+LOGITS = (-6.0, 7.0)  # range of opacity logits: 0.0025, below ALPHA_MIN, to 0.9991, above ALPHA_MAX
+FINE = 10  # binary digits of a means' grid below the spacing of a prior
+UNIT = 20  # binary digits of normals. The grids hide the last bits, in which machines differ.
 
 
 @dataclass(frozen=True)

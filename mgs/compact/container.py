@@ -23,32 +23,19 @@ from mgs.errors import InputError
 from mgs.gaussians import MAX_GAUSSIANS, MAX_SH_DEGREE
 
 MAGIC, MARK, VERSION = b"MGSC", b"\xa7\x5e", 1
-
+# Magic, version, flags, SH degree, cut of the tree, layers, number of Gaussians, tiles, packets;
+# corner of the grid [3], up and origin of the world of the data [3], step of the grid, inset, scale
+# of the steps, hash of the prior.
 HEAD = struct.Struct("<4sBBBBBIHH3d3d3dddd16s")
-"""Magic, version, flags, SH degree, cut of the tree, layers, number of Gaussians, tiles, packets;
-corner of the grid [3], up and origin of the world of the data [3], step of the grid, inset, scale
-of the steps, hash of the prior."""
-
-PACKET = struct.Struct("<HBBI")
-"""Tile, group, layer, and size of the payload."""
-
-ANTIALIASED, LINEAR, SHARED = 1, 2, 4
-"""Flags. SHARED: positions follow from the receiver's prior."""
-
+PACKET = struct.Struct("<HBBI")  # tile, group, layer, and size of the payload
+ANTIALIASED, LINEAR, SHARED = 1, 2, 4  # flags. SHARED: positions follow from the receiver's prior.
+# Content of a packet, by its number.
 GROUPS = ("position", "colour", "directional", "scale", "rotation", "opacity")
-"""Content of a packet, by its number."""
-
-FINER = 4
-"""Steps of a layer over those of the next."""
-
+FINER = 4  # steps of a layer over those of the next
+# 2^(k/4): steps are coded as exponents, with no power function that differs by machine.
 QUARTERS = (1.0, 1.189207115002721, 1.4142135623730951, 1.681792830507429)
-"""2^(k/4): steps are coded as exponents, with no power function that differs by machine."""
-
-ZERO_STEP = 128
-"""Code of a step of 1."""
-
-Key = tuple[int, str, int]
-"""Tile, group and layer of a packet."""
+ZERO_STEP = 128  # code of a step of 1
+Key = tuple[int, str, int]  # tile, group and layer of a packet
 
 
 @dataclass(frozen=True)

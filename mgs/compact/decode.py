@@ -24,15 +24,9 @@ from mgs.splat_places import to_source
 if TYPE_CHECKING:
     from mgs.prior.build import Prior
 
-MOST_BYTES = 1 << 28
-"""Most bytes of a file."""
-
-CELL_BYTES = 200
-"""Memory of a Gaussian while it is decoded, for each column, bytes."""
-
-CELLS_OF_BYTE = 64
-"""Most cells that a byte of a packet places: a file of few bytes never has many."""
-
+MOST_BYTES = 1 << 28  # most bytes of a file
+CELL_BYTES = 200  # memory of a Gaussian while it is decoded, for each column, bytes
+CELLS_OF_BYTE = 64  # most cells that a byte of a packet places: a file of few bytes never has many
 IDENTITY = np.array([[1.0, 0, 0, 0]])
 
 

@@ -18,18 +18,12 @@ from mgs.compact.tree import AXIS_BITS, DEPTH, Tree, cells_of, code_descendants,
 from mgs.data.world import PLUS_Z, Vector
 from mgs.gaussians import Gaussians
 
-LAYERS = 3
-"""Layers of a file; the first has steps 16 times those of the last."""
-
-TILE = 8000
-"""Gaussians of a tile."""
-
-TOP = 3
-"""Fewest cells of a node at the cut, in the mean. Where positions are sent, a node stands for its
-cells in the first packets; elsewhere it has 8 times as many, which takes 3 % fewer bytes."""
-
-WIDEST = 0.6
-"""Largest step of positions over the median distance of neighbours, which would share a cell."""
+LAYERS = 3  # layers of a file; the first has steps 16 times those of the last
+TILE = 8000  # Gaussians of a tile
+# Where positions are sent, a node stands for its cells in the first packets; elsewhere it has 8
+# times as many, which takes 3 % fewer bytes.
+TOP = 3  # fewest cells of a node at the cut, in the mean
+WIDEST = 0.6  # largest step of positions over neighbours' median distance, who would share a cell
 
 Gradients = Callable[[Gaussians], Iterator[Mapping[str, np.ndarray]]]
 """Gradients of sum(z image) by the fields of a model, of some views, z independent signs."""

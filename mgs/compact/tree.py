@@ -15,14 +15,9 @@ import numpy as np
 
 from mgs.compact.coder import Stream, adaptive
 
-AXIS_BITS = 20
-"""Bits of a cell's index along an axis."""
-
-DEPTH = 3 * AXIS_BITS + 1
-"""Bits of a code: those of three axes, and a leading one for the layer."""
-
-BANDS = 12
-"""Kinds of coefficients by the size of their node, each twice as large; the last has the rest."""
+AXIS_BITS = 20  # bits of a cell's index along an axis
+DEPTH = 3 * AXIS_BITS + 1  # bits of a code: those of three axes, and a leading one for the layer
+BANDS = 12  # kinds of coefficients by the size of their node, each twice as large; then the rest
 
 
 def codes_of(cells: np.ndarray, layer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -17,49 +17,24 @@ from mgs.data.visibility import in_image, nearest_point
 if TYPE_CHECKING:
     from mgs.data.structure import Matcher
 
-PAIRS = 12
-"""Most pairs of neighbours that are compared."""
-
+PAIRS = 12  # most pairs of neighbours that are compared
+# Matches of a pair that agree with one epipolar geometry, their share of all matches, and number of
+# such pairs. Fewer are of repeated patterns.
 LEAST_MATCHES, LEAST_SHARE, LEAST_PAIRS = 40, 0.6, 2
-"""Fewest matches of a pair that agree with one epipolar geometry, and their least share of all
-matches, for the pair to count; and fewest such pairs. Fewer are of repeated patterns."""
-
-WRONG = 0.01
-"""Error over the width of the picture, beyond which poses and pictures do not agree."""
-
-SOUND = 0.25
-"""Share of the pairs that must be wrong: the error is this quantile over the pairs."""
-
-MENDED = 0.25
-"""Error under another convention over that under ours, below which that convention is named."""
-
-ZOOM, SCALE = 2.5, 1200.0
-"""Largest factors, either way, on the focal length, and on the poses' lengths against the depth,
-that are tried."""
-
-HIDDEN = 1.05
-"""Depth of a point over that of the picture, beyond which the point is taken as hidden."""
-
-LEAST_SEEN = 0.25
-"""Least share of the points of a depth image that a neighbour must see for their comparison."""
-
+WRONG = 0.01  # error over the width of the picture, beyond which poses and pictures do not agree
+SOUND = 0.25  # share of the pairs that must be wrong: the error is this quantile over the pairs
+MENDED = 0.25  # error under another convention over ours, below which that one is named
+ZOOM, SCALE = 2.5, 1200.0  # largest factors tried on focal length, and on lengths over depth
+HIDDEN = 1.05  # depth of a point over that of the picture, beyond which the point is hidden
+LEAST_SEEN = 0.25  # least share of a depth image's points that a neighbour must see to be compared
+# Fewest masks that are compared; error of their outlines, pixels, that is never wrong; and shuffled
+# orders of the pictures, half of whose median error is wrong.
 LEAST_OUTLINES, OUTLINE, ORDERS = 6, 2.0, 5
-"""Fewest masks that are compared; error of their outlines, pixels, that is never wrong; and number
-of shuffled orders of the pictures, half of whose median error is wrong."""
-
-PARALLEL = 0.02
-"""Least mean squared sine between the optical axes and their mean direction. Cameras that look the
-same way do not show where they look."""
-
-SEEN, UNSEEN = 0.9, 0.5
-"""Share of the cameras in whose picture the place is that most look at: least of right poses, and
-most of wrong ones."""
-
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From OpenGL's camera axes to OpenCV's, and back."""
-
+PARALLEL = 0.02  # least mean squared sine between the optical axes and their mean direction
+SEEN, UNSEEN = 0.9, 0.5  # share of cameras that show where most look: least of right, most of wrong
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's camera axes to OpenCV's, and back
+# From a body's axes (x forward, y left, z up) to OpenCV's.
 BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
-"""From a body's axes (x forward, y left, z up) to OpenCV's."""
 
 Convention = Callable[[np.ndarray], np.ndarray]
 
@@ -70,6 +45,7 @@ OF_A_BODY = (
     "the camera in the body"
 )
 
+# Mistakes in what poses mean, and world-to-camera without them, from ours.
 CONVENTIONS: tuple[tuple[str, Convention], ...] = (
     ("have the camera axes of OpenCV in place of OpenGL's, or the reverse", lambda W: FLIP @ W),
     (INVERSE, np.linalg.inv),
@@ -78,10 +54,8 @@ CONVENTIONS: tuple[tuple[str, Convention], ...] = (
     (OF_A_BODY, lambda W: BODY @ FLIP @ W),
     ("are of mirrored pictures", lambda W: np.diag([-1.0, 1, 1, 1]) @ W),
 )
-"""Mistakes in what poses mean, and world-to-camera without them, from ours."""
 
-Error = Callable[[Convention, float], float]
-"""error(convention, zoom): pixels, where poses and focal lengths are changed by these."""
+Error = Callable[[Convention, float], float]  # error(convention, zoom) of such cameras, pixels
 
 
 @dataclass(frozen=True)

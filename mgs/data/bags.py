@@ -24,12 +24,9 @@ from mgs.errors import InputError
 from mgs.files import atomic_path, parsing, read_bytes, reading
 from mgs.images import read_values, write_png
 
-STORAGE = (".mcap", ".db3")
-"""Endings of the files of a ROS 2 bag."""
-
+STORAGE = (".mcap", ".db3")  # endings of the files of a ROS 2 bag
 KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-
-COLOURS = {
+COLOURS = {  # encoding of a colour image -> its channels in the order R, G, B
     "rgb8": [0, 1, 2],
     "bgr8": [2, 1, 0],
     "rgba8": [0, 1, 2],
@@ -37,25 +34,17 @@ COLOURS = {
     "mono8": [0, 0, 0],
     "8UC3": [2, 1, 0],
 }
-"""Encoding of a colour image -> its channels in the order R, G, B."""
 
+# Encoding of a depth image -> type of its numbers, and metres in a step (REP 118).
 DEPTHS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
-"""Encoding of a depth image -> type of its numbers, and metres in a step (REP 118)."""
-
-DEPTH_HEADER = 12
-"""Bytes before the PNG of a compressedDepth image: a number, and a and b as float32."""
-
-LENSES = {
+DEPTH_HEADER = 12  # bytes before the PNG of a compressedDepth image: a number; a and b as float32
+LENSES = {  # distortion model of a camera_info -> names of its first coefficients
     **dict.fromkeys(("plumb_bob", "rational_polynomial", ""), ("k1", "k2", "p1", "p2", "k3")),
     **dict.fromkeys(("equidistant", "fisheye"), ("k1", "k2", "k3", "k4")),
 }
-"""Distortion model of a camera_info -> names of its first coefficients."""
 
-YAML_BYTES = 1 << 20
-"""Most bytes of the metadata of a bag."""
-
-SYNCHRONOUS = 0.05
-"""Largest difference of the times of a colour and its depth image, seconds."""
+YAML_BYTES = 1 << 20  # most bytes of the metadata of a bag
+SYNCHRONOUS = 0.05  # largest difference of the times of a colour and its depth image, seconds
 
 
 def is_bag(path: Path) -> bool:
@@ -122,8 +111,7 @@ def message_of(pose: Any) -> np.ndarray:
     return rigid((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
 
 
-Samples = dict[str, list[tuple[float, np.ndarray]]]
-"""Parent -> (time, child-to-parent)."""
+Samples = dict[str, list[tuple[float, np.ndarray]]]  # parent -> (time, child-to-parent)
 
 
 class Tree:

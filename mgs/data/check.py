@@ -13,12 +13,9 @@ from mgs.data.frames import Frame
 from mgs.data.visibility import has_masks, in_image
 from mgs.errors import InputError
 
-TOLERANCE = 0.02
-"""Relative excess of depth beyond which a frame sees through a point of the rock."""
-
-MAX_SEEN_THROUGH = 0.05
-"""Largest share of points seen through, median over neighbouring frames. Measured on rendered rocks
-of 32x24 to 320x240 pixels: 0 in sound datasets, 0.07 to 0.3 with all depths 10 % too large."""
+TOLERANCE = 0.02  # relative excess of depth beyond which a frame sees through a point of the rock
+# Measured on rendered rocks: 0 in sound datasets, 0.07 to 0.3 with all depths 10 % too large.
+MAX_SEEN_THROUGH = 0.05  # largest share of points seen through, median over neighbouring frames
 
 
 @dataclass(frozen=True)

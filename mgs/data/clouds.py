@@ -16,10 +16,7 @@ from mgs.errors import InputError
 from mgs.files import atomic_path, parsing, reading
 
 FIELDS = ("x", "y", "z", "nx", "ny", "nz", "track", "error")
-
-NEAREST_SHARE = 0.25
-"""Share of the cameras with a point in their image, nearest first, that are taken to have seen it
-if the cloud does not say."""
+NEAREST_SHARE = 0.25  # share of cameras with a point in view taken to have seen it, nearest first
 
 
 @dataclass(frozen=True)

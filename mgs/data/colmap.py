@@ -22,6 +22,8 @@ from mgs.data.structure import cloud_of
 from mgs.errors import InputError
 from mgs.files import parsing, reading
 
+# Binary file -> bytes of a record, whether a name follows, format of the count of the list that
+# follows ("": none of this kind), and bytes of each of its items (COLMAP's output formats).
 RECORDS = {
     "cameras.bin": (24, False, "", 0),
     "images.bin": (64, True, "<Q", 24),
@@ -29,11 +31,8 @@ RECORDS = {
     "frames.bin": (64, False, "<I", 16),
     "rigs.bin": (4, False, "", 0),
 }
-"""Binary file -> bytes of a record, whether a name follows, format of the count of the list that
-follows ("": none of this kind), and bytes of each of its items (COLMAP's output formats)."""
 
-COMPARED = 20
-"""About the number of pictures whose points are compared with their poses."""
+COMPARED = 20  # about the number of pictures whose points are compared with their poses
 
 
 def _is_whole(path: Path) -> bool:

@@ -20,26 +20,17 @@ from mgs.files import THERE, check_new_folder, read_json, remove_leftovers, writ
 from mgs.memory import padded
 from mgs.notebook import html, thumbnails
 
-PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
-"""Camera models of transforms.json that are pinholes if their distortion is zero."""
-
+PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")  # those without distortion
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
-
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "is_fisheye")
-
-FRAME_INTERVAL = 0.5
-"""Seconds between keyframes (paper, section IV-A)."""
-
-TEST_FOLDER = "test"
-"""Subfolder with the test views, itself a dataset."""
-
-FILES = {
+FRAME_INTERVAL = 0.5  # seconds between keyframes (paper, section IV-A)
+TEST_FOLDER = "test"  # subfolder with the test views, itself a dataset
+FILES = {  # path fields of `Frame` -> their keys in transforms.json
     "image_path": "file_path",
     "depth_path": "depth_file_path",
     "mask_path": "mask_path",
     "rock_path": "rock_file_path",
 }
-"""Path fields of `Frame` -> their keys in transforms.json."""
 
 
 @dataclass(frozen=True, repr=False)

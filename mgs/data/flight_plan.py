@@ -19,22 +19,13 @@ from mgs.camera import Camera, heading_and_pitch
 from mgs.errors import InputError, printable
 from mgs.files import atomic_path, write_json
 
-EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563
-"""Radius of the equator, metres, and flattening of the ellipsoid WGS 84."""
-
-HIGHEST = 1e5
-"""Largest height of an origin above or below the sea, metres."""
-
+EQUATOR, FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84: radius, metres, and flattening
+HIGHEST = 1e5  # largest height of an origin above or below the sea, metres
+# MAVLink commands: NAV_WAYPOINT, NAV_RETURN_TO_LAUNCH, NAV_TAKEOFF, DO_CHANGE_SPEED,
+# DO_MOUNT_CONTROL, IMAGE_START_CAPTURE.
 WAYPOINT, HOME, TAKEOFF, SPEED, MOUNT, PICTURE = 16, 20, 22, 178, 205, 2000
-"""MAVLink commands: NAV_WAYPOINT, NAV_RETURN_TO_LAUNCH, NAV_TAKEOFF, DO_CHANGE_SPEED,
-DO_MOUNT_CONTROL, IMAGE_START_CAPTURE."""
-
-GLOBAL_RELATIVE, MISSION = 3, 2
-"""MAVLink frames: altitude above home; no position."""
-
-MAVLINK_TARGETING = 2
-"""Mode of the mount: angles from the mission."""
-
+GLOBAL_RELATIVE, MISSION = 3, 2  # MAVLink frames: altitude above home; no position
+MAVLINK_TARGETING = 2  # mode of the mount: angles from the mission
 KML = "http://www.opengis.net/kml/2.2"
 
 
@@ -240,4 +231,3 @@ WRITERS: dict[str, Callable[[Path, Sequence[Stop], Origin, float, float], None]]
     ".waypoints": _write_waypoints,
     ".kml": _write_kml,
 }
-"""Formats of flight plans by suffix."""

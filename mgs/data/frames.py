@@ -15,11 +15,8 @@ from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.images import image_size, read_depth, read_mask, read_png
 
-SURVEY_FOLDER = "survey"
-"""Subfolder of an on-demand dataset with its survey, itself a dataset: depth and masks only."""
-
-CAPTURED = "captured"
-"""Subfolder of an on-demand dataset with the records of its live capture, NAME.json."""
+SURVEY_FOLDER = "survey"  # of an on-demand dataset: its survey, a dataset with depth and masks only
+CAPTURED = "captured"  # of an on-demand dataset: records of its live capture, NAME.json
 
 
 @dataclass(frozen=True)

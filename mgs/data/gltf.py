@@ -16,25 +16,14 @@ import numpy as np
 from mgs.errors import InputError
 from mgs.rotation import rotmat_from_quat
 
-MAGIC = b"glTF"
-"""First bytes of a binary file (.glb)."""
-
-JSON, BINARY = 0x4E4F534A, 0x004E4942
-"""Types of the two chunks of a GLB."""
-
+MAGIC = b"glTF"  # first bytes of a binary file (.glb)
+JSON, BINARY = 0x4E4F534A, 0x004E4942  # types of the two chunks of a GLB
+# Component types of accessors -> NumPy's.
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-"""Component types of accessors -> NumPy's."""
-
-SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-"""Types of accessors -> numbers of an element."""
-
+SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}  # of an accessor -> numbers of an element
 INSTANCING = "EXT_mesh_gpu_instancing"
-
-DEEPEST = 200
-"""Most levels of nodes."""
-
-Transform = np.ndarray
-"""Affine map [4,4] from a mesh's coordinates to the scene's."""
+DEEPEST = 200  # most levels of nodes
+Transform = np.ndarray  # affine map [4,4] from a mesh's coordinates to the scene's
 
 
 class Gltf:

@@ -26,11 +26,8 @@ from mgs.errors import InputError, Notice
 from mgs.files import copy_file, fingerprint, folder_locked, remove_file, write_json
 from mgs.images import PNG_BIT_DEPTH, read_depth, read_mask, read_rgba, write_exr, write_png
 
-CHECKED = 4
-"""About the number of pictures that are checked before an import."""
-
-RECORD = "import.json"
-"""Record of what is imported; an interrupted import of the same continues."""
+CHECKED = 4  # about the number of pictures that are checked before an import
+RECORD = "import.json"  # record of what is imported; an interrupted import of the same continues
 
 
 def import_source(

@@ -18,18 +18,14 @@ Undo = Callable[[np.ndarray, bool], np.ndarray]
 """undo(pixels, smooth): resample an image [H,W] or [H,W,C] to another camera, by interpolation if
 `smooth`, else by single pixels (depth)."""
 
-GENERAL = {
+GENERAL = {  # camera models that are cases of a more general one, which takes their place
     **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL"), "FULL_OPENCV"),
     **dict.fromkeys(("OPENCV", "FULL_OPENCV"), "FULL_OPENCV"),
     **dict.fromkeys(("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), "OPENCV_FISHEYE"),
 }
-"""Camera models that are cases of a more general one, which takes their place."""
 
-FARTHEST = np.tan(np.radians(60))
-"""Tangent of the largest angle to the axis in an undistorted image. Wider fisheyes are cut off."""
-
-BLOCK = 1 << 20
-"""Pixels that are mapped at once."""
+FARTHEST = np.tan(np.radians(60))  # largest tangent in an undistorted image; fisheyes are cut
+BLOCK = 1 << 20  # pixels that are mapped at once
 
 
 @dataclass(frozen=True)

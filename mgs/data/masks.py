@@ -16,14 +16,9 @@ from mgs.data.visibility import has_masks
 from mgs.errors import InputError
 from mgs.images import write_png
 
-SHEET = "masks.png"
-"""Contact sheet, in the folder of the dataset."""
-
-THUMBNAIL = 240
-"""Width of a photograph in the contact sheet, pixels."""
-
-ACROSS = 6
-"""Photographs in a row of the contact sheet."""
+SHEET = "masks.png"  # contact sheet, in the folder of the dataset
+THUMBNAIL = 240  # width of a photograph in the contact sheet, pixels
+ACROSS = 6  # photographs in a row of the contact sheet
 
 
 def make_masks(

@@ -17,9 +17,7 @@ from mgs.data.gltf import INSTANCING, Gltf, Transform, triangles
 from mgs.errors import InputError
 from mgs.images import check_pixels
 
-SHAPES = rf"KHR_mesh_quantization|{INSTANCING}|KHR_materials_\w+"
-"""Pattern of the extensions under which a shape is read; those of textures do not change it."""
-
+SHAPES = rf"KHR_mesh_quantization|{INSTANCING}|KHR_materials_\w+"  # these change no shape
 GLOSS = "KHR_materials_pbrSpecularGlossiness"
 REPEAT = 10497
 

@@ -23,22 +23,15 @@ if TYPE_CHECKING:
     import trimesh
 
 GLTF = (".glb", ".gltf")
-
-MESHES = (*GLTF, ".obj", ".ply", ".stl", ".off")
-"""Suffixes of the mesh files that are read; the library's others include archives."""
-
-TEXTURES = ("image", "baseColorTexture")
-"""Attributes of trimesh's materials that are images, of files that are no glTF."""
-
-PLAIN_PLY = re.compile(
+MESHES = (*GLTF, ".obj", ".ply", ".stl", ".off")  # the library reads others, including archives
+TEXTURES = ("image", "baseColorTexture")  # images of trimesh's materials, of files that are no glTF
+PLAIN_PLY = re.compile(  # header of a PLY file with vertices and triangles only
     rb"ply\nformat binary_little_endian 1.0\n(?:comment [^\n]*\n)*element vertex (\d{1,9})\n"
     rb"property float x\nproperty float y\nproperty float z\nelement face (\d{1,9})\n"
     rb"property list uchar int vertex_indices\nend_header\n"
 )
-"""Header of a PLY file with vertices and triangles only."""
 
-FURTHEST = 1e15
-"""Largest coordinate of a mesh, metres: the squares of areas must fit float32."""
+FURTHEST = 1e15  # largest coordinate of a mesh, metres: the squares of areas must fit float32
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from mgs.data.shots import Shot, Source, frame_name
 from mgs.errors import InputError
 from mgs.files import parsing, read_xml
 
-MODELS = {"frame": "OPENCV", "fisheye": "THIN_PRISM_FISHEYE"}
-"""Type of a sensor -> COLMAP's model of the same formula."""
+MODELS = {"frame": "OPENCV", "fisheye": "THIN_PRISM_FISHEYE"}  # COLMAP's of the same formula
 
 
 def is_metashape(path: Path) -> bool:

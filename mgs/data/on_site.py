@@ -23,12 +23,11 @@ from mgs.files import (
 )
 from mgs.images import unlimited_headers
 
-COPIES, DATASET, RECORD = "photographs", "dataset", "copies.json"
-"""Folders at a site: reduced copies of the photographs, and the dataset of them; names of the
-copies, by which the site is known and which alone are removed."""
-
-DOWNSCALE = 3
-"""Width of the copies over that of the dataset's images, which candidates are rated by."""
+COPIES, DATASET = "photographs", "dataset"  # folders of a site: reduced copies, their dataset
+RECORD = (
+    "copies.json"  # names of the copies, by which the site is known, and which alone are removed
+)
+DOWNSCALE = 3  # width of the copies over that of the dataset's images, which rate candidates
 
 
 def holds_photographs(folder: Path) -> bool:

@@ -23,31 +23,14 @@ from mgs.images import exif_orientation, read_rgba
 from mgs.progress import report
 
 KIND = "photographs"
-
-FEWEST = 3
-"""Fewest photographs that can be placed."""
-
-EXHAUSTIVE = 150
-"""Most photographs of which all pairs are matched. Of more, those near each other in order are."""
-
-NEAR = 10
-"""Photographs after each in order that it is then matched with, and at distances of powers of 2."""
-
-LEAST_FEATURES = 100
-"""Fewest features of a photograph that is neither blurred nor blank."""
-
-LEAST_MATCHES = 15
-"""Fewest matches that one epipolar geometry explains, for two photographs to overlap."""
-
-GPS_ERROR = 0.1
-"""Largest median distance of cameras from their positions by GPS, over the extent of these, for
-GPS to give the scale."""
-
-UNREAD = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw")
-"""Endings of pictures of phones and cameras that are left out with a line."""
-
-NAMED = 10
-"""Most photographs that a line names."""
+FEWEST = 3  # fewest photographs that can be placed
+EXHAUSTIVE = 150  # most photographs of which all pairs are matched; of more, those near in order
+NEAR = 10  # photographs after each in order it is matched with, and at distances of powers of 2
+LEAST_FEATURES = 100  # fewest features of a photograph that is neither blurred nor blank
+LEAST_MATCHES = 15  # matches that one epipolar geometry explains, for two photographs to overlap
+GPS_ERROR = 0.1  # largest median distance of cameras from GPS, over the extent, to scale by GPS
+UNREAD = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw")  # left out with a line
+NAMED = 10  # most photographs that a line names
 
 
 def photographs_in(source: Path) -> list[Path]:

@@ -18,8 +18,7 @@ from mgs.data.world import World
 from mgs.errors import InputError
 from mgs.memory import padded
 
-SMALL = 40_000
-"""Pixels of a picture in which a mesh is searched."""
+SMALL = 40_000  # pixels of a picture in which a mesh is searched
 
 
 def mesh_in_sight(

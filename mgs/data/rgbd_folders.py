@@ -21,17 +21,10 @@ from mgs.errors import InputError
 from mgs.files import read_json, read_text
 from mgs.images import image_size
 
-TUM_DEPTH_UNIT = 1 / 5000
-"""Metres in a step of a TUM RGB-D depth image."""
-
-LARGEST_NUMBER = 1e15
-"""Numbers beyond it are mistakes, also of times."""
-
-SYNCHRONOUS = 0.02
-"""Largest difference of the times of a colour and its depth image, seconds (TUM's associate.py)."""
-
-OPEN3D_INTERVAL = 0.5
-"""Seconds between two images of an Open3D folder, which has no times: all become keyframes."""
+TUM_DEPTH_UNIT = 1 / 5000  # metres in a step of a TUM RGB-D depth image
+LARGEST_NUMBER = 1e15  # numbers beyond it are mistakes, also of times
+SYNCHRONOUS = 0.02  # most seconds between a colour and its depth image (TUM's associate.py)
+OPEN3D_INTERVAL = 0.5  # seconds between images of an Open3D folder, without times: all are taken
 
 
 def rows(path: Path, least: int) -> list[list[str]]:

@@ -18,21 +18,14 @@ from mgs.data.world import PLUS_Z, Vector, degrees_between, up_of_cameras
 from mgs.errors import InputError
 from mgs.images import exif_orientation, image_size
 
-LEVELLED = 10.0
-"""Angle from +Z, degrees, up to which cameras' common up vector counts as +Z."""
-
+LEVELLED = 10.0  # angle from +Z, degrees, up to which cameras' common up vector counts as +Z
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
-
-FAR = 1000.0
-"""Distance of the cameras from the origin over their extent, beyond which float32 loses digits of
-the scene and the origin is moved."""
-
-HELD = {
+FAR = 1000.0  # distance from the origin over the cameras' extent, beyond which the origin is moved
+HELD = {  # EXIF orientation -> axes of the camera of the turned picture, in those of the stored one
     3: [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
     6: [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
     8: [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
 }
-"""EXIF orientation -> axes of the camera of the turned picture, in those of the stored one."""
 
 
 @dataclass(frozen=True)

@@ -28,25 +28,21 @@ from mgs.data.world import unit_up
 from mgs.errors import InputError
 from mgs.images import image_size
 
-COEFFICIENTS = (
+COEFFICIENTS = (  # keys of transforms.json that COLMAP's camera models name alike
     *(f"k{i}" for i in range(1, 7)),
     *("p1", "p2", "sx1", "sy1", "omega", "k", "k0", "alpha", "beta"),
 )
-"""Keys of transforms.json that are parameters of COLMAP's camera models, by the same name."""
 
+# NeRF-synthetic names images without a suffix.
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
-"""NeRF-synthetic names images without a suffix."""
-
-SPLITS = ("train_filenames", "val_filenames", "test_filenames")
-"""Keys of transforms.json that list the images of a split (nerfstudio)."""
-
-SHRUNK = (2, 4, 8)
-"""Factors by which images may be smaller than transforms.json says; their cameras are scaled."""
+SPLITS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists of images
+SHRUNK = (2, 4, 8)  # factors by which images may be smaller than transforms.json says
 
 Reader = Callable[[Path, Path | None, Spacing, Path, str | None], Source]
 """(path, images, spacing of keyframes, folder to unpack into, topic of poses) -> source. images:
 folder of the images, or of a bag their topic."""
 
+# Recordings of robots: kind -> (whether a path is one, its reader).
 RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
     "ROS bag": (
         is_bag,
@@ -62,11 +58,9 @@ RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
         lambda path, images, *_: read_metashape(path, images or path.parent / "images"),
     ),
 }
-"""Recordings of robots: kind -> (whether a path is one, its reader)."""
 
 
-TRAINING = "transforms_train.json"
-"""The training split of NeRF-synthetic data."""
+TRAINING = "transforms_train.json"  # the training split of NeRF-synthetic data
 
 
 def read_source(

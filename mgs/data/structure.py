@@ -26,32 +26,15 @@ from mgs.files import read_json, write_json
 from mgs.images import exif_orientation, unlimited_headers
 from mgs.progress import report
 
-WIDEST = 1000
-"""Longer side, pixels, to which larger pictures are reduced for features."""
-
-FEATURES = 4096
-"""Most features of a picture."""
-
-PICTURES_AT_ONCE, PAIRS_AT_ONCE = 8, 64
-"""Pictures and pairs of one call of pycolmap, after which progress is reported."""
-
-ALIKE = 16
-"""Pictures that each is matched with where poses are known: the most alike by pose."""
-
-CLOUD = "sparse.ply"
-"""File of a dataset with its triangulated points."""
-
-LEAST_POINTS = 100
-"""Fewest triangulated points from which a fit can start."""
-
-POSITION_STD = 0.0025
-"""Standard deviation of a given position, over the distance to what its camera sees."""
-
-ADJUSTMENTS = 2
-"""Bundle adjustments of given poses, each after another triangulation."""
-
-LEAST_SHARED = 15
-"""Fewest points that a picture shares with others for its pose to be adjusted."""
+WIDEST = 1000  # longer side, pixels, to which larger pictures are reduced for features
+FEATURES = 4096  # most features of a picture
+PICTURES_AT_ONCE, PAIRS_AT_ONCE = 8, 64  # of one call of pycolmap, then progress is reported
+ALIKE = 16  # pictures that each is matched with where poses are known: the most alike by pose
+CLOUD = "sparse.ply"  # file of a dataset with its triangulated points
+LEAST_POINTS = 100  # fewest triangulated points from which a fit can start
+POSITION_STD = 0.0025  # standard deviation of a given position, over the distance to what is seen
+ADJUSTMENTS = 2  # bundle adjustments of given poses, each after another triangulation
+LEAST_SHARED = 15  # fewest points that a picture shares with others for its pose to be adjusted
 
 
 class Matcher:

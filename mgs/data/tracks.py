@@ -13,22 +13,12 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from mgs.errors import InputError
 
-LONG = 3.0
-"""Times between two samples of a track over their median, beyond which poses are not interpolated.
-"""
-
-STILL = 0.01
-"""Change of a pose, metres and radians, below which it is interpolated over any time."""
-
-NEARLY_RIGID = 1e-2
-"""Largest error of an entry of a rotation that was rounded or fused when it was written. It is
-mended."""
-
+LONG = 3.0  # time between two samples over the median, beyond which poses are not interpolated
+STILL = 0.01  # change of a pose, metres and radians, below which it is interpolated over any time
+NEARLY_RIGID = 1e-2  # largest error of an entry of a rotation that was rounded, which is mended
+# Note about poses that are NEARLY_RIGID, after their number.
 ROUNDED = "rotations are not quite rotations, as they were rounded; they are made orthonormal"
-"""Note about poses that are NEARLY_RIGID, after their number."""
-
-WITHOUT_POSE = "without a pose at its time"
-"""Reason to leave an image out."""
+WITHOUT_POSE = "without a pose at its time"  # reason to leave an image out
 
 
 def posed(

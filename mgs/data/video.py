@@ -11,9 +11,7 @@ from mgs.images import write_png
 from mgs.progress import report
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-
-JUDGED = 640
-"""Longer side, pixels, to which frames are reduced to compare how sharp they are."""
+JUDGED = 640  # longer side, pixels, to which frames are reduced to compare how sharp they are
 
 
 def sharpest_frames(video: Path, folder: Path, spacing: Spacing) -> list[Path]:

@@ -13,8 +13,7 @@ from mgs.camera import Camera
 if TYPE_CHECKING:
     from mgs.data.frames import Frame
 
-GRAZING = 0.2
-"""Least cosine of the angle between normal and view that widens the tolerance."""
+GRAZING = 0.2  # least cosine of the angle between normal and view that widens the tolerance
 
 
 def in_image(camera: Camera, pixels: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -23,14 +23,10 @@ Vector = tuple[float, float, float]
 
 PLUS_Z: Vector = (0.0, 0.0, 1.0)
 
-LEVEL = 0.1
-"""Least second singular value of the cameras' right-hand axes over the square root of their number.
-Below it the cameras look the same way, the direction across their axes is not unique, and the mean
-of their upward axes is taken."""
-
-ONE_WAY, CANCELLED = 0.9, 0.5
-"""Least length of the mean viewing direction, and largest of the mean upward axis, of cameras that
-survey from above in lines there and back."""
+# Below it cameras look one way, and the mean of their upward axes is taken.
+LEVEL = 0.1  # least second singular value of right-hand axes over the root of their number
+# Of cameras that survey from above in lines there and back.
+ONE_WAY, CANCELLED = 0.9, 0.5  # least mean viewing direction, largest mean upward axis, lengths
 
 
 @dataclass(frozen=True)
@@ -73,8 +69,7 @@ class World:
         return thing.turned(turn) if isinstance(thing, Camera) else thing @ turn.T
 
 
-UPRIGHT = World()
-"""A world with +Z up, in metres: nothing is turned."""
+UPRIGHT = World()  # a world with +Z up, in metres: nothing is turned
 
 
 def up_of_cameras(cameras: Sequence[Camera]) -> Vector:

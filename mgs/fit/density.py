@@ -18,35 +18,20 @@ from mgs.memory import padded
 from mgs.rotation import rotmat_from_quat
 from mgs.splat import as_drjit
 
-LEAST_OPACITY = 0.005
-"""Opacity below which a Gaussian is removed."""
-
-LEAST_GRADIENT = 2e-4
-"""Least gradient (`Slopes`) at which `adapt` adds a Gaussian. This and the next numbers are those
-of Kerbl et al. 2023 and, where the paper is silent, of the authors' program."""
-
-SMALL = 0.01
-"""Largest standard deviation of a Gaussian that is copied and not divided, over the extent."""
-
-DIVISION = 1.6
-"""Factor by which the two parts of a divided Gaussian are smaller."""
-
-TOO_LARGE = 0.1
-"""Largest standard deviation of a Gaussian that is kept, over the extent, after RESET_STEPS."""
-
-RESET_OPACITY, RESET_STEPS = 0.01, 3000
-"""Opacity to which all are lowered, and steps between that."""
-
+LEAST_OPACITY = 0.005  # opacity below which a Gaussian is removed
+# Numbers of `adapt` are those of Kerbl et al. 2023 or, where it is silent, of the authors' program.
+LEAST_GRADIENT = 2e-4  # least gradient (`Slopes`) at which a Gaussian is added
+SMALL = 0.01  # largest standard deviation of a Gaussian that is copied, not divided; over extent
+DIVISION = 1.6  # factor by which the two parts of a divided Gaussian are smaller
+TOO_LARGE = 0.1  # largest standard deviation of a Gaussian after RESET_STEPS, over the extent
+RESET_OPACITY, RESET_STEPS = 0.01, 3000  # opacity to which all are lowered, and steps between that
+# Steps between two calls of `adapt`, and the steps after and before which it is called; the last is
+# half of all steps in a shorter fit.
 ADAPTION_STEPS, ADAPTION_FROM, ADAPTION_UNTIL = 100, 500, 15_000
-"""Steps between two calls of `adapt`, and the steps after and before which it is called; the last
-is half of all steps in a shorter fit."""
-
+# Share of the Gaussians that `split` divides, distance of a half from the middle and length of a
+# half, over the length of the whole. Chosen constants.
 GROWTH, APART, SHORTER = 0.3, 0.6, 0.75
-"""Share of the Gaussians that `split` divides, distance of a half from the middle and length of a
-half, over the length of the whole. Chosen constants."""
-
-SPLITS = 6
-"""Times that `split` is called, in the first half of the passes."""
+SPLITS = 6  # times that `split` is called, in the first half of the passes
 
 
 @dataclass(frozen=True)
@@ -170,7 +155,6 @@ DENSITIES: dict[str, Density | None] = {
     "adaptive": Density(adapt, _adaption_times),
     "split": Density(split, lambda passes, _: _split_times(passes)),
 }
-"""Density controls by name."""
 
 
 def controlled(

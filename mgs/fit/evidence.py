@@ -35,11 +35,8 @@ from mgs.memory import Deferred
 from mgs.policy.criteria import LEARN_LOSS
 from mgs.splat import ListCache, as_drjit, groups
 
-DIRECTIONAL = "directional"
-"""Kind of the colour coefficients of degrees above 0."""
-
-BLOCKS = 4
-"""Blocks of neighbouring views; each is left out of a fit once."""
+DIRECTIONAL = "directional"  # kind of the colour coefficients of degrees above 0
+BLOCKS = 4  # blocks of neighbouring views; each is left out of a fit once
 
 Array = NDArray[np.floating]
 Mask = NDArray[np.bool_]

@@ -56,9 +56,8 @@ class Fit:
     stop_reason: StopReason
 
 
-COLOUR_MIN = 1e-4
-"""Lower bound of colours of degree 0 after a step, linear RGB. It is above 0, where a colour is
-clamped and has no gradient, and below half a step of an 8-bit sRGB image."""
+# Above 0, where a colour is clamped and has no gradient; below half a step of an 8-bit sRGB image.
+COLOUR_MIN = 1e-4  # lower bound of colours of degree 0 after a step, linear RGB
 
 
 def _in_bounds(model: Gaussians) -> Gaussians:

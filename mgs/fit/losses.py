@@ -11,24 +11,14 @@ import numpy as np
 
 from mgs.metrics import SSIM_SIGMA, SSIM_WINDOW
 
-DSSIM_SHARE = 0.2
-"""Share of the dissimilarity in `l1_dssim` (Kerbl et al. 2023)."""
-
-SSIM_CONSTANTS = 0.01**2, 0.03**2
-"""Constants of SSIM for values from 0 to 1 (Wang et al. 2004)."""
-
-HALF = SSIM_WINDOW // 2
-"""Pixels of the window of SSIM on each side of its centre."""
+DSSIM_SHARE = 0.2  # share of the dissimilarity in `l1_dssim` (Kerbl et al. 2023)
+SSIM_CONSTANTS = 0.01**2, 0.03**2  # constants of SSIM for values from 0 to 1 (Wang et al. 2004)
+HALF = SSIM_WINDOW // 2  # pixels of the window of SSIM on each side of its centre
 
 _window = np.exp(-0.5 * (np.arange(-HALF, HALF + 1) / SSIM_SIGMA) ** 2)
-WINDOW = (_window / _window.sum()).tolist()
-"""Weights of the window of SSIM along an axis."""
-
-STRIP = 8
-"""Values of an image that one lane makes."""
-
-Size = tuple[int, int, int]
-"""Width, height and channels of an image."""
+WINDOW = (_window / _window.sum()).tolist()  # weights of the window of SSIM along an axis
+STRIP = 8  # values of an image that one lane makes
+Size = tuple[int, int, int]  # width, height and channels of an image
 
 Loss = Callable[[Any, Any, Any, Size, bool], Any]
 """loss(drawn, pixels, weights, size, linear) -> what each pixel value adds, Float [H*W*C]. Render
@@ -54,7 +44,6 @@ def l1_dssim(drawn: Any, pixels: Any, weights: Any, size: Size, linear: bool) ->
 
 
 LOSSES: dict[str, Loss] = {"squared": squared, "l1-dssim": l1_dssim}
-"""Losses by name."""
 
 
 def loss_name(loss: str | Loss) -> str:

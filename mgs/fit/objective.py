@@ -42,9 +42,7 @@ from mgs.splat.projection import camera_array, project, projected
 from mgs.splat.recording import frozen, one_at_a_time
 from mgs.splat.rendering import composite_channels, splats_and_lists
 
-Vector = list[Any]
-"""One number per learned parameter: a TensorXf of the shape of each array of
-`mgs.gaussians.learned`."""
+Vector = list[Any]  # of each array of `mgs.gaussians.learned`, a TensorXf of its shape
 
 
 @dataclass

@@ -9,26 +9,18 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-ADAM_BETAS = (0.9, 0.999)
-"""Decay of Adam's averages of the gradient and of its square (Kingma and Ba 2015)."""
-
+ADAM_BETAS = (0.9, 0.999)  # decay of Adam's averages of gradient and square (Kingma and Ba 2015)
+# Adam's epsilon, (pixel value)^2 per unit of the parameter. Gradients of the summed squared error
+# below it are noise, so parameters that no image sees stay where the prior put them.
 ADAM_EPSILON = 1e-3
-"""Adam's epsilon, (pixel value)^2 per unit of the parameter. Gradients of the summed squared error
-below it are noise, so parameters that no image sees stay where the prior put them."""
-
-NATURAL_BETA = 0.9
-"""Decay of the gradient's average in `natural`."""
-
+NATURAL_BETA = 0.9  # decay of the gradient's average in `natural`
+# Factor on the exact diagonal in `natural`. The diagonal is for one parameter alone, but the
+# several splats of a pixel move together: without the factor, steps overshoot. A chosen constant.
 NATURAL_OVERLAP = 4.0
-"""Factor on the exact diagonal in `natural`. The diagonal is for one parameter alone, but the
-several splats of a pixel move together: without the factor, steps overshoot. A chosen constant."""
-
+# Lower bound of the information in `natural`, (pixel value per unit of the parameter)^2. Without a
+# prior, parameters that are hardly seen would otherwise be moved by rounding errors.
 LEAST_INFORMATION = 1e-6
-"""Lower bound of the information in `natural`, (pixel value per unit of the parameter)^2. Without a
-prior, parameters that are hardly seen would otherwise be moved by rounding errors."""
-
-INFORMATION_PASSES = 10
-"""Passes between two computations of an optimiser's information, each as costly as a pass."""
+INFORMATION_PASSES = 10  # between two computations of an optimiser's information; each costs a pass
 
 
 @dataclass(frozen=True)
@@ -77,8 +69,8 @@ def natural(
     return mi.TensorXf(value.array - update, value.shape), [m]
 
 
+# By name (setting `train.optimiser`). A program may add its own.
 OPTIMISERS: dict[str, Optimiser] = {
     "natural": Optimiser(1, natural, uses_information=True),
     "adam": Optimiser(2, adam),
 }
-"""Optimisers by name (setting `train.optimiser`). A program may add its own."""

@@ -28,19 +28,14 @@ from mgs.gaussians import Gaussians
 from mgs.splat.projection import camera_array, moved
 from mgs.splat.recording import frozen
 
-ROUNDS = 6
-"""Steps of the poses. A chosen constant."""
-
+ROUNDS = 6  # steps of the poses. A chosen constant.
+# Settings of the fit before each: of a fixed number of Gaussians, by the loss of the steps. Chosen
+# constants.
 ROUND = {"passes": 3, "tolerance": 0.0, "density": "fixed", "loss": "squared"}
-"""Settings of the fit before each: of a fixed number of Gaussians, by the loss of the steps. Chosen
-constants."""
-
+# Pixels of an image that count as independent, whatever its size: errors of a model are alike over
+# large parts of it, and pull at its pose together. With more, exact poses move. A chosen constant.
 INDEPENDENT = 50
-"""Pixels of an image that count as independent, whatever its size: errors of a model are alike over
-large parts of it, and pull at its pose together. With more, exact poses move. A chosen constant."""
-
-LEAST = 1e-3
-"""Least factor of `spread`. A chosen constant."""
+LEAST = 1e-3  # least factor of `spread`. A chosen constant.
 
 
 def tau(noise: PoseNoise, cameras: Sequence[Camera], centre: np.ndarray) -> np.ndarray:

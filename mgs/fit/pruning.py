@@ -18,12 +18,9 @@ from mgs.splat.recording import one_at_a_time
 from mgs.splat.rendering import as_colour, as_drjit, render, splats_and_lists
 from mgs.splat.walking import sums_by_splat
 
-NEIGHBOURS = 8
-"""Number of nearest Gaussians of which no two are removed in the same round. They hide and
-replace each other, so that removing two changes more than the sum of both."""
-
-ROUNDS = 8
-"""Most rounds. Each spends half of the change that is still allowed, then measures it."""
+# They hide and replace each other: removing two changes more than the sum of both.
+NEIGHBOURS = 8  # nearest Gaussians of which no two are removed in the same round
+ROUNDS = 8  # most rounds. Each spends half of the change that is still allowed, then measures it.
 
 
 @one_at_a_time

@@ -12,30 +12,23 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from mgs.errors import InputError
 from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD, lam_by_kind, regularisation
 
+# Learning rates of the optimiser, about the longest step, in the unit of each kind of parameter:
+# colour coefficient, log-scale, quaternion, opacity logit. Chosen constants (docs/fit.md).
 RATES = {"colour": 0.02, "scale": 0.04, "rotation": 0.02, "opacity": 0.1}
-"""Learning rates of the optimiser, about the longest step, in the unit of each kind of parameter:
-colour coefficient, log-scale, quaternion, opacity logit. Chosen constants (docs/fit.md)."""
-
+# Learning rate of means as a multiple of the spacing of the prior's samples. Larger steps push more
+# Gaussians behind others, where no image sees them. A chosen constant.
 MEAN_RATE = 0.02
-"""Learning rate of means as a multiple of the spacing of the prior's samples. Larger steps push
-more Gaussians behind others, where no image sees them. A chosen constant."""
-
+# Most passes of the first fit of a run, and of the later ones, which start from a model that was
+# fitted to all images but the new. More passes overfit. Chosen constants (docs/speed-accuracy.md).
 PASSES, WARM_PASSES = 10, 5
-"""Most passes of the first fit of a run, and of the later ones, which start from a model that was
-fitted to all images but the new. More passes overfit. Chosen constants
-(docs/speed-accuracy.md)."""
-
+# Default of `TrainSettings.alpha_weight` in a run whose frames all have a mask or alpha. A chosen
+# constant (docs/fit.md, An opaque surface).
 ALPHA_WEIGHT = 0.1
-"""Default of `TrainSettings.alpha_weight` in a run whose frames all have a mask or alpha. A chosen
-constant (docs/fit.md, An opaque surface)."""
-
-COLOURS_ALONE = {"alpha_weight": 0.0}
-"""Values of `TrainSettings` that fit colours alone, as in the paper."""
+COLOURS_ALONE = {"alpha_weight": 0.0}  # values of `TrainSettings`, as in the paper
 
 Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
-
+# A number that others are divided by, bounded so that the results neither overflow nor vanish.
 Scale = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
-"""A number that others are divided by, bounded so that the results neither overflow nor vanish."""
 
 
 def complete(given: Any, defaults: Mapping[str, float]) -> Any:

@@ -6,14 +6,11 @@ import math
 from collections.abc import Sequence
 from enum import StrEnum
 
+# A fit diverges if its loss stays above this many times the first for DIVERGED_PASSES passes.
+# Chosen constants: a fit that starts from a fitted model first rises a little, then falls.
 DIVERGED_FACTOR = 1.5
-"""A fit diverges if its loss stays above this many times the first for DIVERGED_PASSES passes.
-Chosen constants: a fit that starts from a fitted model first rises a little, then falls."""
-
 DIVERGED_PASSES = 5
-
-LOSS_FLOOR = (1 / 255) ** 2 / 12
-"""Mean squared error of rounding to 8 bits. Smaller losses count as this one."""
+LOSS_FLOOR = (1 / 255) ** 2 / 12  # of rounding to 8 bits; smaller losses count as this one
 
 
 class StopReason(StrEnum):

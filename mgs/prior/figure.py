@@ -17,16 +17,10 @@ from mgs.prior.build import Prior
 from mgs.prior.segmentation import SegmentedCloud
 
 UP = np.array([0.0, 0.0, 1.0])
-
 BLUE, TAN = [0.15, 0.35, 0.75], [0.85, 0.76, 0.6]
-
 FRAMED = STYLE | {"axes.spines.top": True, "axes.spines.right": True}
-
-MAX_DOTS = 60_000
-"""Most points drawn in a panel; with more, it looks the same."""
-
-LIGHT = np.array([-0.5, 0.4, 0.77])
-"""Direction to the light in picture coordinates, about unit."""
+MAX_DOTS = 60_000  # most points drawn in a panel; with more, it looks the same
+LIGHT = np.array([-0.5, 0.4, 0.77])  # direction to the light in picture coordinates, about unit
 
 
 @dataclass(frozen=True)

@@ -22,36 +22,16 @@ from mgs.data.visibility import in_image, nearest_point
 from mgs.errors import InputError, Notice
 from mgs.prior.surface import Surface
 
-COARSE, REFINEMENTS = 48, 2
-"""Cells along an edge of the first grid, and its refinements by two near the surface."""
-
-NEAR_SURFACE = 3.0
-"""Nodes are evaluated anew if their interpolated value is under this many cells."""
-
-ROW = 4096
-"""Points are passed to OpenCV in rows of this length."""
-
-MOST_PIXELS = 1_000_000
-"""Most pixels of a mask to carve with: 4 MB each, and outlines still finer than the grid."""
-
-MARGIN = 1.3
-"""Half edge of the grid over the largest radius of the object that a mask shows."""
-
-LEAST_VIEWS = 3
-"""A point in the image of fewer frames is outside."""
-
-AGREEMENT = 0.8
-"""Least median share of a mask that the hull must fill; above 0.95 where masks and poses fit."""
-
-LEAST_PIECE = 0.02
-"""Least volume of a piece of the hull over that of the largest. Smaller ones are specks, of masks
-that are not exact."""
-
-ODD = 0.5
-"""Least share of what few frames cut away, for a mask that cuts it away to be left out."""
-
-FEW = 0.1
-"""Share of the frames that see a point of the object and may carve it by mistake."""
+COARSE, REFINEMENTS = 48, 2  # cells along an edge of the first grid; its refinements by two
+NEAR_SURFACE = 3.0  # nodes are evaluated anew if their interpolated value is under this many cells
+ROW = 4096  # points are passed to OpenCV in rows of this length
+MOST_PIXELS = 1_000_000  # of a mask to carve with: 4 MB each, with outlines finer than the grid
+MARGIN = 1.3  # half edge of the grid over the largest radius of the object that a mask shows
+LEAST_VIEWS = 3  # A point in the image of fewer frames is outside
+AGREEMENT = 0.8  # least median share of a mask that the hull must fill; above 0.95 if masks fit
+LEAST_PIECE = 0.02  # least volume of a piece over that of the largest; smaller ones are specks
+ODD = 0.5  # least share of what few frames cut away, for a mask that cuts it away to be left out
+FEW = 0.1  # share of the frames that see a point of the object and may carve it by mistake
 
 
 def visual_hull(

@@ -27,50 +27,27 @@ from mgs.rotation import quat_from_normals
 if TYPE_CHECKING:
     from mgs.prior.build import Prior
 
-IN_PLANE_SCALE = 0.65
-"""Standard deviation of a Gaussian along the surface, over the spacing of the samples."""
-
+IN_PLANE_SCALE = 0.65  # standard deviation of a Gaussian along the surface, over the spacing
+# Opacity of a Gaussian, chosen with IN_PLANE_SCALE so that the far side is hidden from the start:
+# the mean log transmittance across the surface is -2 pi (s / spacing)^2 Li2(o) = -3.45. With 0.99
+# the derivative by the logit, o (1 - o), would be almost zero.
 INITIAL_OPACITY = 0.9
-"""Opacity of a Gaussian, chosen with IN_PLANE_SCALE so that the far side is hidden from the start:
-the mean log transmittance across the surface is -2 pi (s / spacing)^2 Li2(o) = -3.45. With 0.99 the
-derivative by the logit, o (1 - o), would be almost zero."""
-
+# Depth of a Gaussian below the surface, in pixels of the closest cameras, by whether it is
+# antialiased: EPS2D widens every footprint by about half a pixel, which would draw the rock too
+# large. Chosen constants (docs/fit.md).
 INSET = {True: 0.5, False: 0.6}
-"""Depth of a Gaussian below the surface, in pixels of the closest cameras, by whether it is
-antialiased: EPS2D widens every footprint by about half a pixel, which would draw the rock too
-large. Chosen constants (docs/fit.md)."""
-
-CLOSEST = 10
-"""Percentile of the cameras' pixel sizes that is taken for the closest; the smallest may be of a
-wrong camera."""
-
-THICKNESS = 0.1
-"""Standard deviation of a Gaussian across the surface, over the spacing."""
-
-BACKING_DEPTH = 1.0
-"""Distance of the backing behind the surface's Gaussians, over their spacing."""
-
-BACKING_SCALE = (0.8, 0.8, 0.2)
-"""Standard deviations of a backing Gaussian, over the backing's spacing."""
-
+CLOSEST = 10  # percentile of the cameras' pixel sizes for the closest; the smallest may be wrong
+THICKNESS = 0.1  # standard deviation of a Gaussian across the surface, over the spacing
+BACKING_DEPTH = 1.0  # distance of the backing behind the surface's Gaussians, over their spacing
+BACKING_SCALE = (0.8, 0.8, 0.2)  # standard deviations of a backing Gaussian, over its spacing
 BACKING_OPACITY = 0.99
-
-AGREEMENT_FRAMES = 24
-"""Most frames whose colours are compared on the surface (`colour_agreement`)."""
-
+AGREEMENT_FRAMES = 24  # most frames whose colours are compared on the surface (`colour_agreement`)
+# Least `colour_agreement` of a right surface. Measured: 0.93 for a rendered rock, 0.83 with its
+# surface 10 % too large and 0.74 with it 10 % too small, 0.79 for the hull of hollow bricks.
 AGREEMENT = 0.85
-"""Least `colour_agreement` of a right surface. Measured: 0.93 for a rendered rock, 0.83 with its
-surface 10 % too large and 0.74 with it 10 % too small, 0.79 for the hull of hollow bricks."""
-
-RANDOM_OPACITY = 0.1
-"""Opacity of a Gaussian of a random start, as in 3DGS (Kerbl et al. 2023)."""
-
-GREY = 0.5
-"""Colour of a Gaussian that no frame sees: all its spherical harmonics are zero."""
-
-
-Colours = tuple[np.ndarray, np.ndarray]
-"""Result of `seen_colours`."""
+RANDOM_OPACITY = 0.1  # opacity of a Gaussian of a random start, as in 3DGS (Kerbl et al. 2023)
+GREY = 0.5  # colour of a Gaussian that no frame sees: all its spherical harmonics are zero
+Colours = tuple[np.ndarray, np.ndarray]  # result of `seen_colours`
 
 
 def initial_gaussians(

@@ -22,29 +22,15 @@ from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import Surface, closed_poisson, intersection, poisson_mesh
 from mgs.survey.fusion import focus, voxel_means
 
-SOURCES = ("depth", "mesh", "points", "hull", "random")
-"""Sources of a prior."""
-
-LEAST_PHOTOGRAPHS = 8
-"""Fewest photographs without depth for a surface."""
-
-LEAST_OVERLAP = 0.5
-"""Least share of cameras that have in their image the point that all look at."""
-
-GAP = 4.0
-"""Distance from every point, in spacings, beyond which the hull replaces the points."""
-
-CELL_OF_SPACING = 0.5
-"""Cloud spacing passed to the Poisson reconstruction, over the real one: its cells are then 0.75
-spacings. Larger cells lose detail, smaller ones gain nothing (measured)."""
-
-BEYOND_POINTS = 0.15
-"""Faces farther than this from every point, over the extent of the points, only close the surface
-and are not sampled. With a hull or a ground plane there is no need."""
-
-
-ONE_SIDED = 0.5
-"""Least length of the mean normal of points seen from one side."""
+SOURCES = ("depth", "mesh", "points", "hull", "random")  # sources of a prior
+LEAST_PHOTOGRAPHS = 8  # fewest photographs without depth for a surface
+LEAST_OVERLAP = 0.5  # least share of cameras that have in their image the point that all look at
+GAP = 4.0  # distance from every point, in spacings, beyond which the hull replaces the points
+# Cells of 0.75 spacings: larger ones lose detail, smaller ones gain nothing (measured).
+CELL_OF_SPACING = 0.5  # cloud spacing passed to the Poisson reconstruction, over the real one
+# Faces beyond it only close the surface and are not sampled; a hull or ground plane needs none.
+BEYOND_POINTS = 0.15  # distance from every point, over the extent of the points
+ONE_SIDED = 0.5  # least length of the mean normal of points seen from one side
 
 
 def choose_source(dataset: Dataset, source: str | None = None, points: Path | None = None) -> str:

@@ -24,48 +24,21 @@ from mgs.seeds import derive_seed
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD
 from mgs.survey.fusion import REACH, Cloud, focus
 
-LEAST_TRACK = 3
-"""Fewest images that saw a point: two can agree by chance."""
-
-ERROR_LIMIT = 2.5
-"""Largest reprojection error, robust standard deviations above the median."""
-
-MASK_SHARE = 0.95
-"""Least `mask_share` of a point."""
-
-MASK_SLACK = 2
-"""Dilation of the masks for it, pixels, for errors of points and poses."""
-
-LEAST_POINTS = 100
-"""Fewest points of the object for a surface."""
-
-CLUSTER_SHARE = 0.02
-"""HDBSCAN's min_cluster_size over the number of points; at least CLUSTER_SAMPLES."""
-
-CLUSTER_SAMPLES = 10
-"""HDBSCAN's min_samples."""
-
-JOINED = 4.0
-"""Clusters closer than this many point spacings are one: varying texture splits an object."""
-
-GROWN, GROWN_NEIGHBOURS = 0.15, 4
-"""Points above a ground plane that DBSCAN joins to the cluster belong to it: eps over the cluster's
-extent, and min_samples. A part with few points, as in shade, is no cluster of its own."""
-
-PLANE_TILT = 45.0
-"""Largest angle between the ground's normal and the vertical, degrees."""
-
-PLANE_VOXEL = 0.25
-"""Voxel passed to `ground_plane`, over the point spacing."""
-
-NEIGHBOURS = 16
-"""Neighbours that decide whether a point lies off the surface."""
-
-OFF_SURFACE = 3.0
-"""Largest distance of a point from the plane of its neighbours, robust standard deviations."""
-
-ALONE = 5.0
-"""Largest distance to the eighth neighbour, over its median."""
+LEAST_TRACK = 3  # fewest images that saw a point: two can agree by chance
+ERROR_LIMIT = 2.5  # largest reprojection error, robust standard deviations above the median
+MASK_SHARE = 0.95  # least `mask_share` of a point
+MASK_SLACK = 2  # dilation of the masks for it, pixels, for errors of points and poses
+LEAST_POINTS = 100  # fewest points of the object for a surface
+CLUSTER_SHARE = 0.02  # HDBSCAN's min_cluster_size over the points; at least CLUSTER_SAMPLES
+CLUSTER_SAMPLES = 10  # HDBSCAN's min_samples
+JOINED = 4.0  # point spacings between clusters that are one: varying texture splits an object
+# A part with few points, as in shade, is no cluster of its own: DBSCAN joins it to the object.
+GROWN, GROWN_NEIGHBOURS = 0.15, 4  # eps over the cluster's extent, and min_samples
+PLANE_TILT = 45.0  # largest angle between the ground's normal and the vertical, degrees
+PLANE_VOXEL = 0.25  # voxel passed to `ground_plane`, over the point spacing
+NEIGHBOURS = 16  # neighbours that decide whether a point lies off the surface
+OFF_SURFACE = 3.0  # largest distance from the plane of the neighbours, robust standard deviations
+ALONE = 5.0  # largest distance to the eighth neighbour, over its median
 
 
 def spacing_of(points: np.ndarray) -> float:

@@ -16,18 +16,12 @@ from mgs.data.meshes import Mesh
 from mgs.data.visibility import in_image
 from mgs.errors import InputError
 
+# Spacing of the samples over the size of the closest pixel. Closer samples gain little, and much
+# closer ones lose: the model then has more parameters than the images have values
+# (docs/parsimony.md).
 PIXELS_PER_SAMPLE = 0.9
-"""Spacing of the samples over the size of the closest pixel. Closer samples gain little, and much
-closer ones lose: the model then has more parameters than the images have values
-(docs/parsimony.md)."""
-
-PIXELS_OF_PHOTOGRAPHS = 1.15
-"""Spacing for surfaces from photographs. There `mgs fit` moves the Gaussians, and more of them need
-more passes (docs/fit.md)."""
-
-MOST_GAUSSIANS = 200_000
-"""Most Gaussians that cameras decide: close-ups and high resolution ask for millions, which take
-hours to fit. A chosen constant."""
+PIXELS_OF_PHOTOGRAPHS = 1.15  # for photographs: more Gaussians need more passes (docs/fit.md)
+MOST_GAUSSIANS = 200_000  # most that cameras decide: close-ups ask for millions. A chosen constant
 
 
 @dataclass(frozen=True)

@@ -25,22 +25,14 @@ from mgs.prior.settings import PriorSettings
 from mgs.seeds import generator
 from mgs.survey.fusion import focus
 
-GAUSSIANS = 10_000
-"""Fewest Gaussians where no number is given."""
-
-PIXELS = 100
-"""Pixels of all images, in the masks, per Gaussian where no number is given. A chosen constant."""
-
+GAUSSIANS = 10_000  # fewest Gaussians where no number is given
+PIXELS = 100  # of all images, in the masks, per Gaussian where no number is given. Chosen
+# Most random points per point that came with the cameras where no number is given and these are
+# many: they hide what is behind them, and a fit splits Gaussians where more are needed. A chosen
+# constant.
 MOST_RANDOM = 0.1
-"""Most random points per point that came with the cameras where no number is given and these are
-many: they hide what is behind them, and a fit splits Gaussians where more are needed. A chosen
-constant."""
-
-FAR = 10.0
-"""Radius of the random background, over that of the ball that the cameras look at."""
-
-DRAWS = 64
-"""Draws per Gaussian after which too few lie inside the masks."""
+FAR = 10.0  # radius of the random background, over that of the ball that the cameras look at
+DRAWS = 64  # draws per Gaussian after which too few lie inside the masks
 
 
 def scattered(

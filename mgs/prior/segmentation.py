@@ -17,43 +17,21 @@ from mgs.seeds import derive_seed
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD
 from mgs.survey.fusion import FILTERED_SHARE, Cloud, focus, fuse_frames, voxel_means
 
-PLANE_TOLERANCE = 0.02
-"""Largest distance of RANSAC's inliers from the plane, over the cameras' distance."""
-
-PLANE_REACH = 0.5
-"""Radius around the focus in which the plane is refined, over the cameras' distance."""
-
-PLANE_MIN_SHARE = 0.2
-"""Least share of the cloud on the plane for it to be the ground."""
-
-CLUSTER_POINTS = 20_000
-"""Most points that DBSCAN sees; the full cloud takes the labels of their nearest ones."""
-
-CLUSTER_NEIGHBOURS = 8
-"""DBSCAN's min_samples. Its eps is twice the median distance to the neighbour of this number."""
-
-EQUAL_SIZE = 0.8
-"""Least share of the largest cluster for one to count as equally large."""
-
-NEARER = 1.25
-"""Least ratio of distances from the focus that tells equally large clusters apart."""
-
-IN_MASKS = 0.8
-"""Least share of the masks that the median point of another cluster of the rock lies in."""
-
+PLANE_TOLERANCE = 0.02  # largest distance of RANSAC's inliers, over the cameras' distance
+PLANE_REACH = 0.5  # radius around the focus of the plane's refinement, over the cameras' distance
+PLANE_MIN_SHARE = 0.2  # least share of the cloud on the plane for it to be the ground
+CLUSTER_POINTS = 20_000  # most points that DBSCAN sees; others take the label of the nearest
+CLUSTER_NEIGHBOURS = 8  # DBSCAN's min_samples; eps: twice the median distance to this neighbour
+EQUAL_SIZE = 0.8  # least share of the largest cluster for one to count as equally large
+NEARER = 1.25  # least ratio of distances from the focus that tells equally large clusters apart
+IN_MASKS = 0.8  # least share of masks with the median point of another cluster of the rock
+# Without masks, another cluster belongs to the rock if the gap is at most this share of its extent,
+# and its median point is above or below the rock, but for a tenth of that.
 STACKED = 0.5
-"""Without masks another cluster belongs to the rock if the gap between them is at most this share
-of the rock's extent, and its median point a tenth of that from being above or below the rock."""
-
-LEAST_PART = 0.02
-"""Least number of points of another part of the rock, over that of the rock's largest."""
-
-NORMAL_NEIGHBOURS = (16, 128)
-"""Neighbours for a normal: without noise, and at most."""
-
-FLOOR_UPRIGHT = 0.9
-"""Least cosine between the normals of ground and of points that rise at the foot of the rock:
-points of its cluster within two plane tolerances of the ground, which are left out."""
+LEAST_PART = 0.02  # least number of points of another part of the rock, over that of its largest
+NORMAL_NEIGHBOURS = (16, 128)  # neighbours for a normal: without noise, and at most
+# Points within two plane tolerances of the ground are left out at the foot of the rock.
+FLOOR_UPRIGHT = 0.9  # least cosine between their normals and the ground's
 
 
 @dataclass(frozen=True)

@@ -15,28 +15,16 @@ from mgs.data.meshes import Mesh
 from mgs.errors import InputError
 from mgs.prior.segmentation import Plane, SegmentedCloud
 
+# Edge of the cube of the Poisson reconstruction, over the extent of the points. Below the open
+# underside the surface bulges out; with pymeshlab's default, 1.1, it leaves the cube and is not
+# closed.
 POISSON_SCALE = 2.0
-"""Edge of the cube of the Poisson reconstruction, over the extent of the points. Below the open
-underside the surface bulges out; with pymeshlab's default, 1.1, it leaves the cube and is not
-closed."""
-
-POISSON_CELL = 1.5
-"""Largest edge of the finest cells, over the voxel. Finer cells fit noise."""
-
-POISSON_DEPTHS = (5, 10)
-"""Least and largest octree depth chosen automatically. Beyond 12, pymeshlab crashes."""
-
-SUPPORT = 0.02
-"""Least share of the points next to a piece of the surface, for the piece to be kept."""
-
-CUBES = ((1, 0), (2, 1))
-"""Cubes to try: factor on POISSON_SCALE, and on the octree depth what keeps the cells' size."""
-
-OVERSAMPLING = 5
-"""Random candidates per sample."""
-
-SAMPLE_BYTES = 3400
-"""Memory per sample, bytes, mostly for pairs of candidates (measured)."""
+POISSON_CELL = 1.5  # largest edge of the finest cells, over the voxel. Finer cells fit noise.
+POISSON_DEPTHS = (5, 10)  # least and largest octree depth chosen; beyond 12 pymeshlab crashes
+SUPPORT = 0.02  # least share of the points next to a piece of the surface, for the piece to be kept
+CUBES = ((1, 0), (2, 1))  # to try: factor on POISSON_SCALE, and octree levels that keep the cells
+OVERSAMPLING = 5  # random candidates per sample
+SAMPLE_BYTES = 3400  # memory per sample, bytes, mostly for pairs of candidates (measured)
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from mgs.errors import InputError
 from mgs.prior.segmentation import SegmentedCloud
 from mgs.seeds import derive_seed
 
-TRUTH_SAMPLES = 50_000
-"""Random points on the true rock whose distance to the prior is measured."""
+TRUTH_SAMPLES = 50_000  # random points on the true rock whose distance to the prior is measured
 
 
 def error_to_truth(

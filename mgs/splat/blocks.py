@@ -24,13 +24,11 @@ from mgs.errors import InputError
 from mgs.memory import check_room
 from mgs.splat.projection import Splats
 
+# Width and height of a block, pixels. With AVX-512, 8x2 and 4x4 drew no faster, and gradients took
+# longer because there are more pairs. Its 32 pixels are a warp of a GPU.
 BLOCK_X, BLOCK_Y = 8, 4
-"""Width and height of a block, pixels. With AVX-512, 8x2 and 4x4 drew no faster, and gradients
-took longer because there are more pairs. Its 32 pixels are a warp of a GPU."""
-
-TILE = 16
-"""Width and height of a tile, blocks. Lanes work tile by tile, so that its splats (64 bytes
-each) and their sums stay in a core's cache. The fastest size measured."""
+# Lanes work tile by tile, so that splats (64 bytes) and sums stay in a core's cache.
+TILE = 16  # width and height of a tile, blocks: the fastest measured
 
 
 def on_cpu() -> bool:
@@ -38,20 +36,14 @@ def on_cpu() -> bool:
     return bool(dr.backend_v(mi.Float) == dr.JitBackend.LLVM)
 
 
-LOG2_INV_ALPHA_MIN = 7.994353436858858
-"""log2(255) = -log2(ALPHA_MIN): a footprint ends where xi^2 + eta^2 = log2_opacity + log2(255)."""
-
-SLACK = 1e-2
-"""Added to `Footprints.level`, so that rounding never drops a pixel at the rim."""
-
+LOG2_INV_ALPHA_MIN = 7.994353436858858  # at the rim xi^2 + eta^2 = log2_opacity + this
+SLACK = 1e-2  # added to `Footprints.level`, so that rounding never drops a pixel at the rim
+# Most (splat, block) pairs of a view, and most (splat, row of blocks) pairs. Indices into buffers
+# of 24 sums per pair then stay below 2^31, so it must not be raised. Fisher information with means
+# has up to 36 sums and its own check.
 MAX_PAIRS = 1 << 26
-"""Most (splat, block) pairs of a view, and most (splat, row of blocks) pairs. Indices into
-buffers of 24 sums per pair then stay below 2^31, so it must not be raised. Fisher information with
-means has up to 36 sums and its own check."""
-
-PAIR_BYTES = 128
-"""Peak memory per pair, bytes. Measured: 28 for an image, 58 for exact Fisher information, 123
-for blocks. With means, their sums take 32 and 48 more."""
+# Measured: 28 for an image, 58 for exact information, 123 for blocks; means add 32 and 48.
+PAIR_BYTES = 128  # peak memory per pair, bytes
 
 
 @dataclass
@@ -120,8 +112,7 @@ def footprints(splats: Splats) -> Footprints:
     return Footprints(*shape, level=dr.select(visible, level + SLACK, -1))
 
 
-RESHAPED, REORDERED = 1, 2
-"""Results of `changes`."""
+RESHAPED, REORDERED = 1, 2  # results of `changes`
 
 
 def changes(old: Footprints, splats: Splats) -> Any:
@@ -225,9 +216,9 @@ def _sorted(values: Any, keys: Any, count: int) -> Any:
     return values
 
 
+# Most bits of a key by which `_permutation` sorts at once. On a GPU Dr.Jit's permutations are
+# stable for up to 512 values (with 64 KB of shared memory), and not above.
 DIGIT_BITS = {"cpu": 20, "gpu": 8}
-"""Most bits of a key by which `_permutation` sorts at once. On a GPU Dr.Jit's permutations are
-stable for up to 512 values (with 64 KB of shared memory), and not above."""
 
 
 def _permutation(keys: Any, count: int) -> Any:

@@ -39,22 +39,11 @@ from mgs.splat.recording import frozen, one_at_a_time
 from mgs.splat.rendering import ListCache, as_colour, as_drjit, by_block, splats_and_lists
 from mgs.splat.walking import pack, packet_count, sums_by_splat
 
-MEANS = {"frozen": 0, "free": 3}
-"""Number of columns of the means: frozen, or free (x, y, z in the world, metres)."""
-
-WEIGHT_MAX = 1e12
-"""Largest weight of a pixel and channel, also (sigma_rgb / sigma_alpha)^2. Beyond it, sums over
-pixels might leave the range of float32."""
-
-MAX_SUMS = 1 << 31
-"""Most sums of all (splat, block) pairs of a view; kernels index them with 31 bits."""
-
-BLOCK_BYTES = 1800
-"""Peak memory of a view's blocks per Gaussian, SH degree 0, without its pairs; 1,700
-measured."""
-
-EXACT = ("exact", "block")
-"""Estimators with all options of `fisher`."""
+MEANS = {"frozen": 0, "free": 3}  # columns of the means: x, y, z in the world, metres
+WEIGHT_MAX = 1e12  # of a pixel and channel, and (sigma_rgb / sigma_alpha)^2: sums must fit float32
+MAX_SUMS = 1 << 31  # sums of all (splat, block) pairs of a view; kernels index them with 31 bits
+BLOCK_BYTES = 1800  # peak memory of blocks per Gaussian, SH degree 0, without pairs; 1,700 measured
+EXACT = ("exact", "block")  # estimators with all options of `fisher`
 
 
 def groups(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
@@ -343,13 +332,8 @@ def loss_gradient(
     return np.concatenate([g.reshape(len(gaussians), -1) for g in gradient.values()], 1) ** 2
 
 
-SMALLEST = 1.2e-38
-"""Smallest normal float32. Smaller entries become 0, because threads flush denormals
-differently."""
-
-PACKETS = 32
-"""Packets of four columns that one kernel writes. LLVM takes minutes to compile a kernel that
-writes all 56 x 56 columns of SH degree 3."""
+SMALLEST = 1.2e-38  # normal float32; smaller entries become 0, as threads flush them differently
+PACKETS = 32  # of four columns that a kernel writes; LLVM takes minutes for all 56 x 56 at degree 3
 
 
 def _interleaved(columns: dict[int, Any], size: int, n: int) -> Any:

@@ -92,9 +92,9 @@ def _store_pixels(lists: BlockLists, lane: Lane, pixels: list[list[Any]]) -> tup
     return out
 
 
+# Powers (a, b) of the monomials xi^a eta^b up to second order. The derivative of ln alpha of a
+# pixel by any parameter is a polynomial of these.
 POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-"""Powers (a, b) of the monomials xi^a eta^b up to second order. The derivative of ln alpha of a
-pixel by any parameter is a polynomial of these."""
 
 
 def log_alpha_tangent(tangents: Splats, splats: Splats) -> dict[tuple[int, int], Any]:
@@ -220,8 +220,7 @@ def _slopes(
     return slopes if last is None else [*slopes, dr.select(free, odds * last, 0)]
 
 
-ADJOINT_SUMS = {False: 8, True: 10}
-"""Number of sums per splat of `adjoint`, without and with gradients of means."""
+ADJOINT_SUMS = {False: 8, True: 10}  # sums per splat of `adjoint`, without and with means
 
 
 @frozen(recorded_sizes)

@@ -11,8 +11,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.errors import InputError
 
-_MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""Mitsuba's camera has x to the image's left and y up, OpenCV's x to the right and y down."""
+_MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])  # x to the left, y up, z forward
 
 
 def camera_from_sensor(sensor: Any) -> Camera:

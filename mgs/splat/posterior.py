@@ -28,15 +28,9 @@ from mgs.splat.rendering import ListCache, as_drjit
 
 Floats = NDArray[np.float64]
 
-STEPS = 30
-"""Most steps of the Lanczos iteration of a probe. A chosen constant."""
-
-TOLERANCE = 1e-3
-"""Norm of a solution's residual over that of the right-hand side, after whitening by the blocks.
-Products in float32 allow about 1e-5."""
-
-MOST_STEPS = 1000
-"""Most steps of the conjugate gradients."""
+STEPS = 30  # most steps of the Lanczos iteration of a probe. A chosen constant.
+TOLERANCE = 1e-3  # residual over right-hand side, whitened by the blocks; float32 allows about 1e-5
+MOST_STEPS = 1000  # most steps of the conjugate gradients
 
 
 class Estimate(NamedTuple):

@@ -11,10 +11,9 @@ from typing import Any, TypeVar, cast
 
 import drjit as dr
 
+# Held during every recording, replay and function of `one_at_a_time`. Dr.Jit 1.5 hangs or fails if
+# two threads record at once, and the garbage collector, off meanwhile, is one per process.
 _one_at_a_time = threading.RLock()
-"""Held during every recording, replay and function of `one_at_a_time`. Dr.Jit 1.5 hangs or fails
-if two threads record at once, and the garbage collector, off meanwhile, is one per process."""
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 

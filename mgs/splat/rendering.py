@@ -23,8 +23,7 @@ from mgs.splat.projection import Splats, camera_array, project, projected
 from mgs.splat.recording import one_at_a_time
 from mgs.splat.walking import PIXELS, pack, sums_by_splat
 
-CACHE_BYTES = 1 << 28
-"""Default budget of a `ListCache`, bytes: enough for 33 cameras of 100,000 Gaussians at 640x480."""
+CACHE_BYTES = 1 << 28  # budget of a `ListCache`: 33 cameras of 100,000 Gaussians at 640x480
 
 
 @dataclass
@@ -48,8 +47,7 @@ class Image:
         return html(repr(self), [picture(one) for one in (rgb if rgb.ndim == 4 else [rgb])])
 
 
-REMEMBERED = 1 << 10
-"""Number of cameras whose last use a `ListCache` remembers, a few hundred bytes each."""
+REMEMBERED = 1 << 10  # cameras whose last use a `ListCache` remembers, a few hundred bytes each
 
 
 class ListCache:

@@ -24,12 +24,10 @@ from mgs.splat.blocks import BLOCK_X, BLOCK_Y, BlockLists, on_cpu
 from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from mgs.splat.projection import Splats
 
-PIXELS = BLOCK_X * BLOCK_Y
-"""Pixels of a block."""
-
+PIXELS = BLOCK_X * BLOCK_Y  # pixels of a block
+# Smaller sums become 0, because threads flush denormals differently. It is so far above the
+# smallest normal float (1e-38) that denormal products change no sum that is kept.
 DENORMAL = 1e-24
-"""Smaller sums become 0, because threads flush denormals differently. It is so far above the
-smallest normal float (1e-38) that denormal products change no sum that is kept."""
 
 
 def without_denormals(x: Any) -> Any:
@@ -159,11 +157,10 @@ class PixelRow:
     raw_alpha: list[Any]
 
 
+# Polynomial for 2^x on [-1/2, 1/2], x^0 first: relative error 3e-9, exact at x = 0 (Remez).
 EXP2 = (
     1.0, 0.69314720574, 0.24022646891, 0.05550328776, 0.00961848896, 0.00133999314, 0.00015345812
 )  # fmt: skip
-"""Coefficients of a polynomial for 2^x on [-1/2, 1/2], x^0 first: relative error 3e-9, exact at
-x = 0 (Remez exchange)."""
 
 
 def exp2(x: Any) -> Any:
@@ -290,9 +287,7 @@ def computed_after(x: Any, before: list[Any]) -> Any:
     return dr.reinterpret_array(type(x), same)
 
 
-TOGETHER = 2
-"""Splats that `walk` draws in one iteration. The pixels' state does not fit into the registers,
-so it is read and written once per iteration."""
+TOGETHER = 2  # splats drawn in an iteration: the pixels' state does not fit the registers
 
 
 def walk(
@@ -431,9 +426,7 @@ def packet_count(count: int) -> int:
     return -(-count // 4)
 
 
-AT_ONCE = 4
-"""Pairs that `sums_by_place` reads in one iteration. Reads at scattered addresses are slow, but
-several can be under way at once."""
+AT_ONCE = 4  # pairs read in an iteration: reads at scattered addresses are slow, but overlap
 
 
 def sums_by_place(lists: BlockLists, by_pair: Any, count: int, real: Any) -> Any:

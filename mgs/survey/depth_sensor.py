@@ -15,25 +15,16 @@ import numpy as np
 
 from mgs.camera import Camera
 
+# Axial noise at depth z: AXIAL_FLOOR + AXIAL_GROWTH (z - AXIAL_START)^2, standard deviation, metres
+# (Nguyen et al., eq. 3): 26 mm at 4 m.
 AXIAL_FLOOR, AXIAL_GROWTH, AXIAL_START = 0.0012, 0.0019, 0.4
-"""Axial noise at depth z: AXIAL_FLOOR + AXIAL_GROWTH (z - AXIAL_START)^2, standard deviation,
-metres (Nguyen et al., eq. 3): 26 mm at 4 m."""
-
+# Lateral noise at angle theta between view and normal: LATERAL_FLOOR + LATERAL_GROWTH theta / (pi/2
+# - theta), standard deviation, pixels of an image REFERENCE_WIDTH wide (Nguyen et al., eq. 1).
 LATERAL_FLOOR, LATERAL_GROWTH, REFERENCE_WIDTH = 0.8, 0.035, 640
-"""Lateral noise at angle theta between view and normal: LATERAL_FLOOR + LATERAL_GROWTH theta /
-(pi/2 - theta), standard deviation, pixels of an image REFERENCE_WIDTH wide (Nguyen et al., eq. 1).
-"""
-
-QUANTUM = 2.85e-3
-"""Depth z comes in steps of QUANTUM z^2, metres (Khoshelham and Elberink, section 4.2: 2.85e-5 in
-centimetres): 46 mm at 4 m."""
-
-DROP_OUT = (np.radians(65.0), np.radians(85.0))
-"""Angles between view and normal, radians, at which none and all returns are lost; linear in
-between. Chosen constants."""
-
-SIGMA_FROM_MAD = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
+# Depth z comes in steps of QUANTUM z^2, metres: 46 mm at 4 m.
+QUANTUM = 2.85e-3  # Khoshelham and Elberink, section 4.2: 2.85e-5 in centimetres
+DROP_OUT = (np.radians(65.0), np.radians(85.0))  # angles where none, all are lost
+SIGMA_FROM_MAD = 1.4826  # standard deviation over median absolute deviation, normal distribution
 
 
 def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:

@@ -31,12 +31,11 @@ from mgs.survey.registration import (
 )
 from mgs.synth.scene_file import MOST_ERROR
 
-STAGES = {
+STAGES = {  # estimated trajectories of a `Survey`, as they are made: field -> label
     "odometry": "odometry alone",
     "registered": "registered, before loop closure",
     "optimised": "after loop closure",
 }
-"""Estimated trajectories of a `Survey`, in the order in which they are made: field -> label."""
 
 
 @dataclass(frozen=True)

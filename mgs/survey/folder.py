@@ -17,8 +17,7 @@ from mgs.plotting import drawing
 from mgs.survey.flight import STAGES, Survey, SurveySettings, survey_numbers
 from mgs.survey.fusion import Cloud, fuse_frames
 
-COLOURS = {"odometry": "#d1495b", "registered": "#edae49", "optimised": "#00798c"}
-"""Colour of each of the STAGES."""
+COLOURS = {"odometry": "#d1495b", "registered": "#edae49", "optimised": "#00798c"}  # of STAGES
 
 
 def save_survey(

@@ -13,24 +13,13 @@ from mgs.data.visibility import nearest_point
 from mgs.errors import InputError
 from mgs.survey.depth_sensor import depth_noise, filter_depth
 
-MAX_FUSED_PIXELS = 6_000_000
-"""About the most pixels that are fused; beyond, rows and columns are skipped. Of 100 frames of
-640x480, each voxel is then still seen ten times."""
-
-EDGE_JUMP = 0.05
-"""Largest depth difference in the neighbourhood of a pixel, over its depth. Beyond it lie
-silhouettes, where a depth may mix two surfaces, and grazing views."""
-
-REACH = 1.0
-"""Radius of the cloud around the focus, over the cameras' distance from it. The ground farther away
-says nothing of the ground under the rock."""
-
-ALIKE = 1.25
-"""Largest ratio of a frame's pixel on the rock to the lower quartile of all for one of the nearest
-frames: all frames, if their distances are alike."""
-
-FILTERED_SHARE = 0.5
-"""Noise left by the bilateral filter, over the noise before; measured 0.27, with a margin."""
+# Beyond, rows and columns are skipped; of 100 frames of 640x480 ten still see each voxel.
+MAX_FUSED_PIXELS = 6_000_000  # about the most pixels that are fused
+# Beyond it lie silhouettes, where a depth may mix two surfaces, and grazing views.
+EDGE_JUMP = 0.05  # largest depth difference around a pixel, over its depth
+REACH = 1.0  # radius of the cloud around the focus, over the cameras' distance from it
+ALIKE = 1.25  # largest pixel of the nearest frames, over the lower quartile of all
+FILTERED_SHARE = 0.5  # noise after the bilateral filter, over before; measured 0.27, with a margin
 
 
 @dataclass(frozen=True)

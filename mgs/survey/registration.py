@@ -20,47 +20,24 @@ from mgs.errors import InputError
 from mgs.survey.depth_sensor import depth_noise, filter_depth
 from mgs.survey.fusion import usable_depth
 
-GRID = 0.007
-"""Cell of the grid of a frame's points, over the cameras' distance: 3 cm at 4 m."""
-
-MATCH = 4.0
-"""Largest distance between matched points, grid cells."""
-
-NEIGHBOURS = 40
-"""Neighbours from which the covariance of a point is computed."""
-
+GRID = 0.007  # cell of the grid of a frame's points, over the cameras' distance: 3 cm at 4 m
+MATCH = 4.0  # largest distance between matched points, grid cells
+NEIGHBOURS = 40  # neighbours from which the covariance of a point is computed
+# Neighbourhood of `usable_depth`, pixels. On silhouettes the sensor reports "flying pixels", which
+# move with the camera and pull every measured motion towards zero: with them, the error of a step
+# was twenty times larger.
 EDGE = 5
-"""Neighbourhood of `usable_depth`, pixels. On silhouettes the sensor reports "flying pixels", which
-move with the camera and pull every measured motion towards zero: with them, the error of a step was
-twenty times larger."""
-
-RANGE = 1.6
-"""Largest depth used, over the lower quartile of the frame's depths."""
-
-CLOSURE_GAP = 5
-"""Fewest steps between two frames that close a loop."""
-
-CLOSURE_RANGE = 1.5
-"""Two frames may close a loop if their estimated positions are closer than this many median steps,
-plus CLOSURE_DRIFT times the way between them."""
-
-CLOSURE_DRIFT = 0.02
-"""Drift of registered poses over the way flown."""
-
-CLOSURE_OVERLAP = 0.5
-"""Least share of a frame's points that must match for a loop."""
-
-
-DRIFT_SCALE, DRIFT_YAW = 0.01, np.radians(0.3)
-"""Bias of every step: relative error of translations, and yaw about the vertical, radians."""
-
+RANGE = 1.6  # largest depth used, over the lower quartile of the frame's depths
+CLOSURE_GAP = 5  # fewest steps between two frames that close a loop
+CLOSURE_RANGE = 1.5  # distance of frames that may close a loop, median steps, beside CLOSURE_DRIFT
+CLOSURE_DRIFT = 0.02  # drift of registered poses over the way flown
+CLOSURE_OVERLAP = 0.5  # least share of a frame's points that must match for a loop
+DRIFT_SCALE, DRIFT_YAW = 0.01, np.radians(0.3)  # bias of a step: relative error, and yaw, radians
+# Random errors of each step, standard deviations per axis: of the translation over the step's
+# length, and of the rotation, radians. Visual-inertial odometry drifts by about one per cent of the
+# way (Delmerico and Scaramuzza, ICRA 2018, table III).
 DRIFT_SHAKE, DRIFT_TURN = 0.01, np.radians(0.2)
-"""Random errors of each step, standard deviations per axis: of the translation over the step's
-length, and of the rotation, radians. Visual-inertial odometry drifts by about one per cent of the
-way (Delmerico and Scaramuzza, ICRA 2018, table III)."""
-
-TRUST = 5.0
-"""Largest accepted difference from odometry, in its standard deviations."""
+TRUST = 5.0  # largest accepted difference from odometry, in its standard deviations
 
 
 @dataclass(frozen=True)

@@ -9,17 +9,10 @@ from mgs.synth.noise import Noise, tile
 from mgs.synth.rock import rock_shape
 from mgs.synth.scene_file import Arena, Lobe, Rock
 
-REACH = 400.0
-"""Half the side of the square terrain, metres; its edge looks like the horizon."""
-
-ROWS = 480
-"""Vertices along one side of the terrain, about 3 cm apart near the rock."""
-
-TILE = 4.0
-"""Side of the regolith's texture tile, metres."""
-
-TEXELS = 1024
-"""Texels along one side of the tile."""
+REACH = 400.0  # half the side of the square terrain, metres; its edge looks like the horizon
+ROWS = 480  # vertices along one side of the terrain, about 3 cm apart near the rock
+TILE = 4.0  # side of the regolith's texture tile, metres
+TEXELS = 1024  # texels along one side of the tile
 
 
 def _grid() -> np.ndarray:

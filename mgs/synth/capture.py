@@ -23,8 +23,7 @@ from mgs.synth.rendering import Photographer, RenderPreset, is_done, orbit_frame
 from mgs.synth.scene import MitsubaScene
 from mgs.synth.scene_file import SceneFile
 
-POSE_TOLERANCE = 1e-9
-"""Largest change of a pose entry (metres, cosines) by writing it as text and reading it."""
+POSE_TOLERANCE = 1e-9  # largest change of a pose entry (metres, cosines) by writing and reading it
 
 
 def capture_of(dataset: Dataset) -> Callable[[Frame], Frame]:

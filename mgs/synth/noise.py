@@ -9,11 +9,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-LATTICE = 96
-"""Samples along one side of the periodic noise volume."""
-
-PERIOD = 16
-"""Side of the noise volume in units of the shortest wavelength of its noise."""
+LATTICE = 96  # samples along one side of the periodic noise volume
+PERIOD = 16  # side of the noise volume in units of the shortest wavelength of its noise
 
 
 class Noise:

@@ -14,12 +14,8 @@ from mgs.synth.scene_file import Orbit, SceneFile
 if TYPE_CHECKING:
     import trimesh
 
-EVALUATION_ELEVATIONS = (5.0, 75.0)
-"""Elevations of the test views above the rock's middle, degrees."""
-
-
-MOST_NOISE = 1000.0
-"""Largest error of positions, metres: far beyond any orbit."""
+EVALUATION_ELEVATIONS = (5.0, 75.0)  # elevations of the test views above the rock's middle, degrees
+MOST_NOISE = 1000.0  # largest error of positions, metres: far beyond any orbit
 
 
 @dataclass(frozen=True)

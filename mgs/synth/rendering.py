@@ -40,24 +40,13 @@ from mgs.synth.rock import load_rock, make_rock, up_axis
 from mgs.synth.scene import GUIDES_PER_SAMPLE, MitsubaScene, Traced, whole_grid
 from mgs.synth.scene_file import SceneFile, load_scene_file
 
-NOISY_FACTOR = 8
-"""Factor on the samples per pixel if pyoidn, the denoiser, is not installed."""
-
-ROCK_EXPOSURE = 0.2
-"""Mean linear value of the rock's pixels over the orbit: exposure is metered once, on the rock."""
-
-MAX_CLIPPED = 0.2
-"""Largest share of rock and ground pixels that the exposure may clip, so that a dark rock does not
-blow out bright ground. The scenes of mgs clip at most 0.04."""
-
-MOST_SAMPLES = 2**32
-"""Samples that Mitsuba cannot render at once."""
-
-PIXEL_BYTES, VIEW_BYTES, IMAGE_BYTES = 4, 2_000, 200
-"""Estimated bytes of a view's pixel on disk, and in memory of a view and of the pixel rendered."""
-
-SHEET_COLUMNS, SHEET_WIDTH, SHEET_FRAMES = 8, 160, 32
-"""Contact sheet: pictures in a row, their width in pixels, and most pictures."""
+NOISY_FACTOR = 8  # factor on the samples per pixel if pyoidn, the denoiser, is not installed
+ROCK_EXPOSURE = 0.2  # mean linear value of the rock over the orbit, which is metered once
+# A dark rock must not blow out bright ground; the scenes of mgs clip at most 0.04.
+MAX_CLIPPED = 0.2  # largest share of rock and ground pixels that the exposure may clip
+MOST_SAMPLES = 2**32  # samples that Mitsuba cannot render at once
+PIXEL_BYTES, VIEW_BYTES, IMAGE_BYTES = 4, 2_000, 200  # on disk; in memory
+SHEET_COLUMNS, SHEET_WIDTH, SHEET_FRAMES = 8, 160, 32  # pictures in a row, pixels, most pictures
 
 
 @dataclass(frozen=True)

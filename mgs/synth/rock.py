@@ -17,11 +17,8 @@ from mgs.rotation import WORLD_FROM_GLTF
 from mgs.synth.noise import Noise
 from mgs.synth.scene_file import Rock
 
-MAX_GRID = 10**8
-"""Most points of the grid of a rock's body: more would take tens of gigabytes."""
-
-CELL = 6
-"""Texels along one side of a cell of the texture; two triangles share a cell."""
+MAX_GRID = 10**8  # most points of the grid of a rock's body: more would take tens of gigabytes
+CELL = 6  # texels along one side of a cell of the texture; two triangles share a cell
 
 
 def make_rock(settings: Rock, rng: np.random.Generator) -> trimesh.Trimesh:

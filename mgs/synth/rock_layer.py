@@ -12,22 +12,12 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 
-SHARE_MIN = 1e-6
-"""Least divisor in place of a share of samples, which is a multiple of 1/spp or 0."""
-
-CONTINUATION = 4.0
-"""Standard deviation, pixels, of the Gaussian that continues the rock beyond its outline. Of 1, 2
-and 4, 4 gives the denoised outline nearest to a rendering with many samples."""
-
-WEIGHT_MIN = 1e-4
-"""Least divisor in place of a sum of Gaussian weights."""
-
-
-GUIDES = 6
-"""Channels of albedo and normal."""
-
-RAYS = 2**22
-"""Camera rays traced at once: bounds the memory of their channels to some 200 MB."""
+SHARE_MIN = 1e-6  # least divisor in place of a share of samples, which is a multiple of 1/spp or 0
+# Of 1, 2 and 4, 4 gives the denoised outline nearest to a rendering with many samples.
+CONTINUATION = 4.0  # standard deviation that continues the rock beyond its outline, pixels
+WEIGHT_MIN = 1e-4  # least divisor in place of a sum of Gaussian weights
+GUIDES = 6  # channels of albedo and normal
+RAYS = 2**22  # camera rays traced at once: bounds the memory of their channels to some 200 MB
 
 
 class RockLayer(mi.SamplingIntegrator):

@@ -23,26 +23,14 @@ from mgs.seeds import generator
 from mgs.synth.arena import make_ground, make_stones, regolith
 from mgs.synth.scene_file import Rock, SceneFile, Sky
 
-MAX_DEPTH = 4
-"""Longest light path in Mitsuba's count: direct light and two bounces."""
-
-GUIDES_PER_SAMPLE = 4
-"""Samples of the denoiser's guides (albedo, normals) per sample of light. They are cheap; with so
-many they are declared clean, and the denoiser keeps the texture that they show."""
-
-DENOISER = "balanced"
-"""Quality of Open Image Denoise. Frames are as good as with "high" and 2 guides per sample, in 5/6
-of the CPU time (benchmarks/denoiser.py of e8eb34c)."""
-
-MARGIN = 16
-"""Pixels around the rock's bounding box that the denoiser of the rock alone sees too."""
-
-COVERAGE_RAYS = 255
-"""Rays through a pixel that measure its coverage by the rock. Shares of 255 are exact in 8 bits;
-the number is odd, so that one ray goes through the centre."""
-
-_MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""Mitsuba's camera axes are x to the image's left, y up, z forward."""
+MAX_DEPTH = 4  # longest light path in Mitsuba's count: direct light and two bounces
+# Guides (albedo, normals) are cheap; with so many they count as clean, and their texture stays.
+GUIDES_PER_SAMPLE = 4  # samples of the denoiser's guides per sample of light
+# As good as "high" with 2 guides per sample, in 5/6 of the CPU time.
+DENOISER = "balanced"  # quality of Open Image Denoise
+MARGIN = 16  # pixels around the rock's bounding box that the denoiser of the rock alone sees too
+COVERAGE_RAYS = 255  # of a pixel: 255 shares are exact in 8 bits; odd, for one through the centre
+_MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])  # x to the left, y up, z forward
 
 
 @dataclass(frozen=True)
@@ -60,8 +48,7 @@ class Rendered:
     mask: np.ndarray
 
 
-Layers = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Result of `mgs.synth.rock_layer.render_layers`."""
+Layers = tuple[np.ndarray, np.ndarray, np.ndarray]  # result of `mgs.synth.rock_layer.render_layers`
 
 
 @dataclass(frozen=True)

@@ -117,8 +117,7 @@ class Orbit(_Strict):
     """
 
 
-MOST_ERROR = 100.0
-"""Largest factor on the errors of sensors: odometry then errs by as much as it moves."""
+MOST_ERROR = 100.0  # largest factor on sensor errors: odometry then errs by as much as it moves
 
 
 class Sensor(_Strict):
