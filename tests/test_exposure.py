@@ -134,7 +134,7 @@ def varied(rock: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 Runs = dict[str, tuple[Checkpoint, Path]]
 
-RUN = {"policy": "uniform", "seeds": 4, "budget": 5, "train": {"passes": 20}}
+RUN = {"policy": "uniform", "seeds": 4, "budget": 3, "train": {"passes": 20}}
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +144,7 @@ def runs(rock: Path, varied: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     made = {}
     kinds = {"constant": (rock, False), "without": (varied, False), "with": (varied, True)}
     for name, (root, exposure) in kinds.items():
-        state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=5, **RUN).state
+        state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=3, **RUN).state
         evaluate_run(folder / name, pictures=False)
         made[name] = state, folder / name
     return made
@@ -194,7 +194,7 @@ def test_an_interrupted_run_goes_on_bit_for_bit(varied, runs, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_nbv(varied, tmp_path / "run", exposure=True, evaluate_every=5, on_step=kill, **RUN)
+        run_nbv(varied, tmp_path / "run", exposure=True, evaluate_every=3, on_step=kill, **RUN)
     resume_nbv(tmp_path / "run")
     one, other = read_checkpoint(runs["with"][1]), read_checkpoint(tmp_path / "run")
     assert np.array_equal(one.H, other.H)

@@ -63,7 +63,8 @@ def test_a_run_that_blends_srgb(dataset, prior, tmp_path):
 @pytest.mark.usefixtures("coarse_rocks", "coarse_priors")
 def test_the_whole_paper_in_a_few_calls(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    rock = mgs.synth_orbit("rock", "boulder", frames=10, size=(64, 48), spp=1, test_views=2)
+    monkeypatch.setattr("mgs.reports.diagnostics.VIEWS", 1)
+    rock = mgs.synth_orbit("rock", "boulder", frames=8, size=(64, 48), spp=1, test_views=2)
     prior = mgs.build_prior(rock, gaussians=300)
     model = mgs.ModelSettings(train={"passes": 3, "alpha_weight": 0.1}, warm_passes=2)
     scene = mgs.Scene(rock, prior, model)

@@ -129,7 +129,7 @@ def test_a_tilted_run_of_an_older_version_is_refused(runs, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def fitted(tmp_path_factory: pytest.TempPathFactory, coarse_priors) -> list[Path]:
     """The same run in both worlds, each with its prior, with colours of degree 1."""
     made = []
     for world in WORLDS:

@@ -112,12 +112,14 @@ def gradients_of(model: Gaussians, names=ARRAYS) -> dict[str, np.ndarray]:
 
 @contextmanager
 def thread_count(count: int) -> Iterator[None]:
-    """Run kernels with this number of threads."""
-    before = dr.thread_count()
+    """Run kernels with this number of threads, on any processor."""
+    before, own = dr.thread_count(), os.sched_getaffinity(0)
+    os.sched_setaffinity(0, range(os.cpu_count() or 1))
     dr.set_thread_count(count)
     try:
         yield
     finally:
+        os.sched_setaffinity(0, own)
         dr.set_thread_count(before)
 
 

@@ -66,7 +66,8 @@ def differing(a: dict, b: dict) -> list[str]:
 
 @pytest.fixture(scope="module")
 def first():
-    return results()
+    with thread_count(2):
+        return results()
 
 
 def test_reruns_change_nothing(first):
