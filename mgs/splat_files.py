@@ -131,12 +131,10 @@ def _kind(path: Path) -> str:
 
 
 def write_gaussians(path: str | Path, gaussians: Gaussians, kind: str, to_y_up: np.ndarray) -> None:
-    """Write Gaussians (NumPy fields) in a format of FORMATS; the file appears complete.
-
-    Compressed PLY and SPZ cannot say that colours are linear. to_y_up: for a GLB (`write_glb`).
-    The two lose an origin, with a Notice. Raises InputError as `mgs.files.atomic_path`, if a
-    package is missing, and if there are no Gaussians or their positions are too far for the format.
-    """
+    """Write Gaussians (NumPy fields) in a format of FORMATS; the file appears complete. Compressed
+    PLY and SPZ cannot say that colours are linear. to_y_up: for a GLB (`write_glb`). The two lose
+    an origin, with a Notice. Raises InputError as `mgs.files.atomic_path`, if a package is missing,
+    and if there are no Gaussians or their positions are too far for the format."""
     if len(gaussians) == 0:
         raise InputError(f"{path}: there are no Gaussians to write")
     if any(gaussians.origin) and kind not in ("ply", "glb"):
@@ -155,9 +153,7 @@ def write_gaussians(path: str | Path, gaussians: Gaussians, kind: str, to_y_up: 
 
 def _spz_codec(path: Path) -> Any:
     """The codec of the package gsply. Its Python interface would compile itself for half a minute.
-
-    Raises InputError if it is not installed.
-    """
+    Raises InputError if it is not installed."""
     try:
         import gsply_cpp
     except ImportError:
@@ -211,11 +207,8 @@ def _spz_marks(data: bytes) -> tuple[bool, int]:
 
 
 def _read_spz(path: Path) -> Gaussians:
-    """Read an SPZ of version 1 to 4 and turn it to the axes of 3DGS files.
-
-    Version 1 is version 2 with positions of float16, which the codec does not read. Raises
-    InputError if it is damaged.
-    """
+    """Read an SPZ of version 1 to 4 and turn it to the axes of 3DGS files. Version 1 is version 2
+    with positions of float16, which the codec does not read. Raises InputError if it is damaged."""
     codec = _spz_codec(path)
     with reading(path), parsing(path, "SPZ", "export it again"), NamedTemporaryFile() as copy:
         data = path.read_bytes()
@@ -248,11 +241,9 @@ def _read_spz(path: Path) -> Gaussians:
 
 def _write_spz(path: Path, gaussians: Gaussians) -> None:
     """Write an SPZ of version 3, y up. Positions take as many fractional bits as their size allows.
-
     Values outside the format's range are clipped: log-scales to -10 to 5.9, coefficients of degree
     0 to +-3.3, and the others to +-1. Raises InputError if the steps of the positions would be
-    coarser than the Gaussians.
-    """
+    coarser than the Gaussians."""
     codec = _spz_codec(path)
     g = mirrored(gaussians, _axes(RUB))
     largest = max(float(np.abs(g.means).max()), 1e-6)

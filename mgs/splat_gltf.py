@@ -39,12 +39,9 @@ def _sh_names(coefficients: int) -> list[str]:
 
 
 def write_glb(path: str | Path, gaussians: Gaussians, to_y_up: np.ndarray) -> None:
-    """Write Gaussians (NumPy fields) as a GLB; the file appears complete.
-
-    to_y_up: rotation [3,3] from the model's world to glTF's, in which +Y is up; it becomes the
-    transform of the file's only node, with the origin. `read_glb` undoes it.
-    Raises InputError as `mgs.files.atomic_path`.
-    """
+    """Write Gaussians (NumPy fields) as a GLB; the file appears complete. to_y_up: rotation [3,3]
+    from the model's world to glTF's, in which +Y is up; it becomes the transform of the file's only
+    node, with the origin. `read_glb` undoes it. Raises InputError as `mgs.files.atomic_path`."""
     g, scales = gaussians, np.exp(np.clip(gaussians.log_scales, -80, 80))  # within float32
     quats = g.quats / np.maximum(np.linalg.norm(g.quats, axis=1, keepdims=True), 1e-12)
     colours = np.clip(np.column_stack([0.5 + SH_C0 * g.sh[:, 0], g.opacities]), 0, 1)
@@ -101,12 +98,10 @@ def write_glb(path: str | Path, gaussians: Gaussians, to_y_up: np.ndarray) -> No
 
 
 def read_glb(path: str | Path) -> Gaussians:
-    """Read all Gaussians of a GLB's scene, under the transforms of their nodes.
-
-    Files of mgs, and those that PlayCanvas' splat-transform made of a PLY, come back in the axes of
-    the model; others stay in glTF's. Raises InputError if the file is missing or damaged, holds no
-    Gaussians, or compressed ones, ones that differ in colour space, or a node has shear.
-    """
+    """Read all Gaussians of a GLB's scene, under the transforms of their nodes. Files of mgs, and
+    those that PlayCanvas' splat-transform made of a PLY, come back in the axes of the model; others
+    stay in glTF's. Raises InputError if the file is missing or damaged, holds no Gaussians, or
+    compressed ones, ones that differ in colour space, or a node has shear."""
     path = Path(path)
     with reading(path, "file; give a GLB"), parsing(path, "GLB", "export it again"):
         gltf = Gltf(path, HANDLED)

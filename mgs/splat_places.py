@@ -36,10 +36,8 @@ def mirrored(g: Gaussians, signs: tuple[int, int, int]) -> Gaussians:
 
 def moved(g: Gaussians, matrix: np.ndarray, where: object) -> Gaussians:
     """Gaussians under an affine map [4,4]: means, covariances, and the directions of colours.
-
     Uneven scales stretch the covariances, while colours only turn. Raises InputError, which begins
-    with `where`, for shear and for singular maps.
-    """
+    with `where`, for shear and for singular maps."""
     A, origin = matrix[:3, :3], matrix[:3, :3] @ g.origin + matrix[:3, 3]
     if np.allclose(A, np.eye(3), rtol=0, atol=1e-9):
         return settled(g, g.means.astype(np.float64), origin)

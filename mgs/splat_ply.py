@@ -243,12 +243,10 @@ def _unit_quats(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def _decompress_sh(path: Path, ply: PlyData, n: int) -> dict[str, np.ndarray]:
-    """Properties f_rest_* of a compressed PLY, an array [n] each; {} if it has only degree 0.
-
-    They are bytes, which divide the range -4 to 4 into 256 steps. A byte stands for the middle of
-    its step, but 0 and 255 for -4 and 4. Raises InputError if the element `sh` is not n rows of
-    bytes.
-    """
+    """Properties f_rest_* of a compressed PLY, an array [n] each; {} if it has only degree 0. They
+    are bytes, which divide the range -4 to 4 into 256 steps. A byte stands for the middle of its
+    step, but 0 and 255 for -4 and 4. Raises InputError if the element `sh` is not n rows of
+    bytes."""
     if "sh" not in ply:
         return {}
     table = ply["sh"].data
@@ -263,11 +261,8 @@ def _decompress_sh(path: Path, ply: PlyData, n: int) -> dict[str, np.ndarray]:
 
 def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
     """Write Gaussians (NumPy fields) as a compressed PLY (`_decompress`); the file appears
-    complete.
-
-    Gaussians are sorted such that those of a chunk are neighbours, which keeps the steps of their
-    positions small. Raises InputError as `mgs.files.atomic_path`.
-    """
+    complete. Gaussians are sorted such that those of a chunk are neighbours, which keeps the steps
+    of their positions small. Raises InputError as `mgs.files.atomic_path`."""
     g = gaussians[cKDTree(gaussians.means, leafsize=CHUNK).indices]
     n, rest = len(g), 3 * (g.sh.shape[1] - 1)
     starts = np.arange(0, n, CHUNK)

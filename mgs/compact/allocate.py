@@ -70,11 +70,9 @@ def gain(
 
 
 def in_order(gains: Mapping[Key, float], sizes: Mapping[Key, int]) -> list[Key]:
-    """Packets by decrease of the expected error per byte, the largest first.
-
-    A layer comes after the one before it, and a tile's positions before the rest of the tile: they
-    count with its first colours, without which they show nothing.
-    """
+    """Packets by decrease of the expected error per byte, the largest first. A layer comes after
+    the one before it, and a tile's positions before the rest of the tile: they count with its first
+    colours, without which they show nothing."""
 
     def rate(key: Key) -> float:
         return gains.get(key, 0.0) / sizes[key]

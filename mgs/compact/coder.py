@@ -71,11 +71,9 @@ def adaptive(stream: Stream, symbols: np.ndarray, counts: np.ndarray) -> np.ndar
 
 
 def integers(stream: Stream, values: np.ndarray) -> np.ndarray:
-    """Code integers [n,C] of magnitudes up to LARGEST, column by column.
-
-    The number of bits of a magnitude is coded adaptively, separately for rows in which an earlier
-    column is not 0; then sign and lower bits as they are.
-    """
+    """Code integers [n,C] of magnitudes up to LARGEST, column by column. The number of bits of a
+    magnitude is coded adaptively, separately for rows in which an earlier column is not 0; then
+    sign and lower bits as they are."""
     result = np.zeros(values.shape, np.int64)
     uniform = _library().model.Uniform
     for column in range(values.shape[1]):

@@ -97,11 +97,9 @@ def join(header: Header, packets: Iterable[bytes]) -> bytes:
 
 
 def split(data: bytes, path: Path) -> tuple[Header, dict[Key, bytes]]:
-    """Header and payloads of a file's whole packets, in their order.
-
-    Raises InputError for another format, version or a damaged header. Nothing is allocated by a
-    number of the file before it was checked.
-    """
+    """Header and payloads of a file's whole packets, in their order. Raises InputError for another
+    format, version or a damaged header. Nothing is allocated by a number of the file before it was
+    checked."""
     again = "; send or export it again"
     if data[:4] != MAGIC or len(data) < HEAD.size:
         raise InputError(f"{path}: is no mgs file, or ends within its header{again}")

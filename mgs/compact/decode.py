@@ -32,11 +32,8 @@ IDENTITY = np.array([[1.0, 0, 0, 0]])
 
 def read_compact(path: Path, prior: Prior | None = None) -> Gaussians:
     """Read Gaussians from a file of the format mgs, in the world of the data; an incomplete file
-    gives what it has, with a Notice.
-
-    prior: where the file leaves positions to it. Raises InputError if the file is damaged at its
-    start, needs a prior, or was made with another one.
-    """
+    gives what it has, with a Notice. prior: where the file leaves positions to it. Raises
+    InputError if the file is damaged at its start, needs a prior, or was made with another one."""
     header, packets = split(read_bytes(path, "file", MOST_BYTES), path)
     if losses := header.packets - len(packets):
         notice = (

@@ -21,11 +21,9 @@ BANDS = 12  # kinds of coefficients by the size of their node, each twice as lar
 
 
 def codes_of(cells: np.ndarray, layer: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Order [N] of cells [N,3] by code, and their codes in it, uint64, strictly increasing.
-
-    layer: [N] 0 or 1. Of equal codes all but the first are raised, which moves a Gaussian to a
-    neighbouring cell.
-    """
+    """Order [N] of cells [N,3] by code, and their codes in it, uint64, strictly increasing. layer:
+    [N] 0 or 1. Of equal codes all but the first are raised, which moves a Gaussian to a
+    neighbouring cell."""
     code = layer.astype(np.int64) << (DEPTH - 1)
     for bit in range(AXIS_BITS):
         for axis in range(3):
@@ -47,11 +45,9 @@ def cells_of(codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def code_descendants(
     stream: Stream, nodes: np.ndarray, depth: int, most: int, codes: np.ndarray | None = None
 ) -> np.ndarray:
-    """Code which descendants nodes [M] have `depth` levels below; returns their codes.
-
-    codes: these, to be written; None: they are read. Each node has a left child, a right one, or
-    both. Raises ValueError if more than `most` are read.
-    """
+    """Code which descendants nodes [M] have `depth` levels below; returns their codes. codes:
+    these, to be written; None: they are read. Each node has a left child, a right one, or both.
+    Raises ValueError if more than `most` are read."""
     counts = np.ones((3, 2, 3))
     forked = np.zeros(len(nodes), np.int64)
     for shift in range(depth - 1, -1, -1):

@@ -75,10 +75,8 @@ class Agreement:
 def agreement(frames: Sequence[Frame], matcher: Matcher, masked: bool = True) -> Agreement | None:
     """Compare poses with what pictures of neighbours in time show: points matched in them, else
     their depth, else the outlines of their masks, else the place that all cameras look at. None
-    where nothing can be compared.
-
-    matcher: of the frames' images. masked: whether the masks were made without the poses.
-    """
+    where nothing can be compared. matcher: of the frames' images. masked: whether the masks were
+    made without the poses."""
     places = np.unique(np.linspace(0, max(len(frames) - 2, 0), PAIRS).astype(int)).tolist()
     places = places if len(frames) > 1 else []
     matcher.match((place, place + 1) for place in places)

@@ -188,12 +188,9 @@ def _pose_topics(reader: Any) -> str:
 def read_bag(
     path: Path, unpack: Path, topic: str | None, poses: str | None, spacing: Spacing
 ) -> Source:
-    """Keyframes of a bag, unpacked into a folder.
-
-    topic: of the colour images; needed where there are several. poses: topic of poses, `Tree`.
-    Raises InputError where the bag has no colour images, calibration or poses of them, or they
-    never move, and as `opened`.
-    """
+    """Keyframes of a bag, unpacked into a folder. topic: of the colour images; needed where there
+    are several. poses: topic of poses, `Tree`. Raises InputError where the bag has no colour
+    images, calibration or poses of them, or they never move, and as `opened`."""
     with opened(path) as reader:
         topic = colour_topic(path, reader, topic)
         camera_at, lens, frame = _lens(path, reader, topic)
@@ -313,12 +310,10 @@ def _rows(message: Any, kind: str) -> np.ndarray:
 
 
 def _metres(message: Any, scratch: Path) -> np.ndarray | None:
-    """Depth of an image [H,W] float32, metres; None for an encoding that is not supported.
-
-    A compressedDepth image holds a PNG. Its numbers are millimetres, or for 32FC1 a / depth + b,
-    with 0 for no depth (compressed_depth_image_transport). scratch: temporary file. Raises
-    InputError if the PNG is damaged.
-    """
+    """Depth of an image [H,W] float32, metres; None for an encoding that is not supported. A
+    compressedDepth image holds a PNG. Its numbers are millimetres, or for 32FC1 a / depth + b, with
+    0 for no depth (compressed_depth_image_transport). scratch: temporary file. Raises InputError if
+    the PNG is damaged."""
     if not hasattr(message, "format"):
         if message.encoding not in DEPTHS:
             return None
@@ -340,10 +335,8 @@ def _metres(message: Any, scratch: Path) -> np.ndarray | None:
 
 def _unpack_depth(reader: Any, unpack: Path, frame: str, shots: dict[float, Shot]) -> list[str]:
     """Write the depth image nearest in time to each keyframe, and add it to the keyframe; notes for
-    the user.
-
-    Only images in the frame of the colour images count: others are not aligned with them.
-    """
+    the user. Only images in the frame of the colour images count: others are not aligned with
+    them."""
     from mgs.images import write_exr
 
     times, gaps = np.array(list(shots)), dict.fromkeys(shots, SYNCHRONOUS)

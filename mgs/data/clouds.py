@@ -53,9 +53,7 @@ def towards(points: np.ndarray, origin: Sequence[float]) -> np.ndarray:
 
 def write_cloud(path: str | Path, cloud: SparseCloud) -> None:
     """Write a binary PLY, float32, atomically: x y z, and if known nx ny nz (views), track, error.
-
-    Raises InputError if it cannot be written.
-    """
+    Raises InputError if it cannot be written."""
     columns = {name: cloud.points[:, k] for k, name in enumerate("xyz")}
     if cloud.views is not None:
         columns |= {name: cloud.views[:, k] for k, name in enumerate(("nx", "ny", "nz"))}
@@ -69,12 +67,10 @@ def write_cloud(path: str | Path, cloud: SparseCloud) -> None:
 
 
 def read_cloud(path: str | Path) -> SparseCloud:
-    """Read the vertices of any PLY file, with nx ny nz, track and error if present.
-
-    Of points in the same place the first is kept, since some programs write a vertex for each
-    corner of each face. Raises InputError if the file is missing, damaged, not finite, or has
-    fewer than two distinct points.
-    """
+    """Read the vertices of any PLY file, with nx ny nz, track and error if present. Of points in
+    the same place the first is kept, since some programs write a vertex for each corner of each
+    face. Raises InputError if the file is missing, damaged, not finite, or has fewer than two
+    distinct points."""
     path = Path(path)
     with reading(path, "point cloud; give a PLY file"), path.open("rb") as file:
         file.read(1)

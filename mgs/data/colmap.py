@@ -96,11 +96,9 @@ def _is_model(folder: Path) -> bool:
 
 
 def read_colmap(source: Path, models: list[Path], images: Path) -> Source:
-    """The largest of the models in a folder: images sorted by name, and points.
-
-    images: folder of the images. Raises InputError if the model is damaged, its text has lost
-    lines, or a lens is not supported.
-    """
+    """The largest of the models in a folder: images sorted by name, and points. images: folder of
+    the images. Raises InputError if the model is damaged, its text has lost lines, or a lens is not
+    supported."""
     sizes = {model: _image_count(model) for model in models}
     model = max(models, key=lambda one: sizes[one])
     notes = []
@@ -121,11 +119,9 @@ def read_colmap(source: Path, models: list[Path], images: Path) -> Source:
 def source_of(
     reconstruction: Any, files: Mapping[int, tuple[str, Path]], where: str, kind: str = "COLMAP"
 ) -> Source:
-    """Images, sorted by name, and points of a reconstruction of pycolmap.
-
-    files: name and path of each image by its number. where: start of messages about an image.
-    Raises InputError if a lens is not supported.
-    """
+    """Images, sorted by name, and points of a reconstruction of pycolmap. files: name and path of
+    each image by its number. where: start of messages about an image. Raises InputError if a lens
+    is not supported."""
     shots = []
     placed = [image for image in reconstruction.images.values() if image.has_pose]
     ordered = sorted(placed, key=lambda image: files[image.image_id])

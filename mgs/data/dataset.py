@@ -87,9 +87,7 @@ class Dataset:
 
     def survey(self) -> Dataset:
         """Dataset to build the prior from: the survey of an on-demand dataset, else this one.
-
-        Raises InputError if an on-demand dataset has no survey, and as `load_dataset`.
-        """
+        Raises InputError if an on-demand dataset has no survey, and as `load_dataset`."""
         if not self.on_demand:
             return self
         folder = self.root / SURVEY_FOLDER
@@ -133,11 +131,9 @@ def load_dataset(
 
 
 def load_cameras(path: str | Path, like: Camera | None = None) -> list[tuple[str, Camera]]:
-    """Read (file_path, camera) of every frame of a transforms.json, in its order and world.
-
-    path: the file, or its folder. like: a camera whose intrinsics are used if the file has none.
-    Raises InputError as `load_dataset`, except that image files need not exist.
-    """
+    """Read (file_path, camera) of every frame of a transforms.json, in its order and world. path:
+    the file, or its folder. like: a camera whose intrinsics are used if the file has none. Raises
+    InputError as `load_dataset`, except that image files need not exist."""
     path = Path(path) / "transforms.json" if Path(path).is_dir() else Path(path)
     data, records = read_records(path)
     if like is not None and not any(key in data | records[0] for key in INTRINSICS):
@@ -149,10 +145,8 @@ def load_cameras(path: str | Path, like: Camera | None = None) -> list[tuple[str
 
 def read_records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Contents of a transforms.json, and its frames, each with file_path and transform_matrix.
-
     Matrices are not checked. Raises InputError if the file is missing or damaged, lists no frames,
-    or has a path that is not printable text.
-    """
+    or has a path that is not printable text."""
     data = read_json(path)
     records = data.get("frames") if isinstance(data, dict) else None
     if not records or not isinstance(records, list):
@@ -296,11 +290,9 @@ def write_transforms(
     notes: Mapping[str, str | float] | None = None,
 ) -> None:
     """Write transforms.json into the folder `root`, with paths relative to it if they are below it.
-
     world: the one to write them in; the frames have +Z up. notes: more entries. Frames are either
     all on demand or none. Intrinsics equal to those of the first frame are written once. Write this
-    file last: its presence marks a complete dataset.
-    """
+    file last: its presence marks a complete dataset."""
     root = Path(root)
     header: dict[str, Any] = {"camera_model": "OPENCV", **intrinsics(frames[0].camera)}
     place: dict[str, Any] = {}
@@ -327,12 +319,10 @@ def write_transforms(
 
 
 def resumes(out: Path, record: str, settings: dict[str, Any]) -> bool:
-    """Whether `out`, whose lock is held, contains a dataset to continue; False if it is empty.
-
-    Such a dataset has the JSON file `record`, which must agree with every item of `settings`. It is
+    """Whether `out`, whose lock is held, contains a dataset to continue; False if it is empty. Such
+    a dataset has the JSON file `record`, which must agree with every item of `settings`. It is
     finished if it has a transforms.json. Temporary files of a killed process are removed. Raises
-    InputError if `out` holds anything else.
-    """
+    InputError if `out` holds anything else."""
     remove_leftovers(out)
     if not (out / record).is_file():
         check_new_folder(out)
@@ -345,11 +335,9 @@ def resumes(out: Path, record: str, settings: dict[str, Any]) -> bool:
 
 
 def target_of(frame: Frame, with_alpha: bool = False) -> np.ndarray:
-    """Target of a fit [H,W,4]: colour and weight of `Frame.target`; [H,W,5] with alpha appended.
-
-    It is `padded`, so that a fit uses its memory in place of a copy. Raises InputError if the mask
-    is empty, since a fit to black would remove the rock.
-    """
+    """Target of a fit [H,W,4]: colour and weight of `Frame.target`; [H,W,5] with alpha appended. It
+    is `padded`, so that a fit uses its memory in place of a copy. Raises InputError if the mask is
+    empty, since a fit to black would remove the rock."""
     if not frame.mask().any():
         raise InputError(
             f"{frame.mask_path}: the rock mask of frame {frame.name} is empty; "

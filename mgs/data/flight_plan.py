@@ -43,10 +43,8 @@ class Origin:
     bearing: float = 0.0
 
     def geodetic(self, position: np.ndarray) -> tuple[float, float, float]:
-        """Latitude, longitude (degrees) and altitude (metres) of a world position [3].
-
-        By the ellipsoid's radii of curvature at the origin: exact to a centimetre within 500 m.
-        """
+        """Latitude, longitude (degrees) and altitude (metres) of a world position [3]. By the
+        ellipsoid's radii of curvature at the origin: exact to a centimetre within 500 m."""
         x, y, z = (float(value) for value in position)
         turn, lat = math.radians(self.bearing), math.radians(self.latitude)
         east, north = (
@@ -108,21 +106,16 @@ def check_plan_path(path: Path) -> None:
 def write_flight_plan(
     path: str | Path, stops: Sequence[Stop], origin: Origin, hover: float, speed: float
 ) -> None:
-    """Write a flight plan in the format of its suffix (WRITERS), atomically.
-
-    The first stop is the home on the ground, where the flight starts and ends. hover: seconds at
-    each picture; speed: metres per second. Raises InputError as `check_plan_path` and
-    `atomic_path`.
-    """
+    """Write a flight plan in the format of its suffix (WRITERS), atomically. The first stop is the
+    home on the ground, where the flight starts and ends. hover: seconds at each picture; speed:
+    metres per second. Raises InputError as `check_plan_path` and `atomic_path`."""
     check_plan_path(Path(path))
     WRITERS[Path(path).suffix.lower()](Path(path), stops, origin, hover, speed)
 
 
 def _items(stops: Sequence[Stop], origin: Origin, hover: float, speed: float) -> list[list[Any]]:
-    """Mission items: command, frame, and seven parameters; the last three are a position.
-
-    Altitudes are above home, the first stop. The drone rises there to the height of the next one.
-    """
+    """Mission items: command, frame, and seven parameters; the last three are a position. Altitudes
+    are above home, the first stop. The drone rises there to the height of the next one."""
     lat, lon, ground = origin.geodetic(stops[0].position)
     rise = float(stops[1].position[2] - stops[0].position[2])
     items: list[list[Any]] = [

@@ -57,10 +57,8 @@ class Frame:
 
     def mask(self) -> np.ndarray:
         """Rock mask, bool [H,W]: the mask file; else alpha >= 0.5 of the rock image; else all true.
-
         In rendered datasets a pixel is true if the ray through its centre meets the rock. Raises
-        InputError as `rgb`.
-        """
+        InputError as `rgb`."""
         if self.mask_path is not None:
             return read_mask(self._existing(self.mask_path))
         if self.rock_path is not None:
@@ -87,10 +85,8 @@ class Frame:
         return self.target()[0][..., :3]
 
     def _existing(self, path: Path) -> Path:
-        """Return `path`, a file of the camera's size by its header.
-
-        Raises InputError if no run has taken this on-demand frame yet, and as `image_size`.
-        """
+        """Return `path`, a file of the camera's size by its header. Raises InputError if no run has
+        taken this on-demand frame yet, and as `image_size`."""
         if self.on_demand and not path.exists():
             raise InputError(
                 f"{path}: does not exist, since no run has taken frame {self.name} of this "

@@ -163,11 +163,8 @@ def import_shot(
     begin: Callable[[], None],
 ) -> Frame:
     """Write the files of a frame, the image last, unless the image exists and is no older than its
-    sources.
-
-    silhouette: mask of a camera by `silhouette_of`. begin: makes the output folder, called between
-    reading and writing, so that a source that cannot be read leaves no folder behind.
-    """
+    sources. silhouette: mask of a camera by `silhouette_of`. begin: makes the output folder, called
+    between reading and writing, so that a source that cannot be read leaves no folder behind."""
     camera, undo = undistorter(shot.camera, shot.lens)
     camera, undo = shrunk(camera, downscale, undo)
     image, mask_path, rock_path = (
@@ -207,11 +204,9 @@ def _mask_and_rock(
     shot: Shot, rgba: np.ndarray, undo: Undo
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Undistorted mask, bool [H,W], and rock image, float32 [H,W,4] linear premultiplied, that the
-    source gives; None if it gives none.
-
-    rgba [H,W,4]: pixels of the shot's image. Premultiplied light is resampled, since straight
-    colours would mix with those of empty pixels and leave a rim.
-    """
+    source gives; None if it gives none. rgba [H,W,4]: pixels of the shot's image. Premultiplied
+    light is resampled, since straight colours would mix with those of empty pixels and leave a
+    rim."""
     about = shot.camera, shot.turned
     cutout = None if shot.rock is None else read_fitting(read_rgba, shot.rock, *about)
     layer = rgba if cutout is None else cutout

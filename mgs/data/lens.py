@@ -38,11 +38,8 @@ class Lens:
     @classmethod
     def of(cls, where: str, model: str, K: np.ndarray, values: Mapping[str, float]) -> Lens | None:
         """Lens of a model of COLMAP, K [3,3], and coefficients by COLMAP's names; None for a
-        pinhole.
-
-        Raises InputError, which begins with `where`, for another model, and for a coefficient that
-        the model lacks.
-        """
+        pinhole. Raises InputError, which begins with `where`, for another model, and for a
+        coefficient that the model lacks."""
         values = {name: value for name, value in values.items() if value}
         if not np.isfinite([*values.values()]).all():
             raise InputError(f"{where} has a distortion that is not finite; correct it")
@@ -87,10 +84,8 @@ def parameter_names(model: str) -> list[str]:
 
 
 def undistorter(camera: Camera, lens: Lens | None) -> tuple[Camera, Undo]:
-    """Pinhole camera inside the view of a lens, of the same size, and the resampling to it.
-
-    camera: its size and pose. Raises InputError if no valid pixel is left.
-    """
+    """Pinhole camera inside the view of a lens, of the same size, and the resampling to it. camera:
+    its size and pose. Raises InputError if no valid pixel is left."""
     if lens is None:
         return camera, lambda pixels, smooth: pixels
     import cv2
@@ -171,11 +166,8 @@ def shrunk(
     camera: Camera, factor: int, undo: Undo = lambda pixels, smooth: pixels
 ) -> tuple[Camera, Undo]:
     """Camera whose pixels are blocks of factor x factor pixels, and the resampling to it after
-    `undo`: means of the blocks, or middle pixels if not smooth.
-
-    Incomplete blocks at the bottom and on the right are cut off. Raises InputError if no block is
-    left.
-    """
+    `undo`: means of the blocks, or middle pixels if not smooth. Incomplete blocks at the bottom and
+    on the right are cut off. Raises InputError if no block is left."""
     if factor == 1:
         return camera, undo
     width, height = camera.width // factor, camera.height // factor

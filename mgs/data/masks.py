@@ -25,11 +25,9 @@ def make_masks(
     dataset: Dataset, mesh: Mesh, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Dataset:
     """Write a mask of a mesh for each frame of a dataset, a contact sheet, and transforms.json; the
-    same first for its test views, if they have no masks.
-
-    progress: called (done, total) before each frame. Raises InputError if a frame has a mask
-    already, if the mesh is in no image, or if a file cannot be read or written.
-    """
+    same first for its test views, if they have no masks. progress: called (done, total) before each
+    frame. Raises InputError if a frame has a mask already, if the mesh is in no image, or if a file
+    cannot be read or written."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     for frame in dataset.frames:

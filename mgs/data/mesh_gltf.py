@@ -26,10 +26,8 @@ def load_gltf_mesh(
     path: Path, resolve: Callable[[str], bytes], coloured: bool
 ) -> trimesh.Trimesh | None:
     """All triangles of a file's scene as one mesh, in the file's axes; None if there are none.
-
     resolve: as of `Gltf`. coloured: whether to read the base colours: factor, texture and its
-    transform, vertex colours. Raises InputError for extensions and colours that are not read.
-    """
+    transform, vertex colours. Raises InputError for extensions and colours that are not read."""
     textures = "KHR_texture_transform|EXT_texture_webp" if coloured else r"\w+_texture_\w+"
     gltf = Gltf(path, f"{SHAPES}|{textures}", resolve)
     image = cache(partial(_image, gltf))

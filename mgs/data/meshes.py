@@ -75,11 +75,9 @@ def face_crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def load_mesh(path: str | Path, coloured: bool = True) -> trimesh.Trimesh:
     """Read a triangle mesh (GLB, OBJ, PLY ...) in the axes and units of its file. coloured: with
-    its texture or vertex colours.
-
-    Raises InputError if the file is missing or unreadable, the mesh has no faces or no area, a
-    vertex is NaN, infinite or beyond FURTHEST, or a face names a vertex that does not exist.
-    """
+    its texture or vertex colours. Raises InputError if the file is missing or unreadable, the mesh
+    has no faces or no area, a vertex is NaN, infinite or beyond FURTHEST, or a face names a vertex
+    that does not exist."""
     import trimesh
 
     path = Path(path)
@@ -172,12 +170,10 @@ def _plain_ply(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a triangle mesh in world coordinates, metres, as one clean surface, all of it seen.
-
-    glTF and GLB are +Y up by their format and turned to +Z up; other formats have no rule and are
-    taken as they are. Faces without area, repeated faces and unused vertices are removed. Faces are
-    wound as their neighbours, and outwards. Raises InputError as `load_mesh`.
-    """
+    """Read a triangle mesh in world coordinates, metres, as one clean surface, all of it seen. glTF
+    and GLB are +Y up by their format and turned to +Z up; other formats have no rule and are taken
+    as they are. Faces without area, repeated faces and unused vertices are removed. Faces are wound
+    as their neighbours, and outwards. Raises InputError as `load_mesh`."""
     path = Path(path)
     arrays = _plain_ply(path)
     if not arrays:

@@ -24,12 +24,10 @@ def is_metashape(path: Path) -> bool:
 
 
 def read_metashape(path: Path, images: Path) -> Source:
-    """Aligned and enabled cameras.
-
-    images: folder of the images, named as the cameras' labels. Lengths are metres where the chunk
-    has a scale, else of unknown unit. Position and north of a georeferenced chunk are left out.
-    Raises InputError where the file is damaged, or a lens is not supported.
-    """
+    """Aligned and enabled cameras. images: folder of the images, named as the cameras' labels.
+    Lengths are metres where the chunk has a scale, else of unknown unit. Position and north of a
+    georeferenced chunk are left out. Raises InputError where the file is damaged, or a lens is not
+    supported."""
     root = read_xml(path)
     shots, left_out = list[Shot](), Counter[str]()
     with parsing(path, "XML of Metashape's cameras", "export it again"):

@@ -39,10 +39,8 @@ def holds_photographs(folder: Path) -> bool:
 
 def dataset_at(folder: Path, site: Path) -> tuple[Dataset, Sequence[str]]:
     """Dataset of a folder of photographs, and notes on what was left out. site: folder for it, of
-    which a later call registers the photographs since then to the same model.
-
-    Raises InputError as `read_source`, and if `site` was made by something else.
-    """
+    which a later call registers the photographs since then to the same model. Raises InputError as
+    `read_source`, and if `site` was made by something else."""
     record = site / RECORD
     if site.exists() and not record.is_file():
         raise in_the_way(site)

@@ -44,12 +44,10 @@ def photographs_in(source: Path) -> list[Path]:
 def read_photographs(
     source: Path, paths: Sequence[Path], folder: Path, exclude: Sequence[str] = ()
 ) -> Source:
-    """Poses, lenses and points of photographs, of the largest part that hangs together.
-
-    folder: for matches, which a later call continues. exclude: names of photographs to leave out;
-    they do not place others either. With GPS in their EXIF that fits, the world
-    is in metres, +Y north and +Z up. Raises InputError if fewer than FEWEST can be placed.
-    """
+    """Poses, lenses and points of photographs, of the largest part that hangs together. folder: for
+    matches, which a later call continues. exclude: names of photographs to leave out; they do not
+    place others either. With GPS in their EXIF that fits, the world is in metres, +Y north and +Z
+    up. Raises InputError if fewer than FEWEST can be placed."""
     import pycolmap
 
     names = [frame_name(path.relative_to(source).as_posix()) for path in paths]

@@ -25,11 +25,8 @@ def mesh_in_sight(
     mesh: Mesh, cameras: Sequence[Camera], world: World, where: object = "mesh"
 ) -> Mesh:
     """Move a mesh to a dataset of this world (`towards`, `World.enter`), and check that it is in
-    some picture.
-
-    where: begins a message. Raises InputError if none of a few cameras sees the mesh, or all are
-    inside, as happens with another unit or other axes.
-    """
+    some picture. where: begins a message. Raises InputError if none of a few cameras sees the mesh,
+    or all are inside, as happens with another unit or other axes."""
     mesh = replace(mesh, vertices=world.enter(towards(mesh.vertices, world.origin)))
     depth, some = mesh_depth(mesh), cameras[:: max(1, len(cameras) // 4)]
     hits = [depth(shrunk_to(camera, SMALL)[0]) > 0 for camera in some]
@@ -46,11 +43,9 @@ def mesh_in_sight(
 
 
 def mesh_depth(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
-    """Return depth(camera): z-depth of the mesh, float32 [H,W], metres, 0 where no face is hit.
-
-    One ray through each pixel centre, which meets faces from either side. Raises InputError if no
-    variant can be started (`mgs.runtime.start`).
-    """
+    """Return depth(camera): z-depth of the mesh, float32 [H,W], metres, 0 where no face is hit. One
+    ray through each pixel centre, which meets faces from either side. Raises InputError if no
+    variant can be started (`mgs.runtime.start`)."""
     runtime.start()
     centre = mesh.vertices.mean(0)  # rays are cast around it: float32 is finest near the origin
     shape = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces))

@@ -186,10 +186,8 @@ def read_rtabmap(folder: Path, spacing: Spacing) -> Source:
 
 
 def _opencv_yaml(path: Path) -> tuple[np.ndarray, Lens | None]:
-    """K and lens of a camera in a file of OpenCV's FileStorage.
-
-    It is not read by OpenCV, which aborts the process on some damaged files.
-    """
+    """K and lens of a camera in a file of OpenCV's FileStorage. It is not read by OpenCV, which
+    aborts the process on some damaged files."""
     text, arrays = "\n" + read_text(path), []
     for key in ("camera_matrix", "distortion_coefficients"):
         _, there, rest = text.partition(f"\n{key}:")

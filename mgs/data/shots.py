@@ -187,10 +187,8 @@ def frame_name(path: str) -> str:
 
 
 def checked(path: Path, source: Source) -> Source:
-    """Source without the shots whose image does not exist.
-
-    Raises InputError if none is left, if a name is listed twice, or cannot be that of a file.
-    """
+    """Source without the shots whose image does not exist. Raises InputError if none is left, if a
+    name is listed twice, or cannot be that of a file."""
     there = [shot for shot in source.shots if shot.image.is_file()]
     left_out = source.left_out + Counter({"whose file is missing": len(source.shots) - len(there)})
     if not there:
@@ -209,11 +207,9 @@ def checked(path: Path, source: Source) -> Source:
 
 def turned_by_exif(source: Source) -> Source:
     """Source whose pictures are turned by their EXIF orientation if its cameras are for such ones.
-
     Some programs ignore the orientation and others apply it. Pictures of unequal sides that lie on
     their side show which by the size of their cameras. Where none does, the pictures are taken as
-    they are stored, and a note says so.
-    """
+    they are stored, and a note says so."""
     if any(shot.turned for shot in source.shots):
         return source
     tags = [exif_orientation(shot.image) for shot in source.shots]

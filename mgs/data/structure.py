@@ -157,11 +157,9 @@ class Matcher:
         return self._cloud(self._points(cameras))
 
     def refined(self, cameras: Sequence[Camera]) -> tuple[list[Camera], SparseCloud | None]:
-        """Cameras after bundle adjustment of their poses, and the points of `triangulated`.
-
-        A prior holds each position to POSITION_STD of the distance to what the camera sees. Cameras
-        that share no points with others, and all if there are under LEAST_POINTS, stay.
-        """
+        """Cameras after bundle adjustment of their poses, and the points of `triangulated`. A prior
+        holds each position to POSITION_STD of the distance to what the camera sees. Cameras that
+        share no points with others, and all if there are under LEAST_POINTS, stay."""
         import pycolmap
 
         self.match(alike(cameras))

@@ -45,10 +45,8 @@ def orthonormal(pose: np.ndarray) -> tuple[np.ndarray, bool]:
 
 
 def rigid(translation: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
-    """Matrix [4,4] of a translation and a quaternion (x, y, z, w).
-
-    Raises ValueError where its length is far from 1.
-    """
+    """Matrix [4,4] of a translation and a quaternion (x, y, z, w). Raises ValueError where its
+    length is far from 1."""
     if not 1e-3 < float(np.linalg.norm(quaternion)) < 1e3:
         raise ValueError("the length of a quaternion is not 1")
     pose = np.eye(4)

@@ -15,12 +15,10 @@ JUDGED = 640  # longer side, pixels, to which frames are reduced to compare how 
 
 
 def sharpest_frames(video: Path, folder: Path, spacing: Spacing) -> list[Path]:
-    """Write the sharpest frame of each time of `spacing` into a folder, and return their files.
-
-    The sharpest has the largest variance of the Laplacian. A video that ends in the middle gives
-    the frames before. A folder that already holds them is taken as it is. Raises InputError for a
-    spacing in metres, and if the video cannot be read.
-    """
+    """Write the sharpest frame of each time of `spacing` into a folder, and return their files. The
+    sharpest has the largest variance of the Laplacian. A video that ends in the middle gives the
+    frames before. A folder that already holds them is taken as it is. Raises InputError for a
+    spacing in metres, and if the video cannot be read."""
     import cv2
 
     if spacing.metres:

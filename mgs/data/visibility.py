@@ -17,10 +17,8 @@ GRAZING = 0.2  # least cosine of the angle between normal and view that widens t
 
 
 def in_image(camera: Camera, pixels: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Whether projected points lie in front of a camera and in its image, bool [N].
-
-    pixels [N,2], z [N]: from `Camera.project`.
-    """
+    """Whether projected points lie in front of a camera and in its image, bool [N]. pixels [N,2], z
+    [N]: from `Camera.project`."""
     return (z > 0) & (pixels >= 0).all(1) & (pixels < [camera.width, camera.height]).all(1)
 
 
@@ -63,11 +61,9 @@ def mask_share(
     points: np.ndarray, frames: Sequence[Frame], slack: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Share of masks that contain each point [N,3], among the frames with it in their image, and
-    the number of these frames: ([N] 0 to 1, [N]).
-
-    A mask is the outline of the whole object, so points of the object fall into every mask, hidden
-    or not. slack: dilation of the masks, pixels, for errors of points and poses.
-    """
+    the number of these frames: ([N] 0 to 1, [N]). A mask is the outline of the whole object, so
+    points of the object fall into every mask, hidden or not. slack: dilation of the masks, pixels,
+    for errors of points and poses."""
     inside, count = np.zeros(len(points)), np.zeros(len(points), int)
     for frame in frames:
         pixels, z = frame.camera.project(points)

@@ -112,10 +112,8 @@ def unit_up(vector: Sequence[float] | np.ndarray) -> Vector:
 
 
 def levelled(up: Vector) -> np.ndarray:
-    """Rotation [3,3] that turns `up` to +Z, and the level part of the world's +Y to +Y.
-
-    The world's +Z takes the place of its +Y if that is less than 45 degrees from the vertical.
-    """
+    """Rotation [3,3] that turns `up` to +Z, and the level part of the world's +Y to +Y. The world's
+    +Z takes the place of its +Y if that is less than 45 degrees from the vertical."""
     z = np.array(up)
     y = np.eye(3)[2 if abs(up[1]) > np.sqrt(0.5) else 1]
     y = y - (y @ z) * z

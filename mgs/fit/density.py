@@ -73,11 +73,9 @@ def adapt(
     model: Gaussians, slopes: Slopes, rng: np.random.Generator
 ) -> tuple[Gaussians, np.ndarray]:
     """The control of Kerbl et al. 2023: Gaussians of large gradient are copied if small and divided
-    in two if large; faint and too large ones are removed, and at times all opacities lowered.
-
-    With no room for all, those of largest gradient are taken. Not removed are Gaussians that are
-    large in an image: the authors' program clears that measure before it reads it.
-    """
+    in two if large; faint and too large ones are removed, and at times all opacities lowered. With
+    no room for all, those of largest gradient are taken. Not removed are Gaussians that are large
+    in an image: the authors' program clears that measure before it reads it."""
     grow = np.argsort(-slopes.gradient, kind="stable")[: max(slopes.most - len(model), 0)]
     grow = np.sort(grow[slopes.gradient[grow] >= LEAST_GRADIENT])
     small = _size(model)[grow] <= SMALL * slopes.extent

@@ -126,10 +126,8 @@ def worth(
     away: Array, precision: Array, lam: Array, sigma: float, of: Mapping[str, slice], phi: float
 ) -> Worth:
     """Worth of parameters by the formulas of this module; 0 if the images say nothing of the kind.
-
     away: [N,P] distance of each from its start. precision: [N,P] diagonal of J^T J + lam over all
-    pixels. lam: [P]. sigma: noise of a pixel, linear RGB. of: columns by kind. phi: objective.
-    """
+    pixels. lam: [P]. sigma: noise of a pixel, linear RGB. of: columns by kind. phi: objective."""
     rise = 0.5 * precision * np.square(away)
     gain = rise / sigma**2 - 0.5 * np.log(precision / lam)
     gains, rises, unseen = {}, {}, np.ones(len(away), bool)
@@ -143,10 +141,8 @@ def worth(
 
 def paying(worths: Worth, sizes: Mapping[str, int], loss: float) -> dict[str, Mask]:
     """Choose the Gaussians that learn each kind, {kind: [N]}: those that gain, without those that
-    gain least per parameter while Phi rises by at most `loss` dB in all.
-
-    sizes: {kind: parameters of a Gaussian}; only these kinds are decided.
-    """
+    gain least per parameter while Phi rises by at most `loss` dB in all. sizes: {kind: parameters
+    of a Gaussian}; only these kinds are decided."""
     gain = np.stack([worths.gain[kind] / size for kind, size in sizes.items()]).ravel()
     rise, pays = np.stack([worths.rise[kind] for kind in sizes]).ravel(), gain > 0
     least = np.flatnonzero(pays)[np.argsort(gain[pays], kind="stable")]
@@ -269,11 +265,9 @@ def fitted(
     cache: ListCache,
     learns: Mapping[str, Mask] | None = None,
 ) -> Gaussians:
-    """Fit some views (indices) from the start; return the Gaussians.
-
-    learns: as `LeanModel.learned`; None: all is learned. Raises InputError as `mgs.fit_gaussians`,
-    and if the fit diverges.
-    """
+    """Fit some views (indices) from the start; return the Gaussians. learns: as
+    `LeanModel.learned`; None: all is learned. Raises InputError as `mgs.fit_gaussians`, and if the
+    fit diverges."""
     start, train = images.start(views).with_degree(degree), settings.train
     fit = fit_gaussians(
         start,

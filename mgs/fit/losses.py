@@ -32,10 +32,8 @@ def squared(drawn: Any, pixels: Any, weights: Any, size: Size, linear: bool) -> 
 
 
 def l1_dssim(drawn: Any, pixels: Any, weights: Any, size: Size, linear: bool) -> Any:
-    """0.8 |x - y| + 0.2 (1 - SSIM(x, y)) of the images as sRGB (Kerbl et al. 2023).
-
-    Alpha is not encoded. SSIM takes values beyond the border as 0, as the authors' program does.
-    """
+    """0.8 |x - y| + 0.2 (1 - SSIM(x, y)) of the images as sRGB (Kerbl et al. 2023). Alpha is not
+    encoded. SSIM takes values beyond the border as 0, as the authors' program does."""
     if linear:
         drawn, pixels = _encoded(drawn, size), _encoded(pixels, size)
     x, y = pixels + (drawn - pixels) * weights, pixels
@@ -90,10 +88,8 @@ class _Blur(dr.CustomOp):
 
 
 def _blurred(images: tuple[Any, ...], size: Size) -> tuple[Any, ...]:
-    """Images convolved with the window of SSIM, 0 beyond the border.
-
-    A lane makes STRIP values of a row or column, which share what they read.
-    """
+    """Images convolved with the window of SSIM, 0 beyond the border. A lane makes STRIP values of a
+    row or column, which share what they read."""
     width, height, channels = size
     for length, stride in ((width, channels), (height, channels * width)):
         dr.eval(images)

@@ -127,10 +127,8 @@ class View:
         return len(self.lists.splat), len(self.lists.block), *self.size, self.target.stored
 
     def rendered(self, model: Gaussians, shift: Sequence[Any] = ()) -> Any:
-        """Pixels of a model, TensorXf [H,W,C], differentiable.
-
-        shift: x and y [N] of zeros, px, to differentiate by the splats' centres.
-        """
+        """Pixels of a model, TensorXf [H,W,C], differentiable. shift: x and y [N] of zeros, px, to
+        differentiate by the splats' centres."""
         splats = project(model, self.camera)
         if shift:
             x, y = splats.mean_x + shift[0], splats.mean_y + shift[1]
@@ -139,10 +137,8 @@ class View:
 
     def slopes(self, shift: Sequence[Any]) -> list[Any]:
         """For each Gaussian, the norm of the derivative of the image's mean loss by its centre, in
-        units of half the width and height, and 1 if it is drawn, else 0; Float [N] each.
-
-        shift: as in `rendered`, with the gradient of half the summed loss.
-        """
+        units of half the width and height, and 1 if it is drawn, else 0; Float [N] each. shift: as
+        in `rendered`, with the gradient of half the summed loss."""
         width, height, _ = self.size
         along_x, along_y = (
             dr.grad(s) * (size / len(self.target))
@@ -277,11 +273,9 @@ def objective(
     error: str = "squared",
 ) -> Objective:
     """The objective of `mgs.fit.fitting.fit_gaussians`, from the same arguments and settings.
-
     error: a name in LOSSES. Raises InputError if it is unknown, the start does not fit the
-    Gaussians, or `means` is not a name in `mgs.splat.MEANS`. A target without alpha, where
-    alpha has a weight, raises it when it is read.
-    """
+    Gaussians, or `means` is not a name in `mgs.splat.MEANS`. A target without alpha, where alpha
+    has a weight, raises it when it is read."""
     groups(gaussians.sh_degree, means)  # raises if the name is unknown
     row_named(LOSSES, error, "loss")
     if len(cameras) != len(targets):

@@ -47,10 +47,8 @@ def tau(noise: PoseNoise, cameras: Sequence[Camera], centre: np.ndarray) -> np.n
 
 def spread(given: Sequence[Camera], cameras: Sequence[Camera], most: np.ndarray) -> np.ndarray:
     """Standard deviation [V,6] of motions as found: `most` [V,6] times the root mean square of
-    motion / most, up to 1, of the turn of each view and of its shift.
-
-    Under it in place of `most`, views that the images hardly pull come to rest where they were.
-    """
+    motion / most, up to 1, of the turn of each view and of its shift. Under it in place of `most`,
+    views that the images hardly pull come to rest where they were."""
     motions = [motion_between(*pair) for pair in zip(given, cameras, strict=True)] / most
     factors = np.sqrt(np.mean(motions.reshape(-1, 2, 3) ** 2, axis=2))
     return most * np.repeat(factors.clip(LEAST, 1), 3, axis=1)
@@ -74,10 +72,8 @@ def displaced(camera: Camera, motion: np.ndarray) -> Camera:
 def pose_steps(
     goal: Objective, model: Gaussians, given: Sequence[Camera], lam: np.ndarray
 ) -> list[Camera]:
-    """Cameras of all views after one Gauss-Newton step from those of the objective's photos.
-
-    model: TensorXf fields. given: cameras of no motion. lam: of each motion [V,6].
-    """
+    """Cameras of all views after one Gauss-Newton step from those of the objective's photos. model:
+    TensorXf fields. given: cameras of no motion. lam: of each motion [V,6]."""
     cameras = []
     for photo, old, weight in zip(goal.photos, given, lam, strict=True):
         residual, J = residual_and_jacobian(goal, model, photo)

@@ -32,11 +32,8 @@ Scale = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
 
 
 def complete(given: Any, defaults: Mapping[str, float]) -> Any:
-    """A number for each kind of parameter: the given one, or the default.
-
-    "mean" may be given too. It has no default, because its unit is the metre and scenes differ in
-    size.
-    """
+    """A number for each kind of parameter: the given one, or the default. "mean" may be given too.
+    It has no default, because its unit is the metre and scenes differ in size."""
     if not isinstance(given, Mapping) or not given.keys() <= {*defaults, "mean"}:
         raise ValueError(
             f"must be a number for each of {', '.join(defaults)}; "
@@ -142,11 +139,9 @@ class ModelSettings(BaseModel):
     def regularisation(
         self, groups: dict[str, slice], surface: bool = False
     ) -> NDArray[np.float64]:
-        """lambda [P] of the columns of the Fisher information; groups: columns by kind.
-
-        surface: of the Gaussians on the surface before training, which the setting `lam` does not
-        concern. Raises InputError where `prior_std` lacks one of these kinds.
-        """
+        """lambda [P] of the columns of the Fisher information; groups: columns by kind. surface: of
+        the Gaussians on the surface before training, which the setting `lam` does not concern.
+        Raises InputError where `prior_std` lacks one of these kinds."""
         if missing := [kind for kind in groups if kind not in self.prior_std]:
             raise InputError(f"prior_std: has no number for {missing[0]}; give one, metres")
         by_kind = regularisation(groups, self.pixel_noise, self.prior_std)
@@ -158,10 +153,8 @@ class ModelSettings(BaseModel):
 
 
 def as_3dgs(extent: float) -> dict[str, Any]:
-    """Values of `TrainSettings` as in Kerbl et al. 2023, for any number of passes.
-
-    extent: of the scene, metres (`mgs.camera.extent_of`).
-    """
+    """Values of `TrainSettings` as in Kerbl et al. 2023, for any number of passes. extent: of the
+    scene, metres (`mgs.camera.extent_of`)."""
     steady = {"colour": 2.5e-3, "scale": 5e-3, "rotation": 1e-3, "opacity": 5e-2}
     return {
         "means": "free",

@@ -134,11 +134,9 @@ def prior_and_cloud(
     points: Path | None = None,
 ) -> tuple[Prior, SegmentedCloud | None]:
     """Build the prior of a dataset. Returns it, and the cloud of its mesh (None for a hull).
-
     Arguments as `build_prior`. Raises InputError as `choose_source`, `check_masks`, `surface_of`,
     `scattered`, `segment_dataset`, `poisson_mesh` and `sample_surface`, and if no frame sees the
-    mesh; NoSurface, which holds the cloud, if points give no surface.
-    """
+    mesh; NoSurface, which holds the cloud, if points give no surface."""
     kind = choose_source(dataset, source, points)
     if kind == "random":
         return _random_prior(dataset, settings, dataset.frames), None
@@ -237,12 +235,9 @@ def _samples(
     closest_pixels: float = PIXELS_PER_SAMPLE,
 ) -> tuple[np.ndarray, np.ndarray, float, dict[str, Any]]:
     """Samples of a surface: points [N,3], unit normals [N,3], spacing in metres, and items of
-    prior.json about mesh and samples; square metres, metres.
-
-    cameras: the closest one sets the spacing, to `closest_pixels` of its pixels, if the settings do
-    not. pixel: unit of `settings.density`, metres. Raises InputError as `resolution` and
-    `sample_surface`.
-    """
+    prior.json about mesh and samples; square metres, metres. cameras: the closest one sets the
+    spacing, to `closest_pixels` of its pixels, if the settings do not. pixel: unit of
+    `settings.density`, metres. Raises InputError as `resolution` and `sample_surface`."""
     resolved = None
     if settings.resolved_by_cameras:
         resolved = resolution(mesh, cameras, closest_pixels)
@@ -331,12 +326,9 @@ def outline_error(mesh: Mesh, frames: Sequence[Frame]) -> float:
 
 def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
     """The mesh, with only those faces seen that have a corner which some frame sees inside its rock
-    mask.
-
-    Other faces are buried, close a gap that frames look through, or are hidden from every view, so
-    Gaussians there would be useless or wrong. tolerance: as `visible`, metres. If no frame has
-    depth, the depth of the mesh decides. Raises InputError if no frame sees the mesh.
-    """
+    mask. Other faces are buried, close a gap that frames look through, or are hidden from every
+    view, so Gaussians there would be useless or wrong. tolerance: as `visible`, metres. If no frame
+    has depth, the depth of the mesh decides. Raises InputError if no frame sees the mesh."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     with_depth = [frame for frame in frames if frame.depth_path is not None]
@@ -357,10 +349,8 @@ def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
 
 def save_prior(out: str | Path, prior: Prior) -> Path:
     """Write mesh.ply, points.ply (x y z nx ny nz) and prior.json into a new folder, and return it.
-
     The files are in the world of the dataset's files (`Prior.world`). Raises InputError if the
-    folder is not empty or cannot be written.
-    """
+    folder is not empty or cannot be written."""
     import trimesh
 
     out, prior = check_new_folder(out), prior.moved(prior.world.leave)
@@ -373,10 +363,8 @@ def save_prior(out: str | Path, prior: Prior) -> Path:
 
 def load_prior(folder: str | Path) -> Prior:
     """Read a prior that `save_prior` wrote, turned upright. All faces of its mesh count as seen,
-    since the file does not say which were sampled.
-
-    Raises InputError if the folder or a file is missing, damaged or holds NaN.
-    """
+    since the file does not say which were sampled. Raises InputError if the folder or a file is
+    missing, damaged or holds NaN."""
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(

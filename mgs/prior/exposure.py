@@ -59,11 +59,9 @@ def without_gain(target: np.ndarray, gain: np.ndarray) -> np.ndarray:
 
 
 def exposure_of(prior: Prior) -> Callable[[Sequence[Frame]], np.ndarray]:
-    """Return gains(frames): [V,3] by `solve_gains`; every frame is read once.
-
-    Of a random start only the points that came with the cameras are compared. gains raises
-    InputError if a file of a frame cannot be read.
-    """
+    """Return gains(frames): [V,3] by `solve_gains`; every frame is read once. Of a random start
+    only the points that came with the cameras are compared. gains raises InputError if a file of a
+    frame cannot be read."""
     count = prior.numbers.get("triangulated", len(prior.points))
     some = slice(None, count, max(1, -(-count // SAMPLES)))
     points, normals = prior.points[some], prior.normals[some]

@@ -42,10 +42,8 @@ class _View:
         axis.set(xlim=limits, ylim=limits, aspect="equal", xticks=[], yticks=[])
 
     def dots(self, axis, points: np.ndarray, colour: np.ndarray, zoom: float, size: float) -> None:
-        """Draw world points [N,3], nearest last, as dots of `size` square points.
-
-        colour: RGB [N,3], or values [N] for a colour map.
-        """
+        """Draw world points [N,3], nearest last, as dots of `size` square points. colour: RGB
+        [N,3], or values [N] for a colour map."""
         points = self.picture(points)
         if len(points) > MAX_DOTS:
             subset = np.random.default_rng(0).choice(len(points), MAX_DOTS, replace=False)
@@ -58,11 +56,8 @@ class _View:
 
 
 def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None) -> None:
-    """Write the figure of a prior as a PNG, atomically.
-
-    segmented: the cloud of the mesh; None if the mesh was given, without panels of the cloud.
-    Raises InputError if it cannot be written.
-    """
+    """Write the figure of a prior as a PNG, atomically. segmented: the cloud of the mesh; None if
+    the mesh was given, without panels of the cloud. Raises InputError if it cannot be written."""
     plane = None if segmented is None else segmented.plane
     body = prior.mesh.vertices
     reach = 0.5 * float(np.linalg.norm(np.ptp(body, axis=0)))
@@ -91,9 +86,7 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
 
 def draw_refused(path: str | Path, points: np.ndarray, rock: np.ndarray) -> None:
     """Write the figure of a cloud [P,3] without surface, from the side and from above, as a PNG.
-
-    rock: [P] bool, taken for the object, blue. Raises InputError if it cannot be written.
-    """
+    rock: [P] bool, taken for the object, blue. Raises InputError if it cannot be written."""
     object_points = points[rock] if rock.any() else points
     middle = np.median(object_points, axis=0)
     reach = 1.5 * float(np.quantile(np.linalg.norm(object_points - middle, axis=1), 0.95))

@@ -145,10 +145,7 @@ def _signed_distance(mask: np.ndarray) -> np.ndarray:
 
 def _bounds(frames: Sequence[Frame]) -> tuple[np.ndarray, float]:
     """Lowest corner [3] and edge of the cube to carve in, around the point nearest to the rays
-    through the masks' centres.
-
-    Raises InputError if every mask is empty or fills its image.
-    """
+    through the masks' centres. Raises InputError if every mask is empty or fills its image."""
     rays, cones = [], []
     for frame in frames:
         mask = frame.mask()
@@ -187,10 +184,7 @@ def _inside(views: Sequence[_View], points: np.ndarray, reach: float) -> np.ndar
 
 def _odd_one(views: Sequence[_View], points: np.ndarray) -> tuple[int, float, float]:
     """Place of the frame that carves most of the points that few others carve (FEW), the share of
-    them that it carves, and that of the median frame.
-
-    points: [N,3], of the coarse grid.
-    """
+    them that it carves, and that of the median frame. points: [N,3], of the coarse grid."""
     values = np.stack([view(points) for view in views])
     carved, count = values <= 0, np.isfinite(values).sum(axis=0)
     above = carved.sum(axis=0) - np.maximum(FEW * count, 1)
@@ -222,10 +216,8 @@ def _without_specks(field: np.ndarray) -> np.ndarray:
 def _checked_agreement(
     frames: Sequence[Frame], views: Sequence[_View], mesh: Mesh, points: np.ndarray
 ) -> np.ndarray:
-    """Share of each mask that the mesh fills. Raises InputError if too small.
-
-    points: [N,3], of the coarse grid; they tell which frame is wrong.
-    """
+    """Share of each mask that the mesh fills. Raises InputError if too small. points: [N,3], of the
+    coarse grid; they tell which frame is wrong."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     depth = mesh_depth(mesh)

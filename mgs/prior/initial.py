@@ -112,9 +112,7 @@ def round_gaussians(
     linear: bool = True,
 ) -> tuple[Gaussians, np.ndarray]:
     """Round, nearly transparent Gaussians at points [N,3], and whether a frame shows them [N].
-
-    gains, linear: as in `initial_gaussians`.
-    """
+    gains, linear: as in `initial_gaussians`."""
     total, count = np.zeros((len(points), 3)), np.zeros(len(points))
     for k, frame in enumerate(frames):
         pixels, z = frame.camera.project(points)
@@ -136,12 +134,10 @@ def round_gaussians(
 
 
 def warm_start(model: Gaussians, before: Gaussians, start: Gaussians) -> Gaussians:
-    """Model to continue a fit from after images were added.
-
-    model: result of the fit so far. before, start: `initial_gaussians` of the images until then,
-    and of all images now. Colours change by the difference of the two, so a Gaussian that is newly
-    seen takes its new colour at once; all else stays as fitted.
-    """
+    """Model to continue a fit from after images were added. model: result of the fit so far.
+    before, start: `initial_gaussians` of the images until then, and of all images now. Colours
+    change by the difference of the two, so a Gaussian that is newly seen takes its new colour at
+    once; all else stays as fitted."""
     return replace(model, sh=model.sh + (start.sh - before.sh))
 
 
@@ -190,10 +186,8 @@ def seen_colours(
     points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float
 ) -> Colours:
     """Mask [N] of the surface points that a frame sees inside its mask, and their colours, [seen,3]
-    linear RGB.
-
-    normals, depth [H,W], tolerance: as `visible`. Raises InputError if a file cannot be read.
-    """
+    linear RGB. normals, depth [H,W], tolerance: as `visible`. Raises InputError if a file cannot be
+    read."""
     seen = visible(points, normals, frame.camera, depth, tolerance) & in_mask(points, frame)
     pixels, _ = frame.camera.project(points[seen])
     at, rgb = [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], frame.rgb()
@@ -202,10 +196,8 @@ def seen_colours(
 
 
 def depth_of(prior: Prior) -> Callable[[Frame], np.ndarray]:
-    """Return depth(frame): [H,W], metres, the frame's own, or that of the prior's mesh.
-
-    depth raises InputError as `mesh_depth` and `Frame.depth`.
-    """
+    """Return depth(frame): [H,W], metres, the frame's own, or that of the prior's mesh. depth
+    raises InputError as `mesh_depth` and `Frame.depth`."""
 
     @cache
     def of_mesh() -> Callable[[Camera], np.ndarray]:
@@ -218,12 +210,9 @@ def depth_of(prior: Prior) -> Callable[[Frame], np.ndarray]:
 
 def colour_agreement(prior: Prior, frames: Sequence[Frame]) -> float:
     """Share of the variance of the colours seen that is between samples, not between frames at one
-    sample; NaN if no sample is seen twice.
-
-    A point of a real surface has about one colour in all frames that see it; a wrong surface shows
-    another thing in each. Up to AGREEMENT_FRAMES frames, evenly spread, are read. Raises InputError
-    if a file cannot be read.
-    """
+    sample; NaN if no sample is seen twice. A point of a real surface has about one colour in all
+    frames that see it; a wrong surface shows another thing in each. Up to AGREEMENT_FRAMES frames,
+    evenly spread, are read. Raises InputError if a file cannot be read."""
     step = max(1, -(-len(frames) // AGREEMENT_FRAMES))
     colours = colours_of(prior)
     n = len(prior.points)

@@ -75,11 +75,9 @@ def on_surface(points: np.ndarray) -> np.ndarray:
 
 def main_cluster(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, int]:
     """Points [N,3] of the cluster of largest total weight [N], bool [N], and the number of
-    clusters; all points and 0 if no part is denser.
-
-    HDBSCAN (Campello et al. 2013, scikit-learn). Points that it gives to no cluster, because few
-    are around them, belong to the one next to them.
-    """
+    clusters; all points and 0 if no part is denser. HDBSCAN (Campello et al. 2013, scikit-learn).
+    Points that it gives to no cluster, because few are around them, belong to the one next to
+    them."""
     from sklearn.cluster import HDBSCAN
 
     least = max(CLUSTER_SAMPLES, int(CLUSTER_SHARE * len(points)))
@@ -105,10 +103,8 @@ def segment_points(
     sparse: SparseCloud, dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]
 ) -> SegmentedCloud:
     """The object in a triangulated cloud: the points inside all masks; without masks, what stands
-    above the ground; without ground, the densest thing near what the cameras look at.
-
-    on_stage: called with the name of each stage. Raises NoSurface if too few points are left.
-    """
+    above the ground; without ground, the densest thing near what the cameras look at. on_stage:
+    called with the name of each stage. Raises NoSurface if too few points are left."""
     on_stage("points")
     frames = dataset.frames
     good = reliable(sparse)
@@ -158,11 +154,9 @@ def _plane_or_none(cloud: Cloud, frames: Sequence[Frame], settings: PriorSetting
 def _cluster_looked_at(
     cloud: Cloud, frames: Sequence[Frame], plane: Plane | None
 ) -> tuple[np.ndarray, int]:
-    """Object points without masks, bool [N], and the number of clusters in question.
-
-    Points weigh more the higher above the ground and the nearer to what the cameras look at, since
-    a long low rise of the ground has more points than a rock.
-    """
+    """Object points without masks, bool [N], and the number of clusters in question. Points weigh
+    more the higher above the ground and the nearer to what the cameras look at, since a long low
+    rise of the ground has more points than a rock."""
     target = focus(frames)
     away = np.linalg.norm(cloud.points - target.point, axis=1) / target.distance
     height = np.ones(len(away)) if plane is None else plane.height(cloud.points)

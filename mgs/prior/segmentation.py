@@ -177,11 +177,8 @@ def rock_cluster(
 
 def estimate_normals(points: np.ndarray, views: np.ndarray, roughness: float = 0.0) -> np.ndarray:
     """Unit normals [N,3] of points [N,3], of the plane through their neighbours (Hoppe et al.
-    1992).
-
-    views [N,3]: directions to the cameras, which decide the sign. roughness: noise over the
-    distance between neighbours; the more, the more neighbours are used.
-    """
+    1992). views [N,3]: directions to the cameras, which decide the sign. roughness: noise over the
+    distance between neighbours; the more, the more neighbours are used."""
     least, most = NORMAL_NEIGHBOURS
     count = min(int(least * (1 + 2 * roughness)), most, len(points))
     neighbours = points[cKDTree(points).query(points, count)[1]]
@@ -211,11 +208,9 @@ class SegmentedCloud:
 def segment_dataset(
     dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]
 ) -> SegmentedCloud:
-    """Fuse the depth images of a dataset into a cloud, and find the ground and the rock.
-
-    on_stage: called with the name of each stage. Raises InputError as `fuse_frames`, `ground_plane`
-    and `rock_cluster`.
-    """
+    """Fuse the depth images of a dataset into a cloud, and find the ground and the rock. on_stage:
+    called with the name of each stage. Raises InputError as `fuse_frames`, `ground_plane` and
+    `rock_cluster`."""
     on_stage("cloud")
     cloud = fuse_frames(dataset.frames)
     on_stage("ground plane")

@@ -42,10 +42,8 @@ class PriorSettings:
         return self.gaussians == "auto" or values == (None, None, None)
 
     def refuse_shaping(self, why: str) -> None:
-        """Raise InputError if a Poisson depth is set, which needs a cloud.
-
-        why: end of the message, what the surface is made of instead.
-        """
+        """Raise InputError if a Poisson depth is set, which needs a cloud. why: end of the message,
+        what the surface is made of instead."""
         if self.poisson_depth is not None:
             raise InputError(
                 "prior: `poisson_depth` shapes a mesh that is built of a cloud, "

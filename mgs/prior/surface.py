@@ -66,10 +66,8 @@ def poisson_mesh(
 def closed_poisson(
     points: np.ndarray, normals: np.ndarray, voxel: float, depth: int | None
 ) -> tuple[Mesh, int]:
-    """The watertight Poisson surface of points all around an object, and octree depth.
-
-    Arguments and errors as `poisson_mesh`, without plane and cut.
-    """
+    """The watertight Poisson surface of points all around an object, and octree depth. Arguments
+    and errors as `poisson_mesh`, without plane and cut."""
     solid, depth = _closed_solid(points, normals, voxel, depth, None)
     return _from_solid(_supported(solid, points)), depth
 
@@ -118,12 +116,9 @@ def _from_solid(solid: Any) -> Mesh:
 def _closed_solid(
     points: np.ndarray, normals: np.ndarray, voxel: float, depth: int | None, plane: Plane | None
 ) -> tuple[Any, int]:
-    """Poisson surface as a solid of manifold3d, and the octree depth.
-
-    Under an open cloud the surface may leave the cube. Then a larger cube is tried, and last the
-    points are mirrored in the ground plane too; cells keep their size. Raises InputError if no try
-    gives a closed surface.
-    """
+    """Poisson surface as a solid of manifold3d, and the octree depth. Under an open cloud the
+    surface may leave the cube. Then a larger cube is tried, and last the points are mirrored in the
+    ground plane too; cells keep their size. Raises InputError if no try gives a closed surface."""
     import manifold3d
     import pymeshlab
 
@@ -244,11 +239,9 @@ def _blue_noise(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
 
 
 def _independent(pairs: np.ndarray, n: int) -> np.ndarray:
-    """Take 0, 1, ... n-1 in turn, except partners in `pairs` [P,2] of one taken before.
-
-    Vectorised rounds: a number is taken if it has no smaller undecided partner; partners of taken
-    numbers are dropped.
-    """
+    """Take 0, 1, ... n-1 in turn, except partners in `pairs` [P,2] of one taken before. Vectorised
+    rounds: a number is taken if it has no smaller undecided partner; partners of taken numbers are
+    dropped."""
     low, high = pairs.min(1), pairs.max(1)
     undecided, members = np.ones(n, bool), np.zeros(n, bool)
     while undecided.any():

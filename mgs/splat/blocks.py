@@ -116,11 +116,9 @@ RESHAPED, REORDERED = 1, 2  # results of `changes`
 
 
 def changes(old: Footprints, splats: Splats) -> Any:
-    """Compare splats with those for which lists were built, UInt32 [N].
-
-    0: the footprint is the same, or drawn in neither. RESHAPED: the footprint changed, so lists
-    must be rebuilt. REORDERED: the depth changed, so the order must be, too.
-    """
+    """Compare splats with those for which lists were built, UInt32 [N]. 0: the footprint is the
+    same, or drawn in neither. RESHAPED: the footprint changed, so lists must be rebuilt. REORDERED:
+    the depth changed, so the order must be, too."""
     now = footprints(splats)
     # Any number of a drawn footprint differs, bit for bit.
     other = (old.mean_x != now.mean_x) | (old.mean_y != now.mean_y) | (old.shear != now.shear)
@@ -132,10 +130,8 @@ def changes(old: Footprints, splats: Splats) -> Any:
 
 
 def depth_order(depth: Any) -> Any:
-    """Indices of splats front to back, equal depths by index, UInt32 [N].
-
-    The bits of positive floats have the order of the values. depth: Float [N], positive.
-    """
+    """Indices of splats front to back, equal depths by index, UInt32 [N]. The bits of positive
+    floats have the order of the values. depth: Float [N], positive."""
     index = dr.arange(mi.UInt32, len(depth))
     return _sorted(index, dr.reinterpret_array(mi.UInt32, depth), 1 << 32)
 
@@ -190,10 +186,8 @@ def build(splats: Splats, camera: Camera, older: BlockLists | None = None) -> Bl
 
 
 def _tile_number(block: Any, blocks_x: int) -> Any:
-    """Number of a block counted tile by tile, from its number counted row by row, UInt32.
-
-    Tiles at the edge of the image count as whole, so some numbers belong to no block.
-    """
+    """Number of a block counted tile by tile, from its number counted row by row, UInt32. Tiles at
+    the edge of the image count as whole, so some numbers belong to no block."""
     # Block (bx, by) is number (by mod TILE) TILE + bx mod TILE of its tile.
     bx, by = block % blocks_x, block // blocks_x
     tile = (by // TILE) * -(-blocks_x // TILE) + bx // TILE
@@ -206,11 +200,9 @@ def _tile_numbers(blocks_x: int, blocks_y: int) -> int:
 
 
 def _sorted(values: Any, keys: Any, count: int) -> Any:
-    """UInt32 values, stably sorted by their keys, which are below `count`.
-
-    Evaluated, because the values serve as addresses next: two kernels are faster than one in which
-    a random read waits for another.
-    """
+    """UInt32 values, stably sorted by their keys, which are below `count`. Evaluated, because the
+    values serve as addresses next: two kernels are faster than one in which a random read waits for
+    another."""
     values = dr.gather(mi.UInt32, values, _permutation(keys, count))
     dr.eval(values)
     return values
@@ -239,9 +231,7 @@ def _orders(
     splats: Splats, first: tuple[Any, Any], blocks_x: int, blocks_y: int
 ) -> tuple[Any, Any]:
     """Order and place of `BlockLists`. A centre outside the image counts to the nearest block.
-
-    first: column and row of the first block on the film, UInt32 [1].
-    """
+    first: column and row of the first block on the film, UInt32 [1]."""
 
     def block(pixel: Any, size: int, first: Any, count: int) -> Any:
         number = dr.clip(pixel / size - mi.Float(first), 0, count - 1)
@@ -262,10 +252,8 @@ def _orders(
 
 def _lanes_by_tile(length: Any, number: Any, numbers: int) -> Any:
     """Blocks in the order of lanes, UInt32 [L]: tile by tile, in a tile the longest list first, so
-    that the lanes of a SIMD register have lists of similar lengths.
-
-    length: of each block's list. number: `_tile_number` of each block. numbers: `_tile_numbers`.
-    """
+    that the lanes of a SIMD register have lists of similar lengths. length: of each block's list.
+    number: `_tile_number` of each block. numbers: `_tile_numbers`."""
     # Longest first, then stably by tile.
     longest = _sorted(dr.arange(mi.UInt32, len(length)), 4095 - dr.minimum(length, 4095), 4096)
     tile = dr.gather(mi.UInt32, number, longest) // (TILE * TILE)
@@ -355,10 +343,8 @@ def _total(counts: Any, most: int, what: str) -> int:
 
 
 def _run_numbers(start: Any, length: Any, count: int) -> Any:
-    """The run that each of `count` consecutive numbers belongs to, UInt32 [count].
-
-    start, length: first number and length of each run, UInt32; a length may be 0.
-    """
+    """The run that each of `count` consecutive numbers belongs to, UInt32 [count]. start, length:
+    first number and length of each run, UInt32; a length may be 0."""
     if count == 0:
         return mi.UInt32()
     # Mark the first number of each run with the run's index; a running maximum fills the rest.
@@ -409,12 +395,10 @@ def _blocks_of_row(
 
 
 def _by_block(owner: Any, number: Any, numbers: int) -> tuple[Any, Any, Any, Any]:
-    """Sort pairs by block.
-
-    owner, number: place of each pair's splat, and its block, one of `numbers`, UInt32 [M].
-    Returns, as UInt32: the splat's place of each sorted pair and the sorted pair at each slot,
-    [_room(M)] both; first pair and end of each block's pairs [numbers], 0 and 0 if it has none.
-    """
+    """Sort pairs by block. owner, number: place of each pair's splat, and its block, one of
+    `numbers`, UInt32 [M]. Returns, as UInt32: the splat's place of each sorted pair and the sorted
+    pair at each slot, [_room(M)] both; first pair and end of each block's pairs [numbers], 0 and 0
+    if it has none."""
     count = len(number)
     pair = dr.zeros(mi.UInt32, _room(count))
     start, end = dr.zeros(mi.UInt32, numbers), dr.zeros(mi.UInt32, numbers)

@@ -146,12 +146,9 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
 
 
 def by_means(gaussians: Gaussians, camera: Any) -> list[ByMean]:
-    """Derivatives by the coordinates x, y, z of the means, by forward AD of the projection.
-
-    They include the change of the splat's centre, of its footprint (through the projection's
-    Jacobian) and, above SH degree 0, of its colour. gaussians: TensorXf fields. camera:
-    `camera_array`.
-    """
+    """Derivatives by the coordinates x, y, z of the means, by forward AD of the projection. They
+    include the change of the splat's centre, of its footprint (through the projection's Jacobian)
+    and, above SH degree 0, of its colour. gaussians: TensorXf fields. camera: `camera_array`."""
     columns = []
     fixed = gaussians.map(dr.detach)
     # One forward pass of the projection for each of x, y, z.

@@ -182,10 +182,8 @@ def _sums(
     chosen: np.ndarray | None = None,
 ) -> tuple[Moments, Any, Gaussians, Any, list[ByMean]]:
     """Sums of `kernels.fisher`, camera, chosen Gaussians and their splats for `geometry`, and
-    derivatives by the means.
-
-    means, alpha_weight: as in `fisher`. weights: [H,W,4]. chosen: indices [M].
-    """
+    derivatives by the means. means, alpha_weight: as in `fisher`. weights: [H,W,4]. chosen: indices
+    [M]."""
     device = camera_array(camera.seen_from(gaussians.origin))
     splats, lists, packed = splats_and_lists(gaussians, camera, cache)
     # The derivative by a mean has a part by colour above degree 0: w g_c, hence w s_c sums.
@@ -234,10 +232,8 @@ def _sums(
 def exact(
     gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None, **options: Any
 ) -> np.ndarray:
-    """Exact diagonal of J^T J, in one pass over the image: ten sums per splat, no Jacobian.
-
-    With means it takes 16 sums, or 34 above SH degree 0. options: of `_sums`.
-    """
+    """Exact diagonal of J^T J, in one pass over the image: ten sums per splat, no Jacobian. With
+    means it takes 16 sums, or 34 above SH degree 0. options: of `_sums`."""
     sums, device, model, splats, by_mean = _sums(
         gaussians, camera, background, cache, False, **options
     )
@@ -320,12 +316,9 @@ def loss_gradient(
     gaussians: Gaussians, camera: Camera, background: Any, cache: ListCache | None
 ) -> np.ndarray:
     """The paper's Eq. 7 as written: the squared gradient of one scalar "dummy photometric loss" per
-    image.
-
-    The paper does not state the loss. Here it is the mean squared error against mid-grey, mean
-    (rgb - 0.5)^2. The result is not diag(J^T J): gradients of different pixels cancel before they
-    are squared.
-    """
+    image. The paper does not state the loss. Here it is the mean squared error against mid-grey,
+    mean (rgb - 0.5)^2. The result is not diag(J^T J): gradients of different pixels cancel before
+    they are squared."""
     # L = mean (rgb - 0.5)^2, so dL/drgb = 2 (rgb - 0.5) / count.
     slope = lambda rgb: (rgb - 0.5) * (2 / len(rgb.array))  # noqa: E731  dL / drgb
     gradient = vjp(gaussians, slope, camera, background, cache, LEARNED)

@@ -99,11 +99,8 @@ POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 
 def log_alpha_tangent(tangents: Splats, splats: Splats) -> dict[tuple[int, int], Any]:
     """Derivative of ln alpha of a pixel along `tangents` of the splats: coefficients of `POWERS`,
-    arrays [N].
-
-    By the chain rule through xi and eta. It does not hold where alpha is clamped. Letters p, k, e:
-    docs/notation.md.
-    """
+    arrays [N]. By the chain rule through xi and eta. It does not hold where alpha is clamped.
+    Letters p, k, e: docs/notation.md."""
     k, p, e = splats.shear, splats.white_x, splats.white_y
     # ln alpha = ln 2 (log2 o - xi^2 - eta^2) with xi = p (dx - k dy), eta = e dy, so its tangent is
     # ln 2 (d log2 o - 2 xi dxi - 2 eta deta). A centre that moves by (u', v') gives dxi = -p (u' -
@@ -119,11 +116,9 @@ def log_alpha_tangent(tangents: Splats, splats: Splats) -> dict[tuple[int, int],
 
 
 def pack_tangents(tangents: Splats, splats: Splats, place: Any) -> Any:
-    """Pack the tangents of each splat at its `place`: Float [12 N], evaluated.
-
-    tangents: derivatives of the splats' fields (`_rest` fields are not read). Packed are the
-    coefficients of `log_alpha_tangent` and the tangents of depth and colour.
-    """
+    """Pack the tangents of each splat at its `place`: Float [12 N], evaluated. tangents:
+    derivatives of the splats' fields (`_rest` fields are not read). Packed are the coefficients of
+    `log_alpha_tangent` and the tangents of depth and colour."""
     # Six coefficients of the tangent of ln alpha, then those of depth and colour.
     one, xi, eta, xi_xi, xi_eta, eta_eta = log_alpha_tangent(tangents, splats).values()
     return pack_parts(
@@ -296,10 +291,7 @@ def adjoint(
 
 def splat_gradient(sums: list[Any], splats: Splats) -> Splats:
     """Gradient by the splats' fields, from the sums of `adjoint`, by the chain rule through xi and
-    eta.
-
-    mean_x and mean_y are None if their sums are missing. Letters p, k, e: docs/notation.md.
-    """
+    eta. mean_x and mean_y are None if their sums are missing. Letters p, k, e: docs/notation.md."""
     # Transpose of `log_alpha_tangent`: each field's gradient is its coefficient there times the
     # sum.
     # dL/dp = sum s d(ln alpha)/dp = -(2 ln 2 / p) sum s xi^2, and so on.
@@ -325,11 +317,8 @@ def splat_gradient(sums: list[Any], splats: Splats) -> Splats:
 
 def fisher_moments(cross: bool, means: bool) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Powers (a, b) of the monomials xi^a eta^b that `fisher` sums: weighted by |s|^2, and by w s_c
-    for each channel c.
-
-    cross: products with colours are needed. means: derivatives by the means are needed, which alone
-    contain xi and eta to the first power.
-    """
+    for each channel c. cross: products with colours are needed. means: derivatives by the means are
+    needed, which alone contain xi and eta to the first power."""
     # Without means, d ln alpha has orders 0 and 2, so its squares have 0, 2 and 4; products with a
     # colour have 0 and 2. Means add order 1, and so 1 and 3 to the squares.
     squared, mixed = [0, 4, 2], [0, 2] if cross else []
@@ -460,12 +449,9 @@ def fisher(
 @frozen(recorded_sizes)
 def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
     """Sum over pixels of alpha^2 |D|^2 of each splat, to be read by `sums_by_splat` (one sum,
-    Float64).
-
-    A pixel is affine in the alpha of each splat, with slope D. So setting alpha to 0 changes it by
-    exactly -alpha D, also where alpha is clamped. Effects on the thresholds of other splats are
-    ignored. background: Color3f, linear RGB.
-    """
+    Float64). A pixel is affine in the alpha of each splat, with slope D. So setting alpha to 0
+    changes it by exactly -alpha D, also where alpha is clamped. Effects on the thresholds of other
+    splats are ignored. background: Color3f, linear RGB."""
     lane, T = lanes(lists)
     pixels = _pixel_sums(lists, packed, lane, T, lambda splat: splat.colour)
     behind = _finished(pixels, background, mi.Float)

@@ -101,12 +101,9 @@ class Information:
         return total
 
     def solve(self, vector: ArrayLike, lam: ArrayLike, tolerance: float = TOLERANCE) -> Floats:
-        """(H + lam)^-1 v [N,P] of v [N,P], by conjugate gradients.
-
-        lam: positive, [P], or what broadcasts to [N,P] (`regularisation`). tolerance: of the
-        residual's norm, relative, whitened by the blocks. Raises InputError if MOST_STEPS do not
-        reach it.
-        """
+        """(H + lam)^-1 v [N,P] of v [N,P], by conjugate gradients. lam: positive, [P], or what
+        broadcasts to [N,P] (`regularisation`). tolerance: of the residual's norm, relative,
+        whitened by the blocks. Raises InputError if MOST_STEPS do not reach it."""
         whiten, lam = self._whitening(lam)
         # Solve A y = b with A = L^-1 (H + lam) L^-T and b = L^-1 v; the solution is L^-T y.
         # x: y so far; r = b - A y, its residual; p: direction of the next step.
@@ -179,12 +176,10 @@ class Information:
         seed: int = 0,
         tolerance: float = TOLERANCE,
     ) -> list[Gaussians]:
-        """Draws from the posterior N(theta, sigma_e^2 (H + lam)^-1) of the parameters.
-
-        lam, tolerance: as in `solve`. pixel_noise: sigma_e, that of lam. Each draw adds
-        (H + lam)^-1 (J^T W^1/2 e + lam^1/2 n) sigma_e with unit normal e and n, which has this
-        covariance, at the cost of one `solve`.
-        """
+        """Draws from the posterior N(theta, sigma_e^2 (H + lam)^-1) of the parameters. lam,
+        tolerance: as in `solve`. pixel_noise: sigma_e, that of lam. Each draw adds (H + lam)^-1
+        (J^T W^1/2 e + lam^1/2 n) sigma_e with unit normal e and n, which has this covariance, at
+        the cost of one `solve`."""
         rng, (n, size) = np.random.default_rng(seed), self.blocks.shape[:2]
         draws = []
         for _ in range(count):

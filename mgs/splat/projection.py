@@ -181,10 +181,8 @@ def is_rotation(quats: Any) -> Any:
 
 def sh_basis(means: Any, camera: Any, coefficients: int) -> list[Any]:
     """Real spherical harmonics in the directions from the camera to the means: K = `coefficients`
-    arrays Float64 [N], in the order and signs of 3DGS.
-
-    means: Vector3d, world, metres. camera: `camera_array`.
-    """
+    arrays Float64 [N], in the order and signs of 3DGS. means: Vector3d, world, metres. camera:
+    `camera_array`."""
     # Unit direction from the camera's centre (numbers 20 to 22) to each mean.
     offset = means - mi.Vector3d(*_numbers(camera, 20, 23))
     directions = offset * inverse_sqrt(dr.maximum(dr.squared_norm(offset), 1e-24))
@@ -192,11 +190,9 @@ def sh_basis(means: Any, camera: Any, coefficients: int) -> list[Any]:
 
 
 def rows_as_vectors(tensor: Any, dtype: Any) -> Any:
-    """A TensorXf [N, size] as N Dr.Jit vectors of type `dtype`.
-
-    NoConflicts is right because every number is read by one vector alone. The derivative then needs
-    no atomic additions, whose order would change from run to run.
-    """
+    """A TensorXf [N, size] as N Dr.Jit vectors of type `dtype`. NoConflicts is right because every
+    number is read by one vector alone. The derivative then needs no atomic additions, whose order
+    would change from run to run."""
     return dr.gather(
         dtype, tensor.array, dr.arange(mi.UInt32, tensor.shape[0]), mode=dr.ReduceMode.NoConflicts
     )
@@ -255,10 +251,8 @@ def _with_rest(value: Any) -> tuple[Any, Any]:
 
 def project64(gaussians: Gaussians, camera: Any) -> Splats:
     """Project Gaussians (TensorXf fields) through a `camera_array`: Float64 fields, no rests.
-
     Differentiable in every parameter. Source: EWA splatting (Zwicker et al. 2002) as in 3DGS (Kerbl
-    et al. 2023).
-    """
+    et al. 2023)."""
     mean = mi.Vector3d(rows_as_vectors(gaussians.means, mi.Vector3f))
     quats = mi.Vector4d(rows_as_vectors(gaussians.quats, mi.Vector4f))
     log_scales = mi.Vector3d(rows_as_vectors(gaussians.log_scales, mi.Vector3f))

@@ -81,10 +81,8 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def project(gaussians: Gaussians, camera: Camera) -> Projected:
-    """EWA projection (Zwicker et al. 2002) as in 3DGS (Kerbl et al. 2023).
-
-    J [N,2,3] is the Jacobian of the projection at each mean, T = J R maps metres to pixels.
-    """
+    """EWA projection (Zwicker et al. 2002) as in 3DGS (Kerbl et al. 2023). J [N,2,3] is the
+    Jacobian of the projection at each mean, T = J R maps metres to pixels."""
     means = np.asarray(gaussians.means, np.float64)
     camera = (camera.film or camera).seen_from(gaussians.origin)
     R, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
@@ -135,12 +133,10 @@ def _half_square(d: np.ndarray, cov: np.ndarray) -> np.ndarray:
 def composite(
     projected: Projected, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Front-to-back alpha compositing of M visible Gaussians on P = H*W pixels.
-
-    Returns order [M], visible Gaussians by depth, equal depths by index; alpha [P,M] after all
-    thresholds (0 where not drawn); T [P,M], transmittance in front of each splat; clipped [P,M],
-    mask where alpha exceeds ALPHA_MAX.
-    """
+    """Front-to-back alpha compositing of M visible Gaussians on P = H*W pixels. Returns order [M],
+    visible Gaussians by depth, equal depths by index; alpha [P,M] after all thresholds (0 where not
+    drawn); T [P,M], transmittance in front of each splat; clipped [P,M], mask where alpha exceeds
+    ALPHA_MAX."""
     index = np.flatnonzero(projected.visible)
     order = index[np.argsort(projected.depths[index].astype(np.float32), kind="stable")]
     pixels = _pixels(camera)
@@ -251,12 +247,10 @@ def jacobian(
     means: str = "frozen",
     alpha_weight: float = 0.0,
 ) -> np.ndarray:
-    """Dense Jacobian of the rgb image [H*W, 3, N, P]. For toy scenes only.
-
-    Columns: those of `mgs.gaussians.LEARNED`, then 0 or 3 of the means. means, alpha_weight: as in
+    """Dense Jacobian of the rgb image [H*W, 3, N, P]. For toy scenes only. Columns: those of
+    `mgs.gaussians.LEARNED`, then 0 or 3 of the means. means, alpha_weight: as in
     `mgs.splat.fisher`. With an alpha_weight there are four channels, the last one alpha times its
-    square root, composited as a colour that all Gaussians share.
-    """
+    square root, composited as a colour that all Gaussians share."""
     projected = project(gaussians, camera)
     order, alpha, T, clipped = composite(projected, camera)
     weights = alpha * T

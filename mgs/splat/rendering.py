@@ -78,11 +78,8 @@ class ListCache:
 
     def get(self, camera: Camera, splats: Splats) -> tuple[BlockLists, Any]:
         """Lists for detached splats seen by the camera, cached or new, and the packed splats
-        (`walking.pack`).
-
-        Raises InputError if a parameter is not finite, a colour beyond SH_MAX, or the view has too
-        many pairs.
-        """
+        (`walking.pack`). Raises InputError if a parameter is not finite, a colour beyond SH_MAX, or
+        the view has too many pairs."""
         # Old lists may fit no longer: footprints or depth order may have changed.
         key = camera.key
         lists = self._lists.get(key)
@@ -138,11 +135,8 @@ class ListCache:
 
 def as_colour(background: Any) -> Any:
     """A background as Color3f, linear RGB: one number, three, or a Dr.Jit colour, which keeps its
-    gradient.
-
-    Numbers pass through `dr.opaque`, so they are not compiled into kernels. Raises InputError for
-    anything else, and for numbers that are not finite or beyond SH_MAX.
-    """
+    gradient. Numbers pass through `dr.opaque`, so they are not compiled into kernels. Raises
+    InputError for anything else, and for numbers that are not finite or beyond SH_MAX."""
     if dr.is_jit_v(background):
         return mi.Color3f(background)
     try:
@@ -166,11 +160,8 @@ def _raise_unless_finite(finite: Any) -> None:
 
 def as_drjit(gaussians: Gaussians) -> Gaussians:
     """The same Gaussians with TensorXf fields. Dr.Jit fields stay as they are, with their
-    gradients.
-
-    Raises InputError if the shapes of the fields do not fit each other, or no variant can be
-    started (`mgs.runtime.start`).
-    """
+    gradients. Raises InputError if the shapes of the fields do not fit each other, or no variant
+    can be started (`mgs.runtime.start`)."""
     runtime.start()
     gaussians.check_shapes()
     return gaussians.map(lambda v: v if dr.is_array_v(v) else mi.TensorXf(padded(v)))
@@ -250,11 +241,8 @@ def splats_and_lists(
     gaussians: Gaussians, camera: Camera, cache: ListCache | None
 ) -> tuple[Splats, BlockLists, Any]:
     """Project Gaussians with Dr.Jit fields. Returns the splats, with gradients, their block lists,
-    and the packed splats.
-
-    Raises InputError if a parameter is not finite or a colour beyond SH_MAX, naming parameter and
-    Gaussian; and if the view has too many pairs.
-    """
+    and the packed splats. Raises InputError if a parameter is not finite or a colour beyond SH_MAX,
+    naming parameter and Gaussian; and if the view has too many pairs."""
     device = camera_array(camera.seen_from(gaussians.origin))
     splats = (project if dr.grad_enabled(gaussians, device) else projected)(gaussians, device)
     try:
@@ -328,10 +316,7 @@ def composite(
     splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, background: Any = 0.0
 ) -> Image:
     """Image of projected splats over a background (Color3f), differentiable in the splats and the
-    background.
-
-    packed: from `walking.pack`. lists: block lists. width, height: pixels.
-    """
+    background. packed: from `walking.pack`. lists: block lists. width, height: pixels."""
     r, g, b, alpha, weighted = _rasterised(splats, packed, lists, width, height, 5)
     # C = sum w c + T_end background, with T_end = 1 - alpha.
     rgb = mi.Color3f(r, g, b) + (1 - alpha) * background
@@ -350,10 +335,8 @@ def composite_channels(
     splats: Splats, packed: Any, lists: BlockLists, width: int, height: int, channels: int
 ) -> Any:
     """Colours of `composite` over black and, with four channels, alpha: TensorXf [H,W,channels],
-    differentiable in the splats.
-
-    Faster than `composite`: depth is left out, and alpha unless wanted.
-    """
+    differentiable in the splats. Faster than `composite`: depth is left out, and alpha unless
+    wanted."""
     pixels = _rasterised(splats, packed, lists, width, height, channels)
     vectors = mi.Color3f(*pixels) if channels == 3 else mi.Vector4f(*pixels)
     return mi.TensorXf(dr.ravel(vectors), (height, width, channels))

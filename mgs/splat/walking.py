@@ -165,11 +165,8 @@ EXP2 = (
 
 def exp2(x: Any) -> Any:
     """2^x of a Float or Float64 up to 120, and 2^-120 below -120. Relative error 3e-9, of a Float
-    8e-8.
-
-    Half the instructions of dr.exp2, which also handles infinity and zero: an alpha of 2^-120 is
-    not drawn.
-    """
+    8e-8. Half the instructions of dr.exp2, which also handles infinity and zero: an alpha of 2^-120
+    is not drawn."""
     # x = n + f with n an integer and |f| <= 1/2: 2^f by the polynomial (Horner), times 2^n by
     # adding n to the bits of the exponent.
     integer, bits = (mi.Int64, 52) if type(x) is mi.Float64 else (mi.Int32, 23)
@@ -404,10 +401,8 @@ def _walk_until_done(
     together: int,
 ) -> tuple[Any, list[list[Any]]]:
     """The loop of `walk`. Returns the pair after the last visited one, and the pixels' state.
-
     visit(pair, pairs, pixels) -> (pixels, alive), with `pairs` the results of `pair_at` for
-    `together` pairs from that one on.
-    """
+    `together` pairs from that one on."""
 
     def body(i: Any, pixels: Any, alive: Any) -> Any:
         # A lane ends with its list, or with its last unfinished pixel.
@@ -431,10 +426,8 @@ AT_ONCE = 4  # pairs read in an iteration: reads at scattered addresses are slow
 
 def sums_by_place(lists: BlockLists, by_pair: Any, count: int, real: Any) -> Any:
     """Add the results of `walk_and_store` for the pairs of each splat, in the order of their slots
-    and in double, so reruns are bitwise equal.
-
-    Returns [N * packets * 4] of type `real` (Float or Float64), by place.
-    """
+    and in double, so reruns are bitwise equal. Returns [N * packets * 4] of type `real` (Float or
+    Float64), by place."""
     dr.eval(by_pair)
     # Slots of one splat are consecutive, so a lane adds those of one splat, in their order.
     packets, end = packet_count(count), lists.slot_end

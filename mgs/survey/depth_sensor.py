@@ -28,11 +28,8 @@ SIGMA_FROM_MAD = 1.4826  # standard deviation over median absolute deviation, no
 
 
 def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Unit normals [H,W,3], world, towards the camera, of a depth image [H,W].
-
-    From differences between opposite neighbours; zero where the pixel or one of its four neighbours
-    has no depth.
-    """
+    """Unit normals [H,W,3], world, towards the camera, of a depth image [H,W]. From differences
+    between opposite neighbours; zero where the pixel or one of its four neighbours has no depth."""
     points = camera.unproject(depth)
     padded = np.pad(points, ((1, 1), (1, 1), (0, 0)), mode="edge")
     valid = np.pad(depth > 0, 1)
@@ -50,13 +47,10 @@ def normals_from_depth(depth: np.ndarray, camera: Camera) -> np.ndarray:
 def noisy_depth(
     depth: np.ndarray, camera: Camera, rng: np.random.Generator, scale: float = 1.0
 ) -> np.ndarray:
-    """Measurement [H,W] of a true depth image [H,W]; metres, 0 = no return.
-
-    In order: lateral noise (the depth of a pixel nearby), axial noise, quantisation, lost returns.
-    Pixels without a normal (silhouettes, image rim) count as grazing. scale: factor on standard
-    deviations and steps; below 1 it also moves DROP_OUT towards 90 degrees; at 0 the depth is
-    exact.
-    """
+    """Measurement [H,W] of a true depth image [H,W]; metres, 0 = no return. In order: lateral noise
+    (the depth of a pixel nearby), axial noise, quantisation, lost returns. Pixels without a normal
+    (silhouettes, image rim) count as grazing. scale: factor on standard deviations and steps; below
+    1 it also moves DROP_OUT towards 90 degrees; at 0 the depth is exact."""
     if scale <= 0:
         return depth.copy()
     h, w = depth.shape
@@ -84,10 +78,8 @@ def noisy_depth(
 
 def depth_noise(depth: np.ndarray) -> float:
     """Standard deviation of the noise in a depth image [H,W], metres; 0 if under 100 pixels can be
-    used.
-
-    Estimated from second differences within rows, to which smooth surfaces contribute little.
-    """
+    used. Estimated from second differences within rows, to which smooth surfaces contribute
+    little."""
     whole = (depth[:, :-2] > 0) & (depth[:, 1:-1] > 0) & (depth[:, 2:] > 0)
     second = (depth[:, :-2] - 2 * depth[:, 1:-1] + depth[:, 2:])[whole]
     if len(second) < 100:
@@ -98,11 +90,8 @@ def depth_noise(depth: np.ndarray) -> float:
 
 def filter_depth(depth: np.ndarray, sigma: float) -> np.ndarray:
     """Smooth a depth image [H,W], metres, by a 7x7 bilateral filter, which keeps edges and lost
-    returns.
-
-    sigma: standard deviation of the noise, metres; at 0 the image is returned. Source: Tomasi and
-    Manduchi 1998, by OpenCV; the first step of KinectFusion (Newcombe et al. 2011).
-    """
+    returns. sigma: standard deviation of the noise, metres; at 0 the image is returned. Source:
+    Tomasi and Manduchi 1998, by OpenCV; the first step of KinectFusion (Newcombe et al. 2011)."""
     import cv2
 
     if sigma <= 0:

@@ -83,11 +83,9 @@ def fly(
     settings: SurveySettings,
     on_stage: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> Survey:
-    """Survey a dataset that has depth images. on_stage: called (name, done, total).
-
-    Raises InputError if there are fewer than three frames, or one has no depth image or too few
-    returns to be registered.
-    """
+    """Survey a dataset that has depth images. on_stage: called (name, done, total). Raises
+    InputError if there are fewer than three frames, or one has no depth image or too few returns to
+    be registered."""
     frames = dataset.frames
     if len(frames) < 3:
         raise InputError(
@@ -129,9 +127,7 @@ def fly(
 
 def trajectory_error(poses: np.ndarray, truth: np.ndarray) -> dict[str, float]:
     """Absolute trajectory error (Sturm et al. 2012) of poses [F,4,4] against true ones [F,4,4].
-
-    ate_rms, ate_max: distance of the positions, metres; rotation_rms: degrees.
-    """
+    ate_rms, ate_max: distance of the positions, metres; rotation_rms: degrees."""
     offset = np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1)
     turn = np.einsum("fki,fkj->fij", poses[:, :3, :3], truth[:, :3, :3])
     angle = np.degrees(np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1, 1)))
@@ -143,13 +139,10 @@ def trajectory_error(poses: np.ndarray, truth: np.ndarray) -> dict[str, float]:
 
 
 def survey_numbers(dataset: Dataset, survey: Survey, settings: SurveySettings) -> dict[str, Any]:
-    """Contents of survey.json, lengths in metres.
-
-    path_length: of the flight; depth_error_on_rock: robust standard deviation of the depth error in
-    the rock's masks; returns_lost: share of pixels with true depth and no measured one;
-    steps_by_odometry: number of failed registrations; loops: [i, j, overlap]
-    each; error: `trajectory_error` of each of the STAGES.
-    """
+    """Contents of survey.json, lengths in metres. path_length: of the flight; depth_error_on_rock:
+    robust standard deviation of the depth error in the rock's masks; returns_lost: share of pixels
+    with true depth and no measured one; steps_by_odometry: number of failed registrations; loops:
+    [i, j, overlap] each; error: `trajectory_error` of each of the STAGES."""
     error, returns, possible = [], 0, 0
     for frame, depth in zip(dataset.frames, survey.depths, strict=True):
         true = frame.depth()

@@ -24,10 +24,8 @@ def save_survey(
     out: Path, dataset: Dataset, survey: Survey, settings: SurveySettings
 ) -> dict[str, Any]:
     """Write a survey into the folder `out`: the dataset of `write_survey`, cloud.ply, survey.json
-    and survey.png. Returns the contents of survey.json.
-
-    Raises InputError as `fuse_frames`, and if a file cannot be written.
-    """
+    and survey.png. Returns the contents of survey.json. Raises InputError as `fuse_frames`, and if
+    a file cannot be written."""
     numbers = survey_numbers(dataset, survey, settings)
     cloud = fuse_frames(write_survey(out, dataset, survey).frames)
     numbers["points"] = len(cloud.points)
@@ -39,12 +37,10 @@ def save_survey(
 
 
 def write_survey(out: Path, dataset: Dataset, survey: Survey) -> Dataset:
-    """Write a survey of a dataset as a dataset into the folder `out`, and load it.
-
-    Images, masks, the true rock (rock.glb) and the test views, whose poses are exact, are copied,
-    except images of on-demand frames; depth is measured and poses are estimated. Raises InputError
-    if a file cannot be read or written.
-    """
+    """Write a survey of a dataset as a dataset into the folder `out`, and load it. Images, masks,
+    the true rock (rock.glb) and the test views, whose poses are exact, are copied, except images of
+    on-demand frames; depth is measured and poses are estimated. Raises InputError if a file cannot
+    be read or written."""
     frames = []
     for frame, pose, depth in zip(dataset.frames, survey.optimised, survey.depths, strict=True):
         path = out / "depth" / f"{frame.name}.exr"
@@ -77,11 +73,8 @@ def _copied(out: Path, frame: Frame) -> Frame:
 def draw_survey(
     path: str | Path, dataset: Dataset, survey: Survey, cloud: Cloud, numbers: dict[str, Any]
 ) -> None:
-    """Write the figure of a survey as a PNG, atomically.
-
-    cloud: fused from the survey; numbers: from `survey_numbers`. Raises InputError if it cannot be
-    written.
-    """
+    """Write the figure of a survey as a PNG, atomically. cloud: fused from the survey; numbers:
+    from `survey_numbers`. Raises InputError if it cannot be written."""
     around = survey.truth[:, :3, 3].mean(0)
     reach = float(np.abs(survey.truth[:, :3, 3] - around).max())
     points = cloud.points[np.argsort(cloud.points[:, 2])]

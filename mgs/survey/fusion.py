@@ -58,24 +58,18 @@ def focus(frames: Sequence[Frame]) -> Focus:
 
 def usable_depth(depth: np.ndarray, size: int = 3) -> np.ndarray:
     """Depth image [H,W], metres, with pixels on silhouettes and at grazing angles set to 0
-    (EDGE_JUMP).
-
-    size: of the neighbourhood, pixels. Pixels beside a lost return are set to 0 too: returns are
-    lost at grazing angles, and those left there are the worst. With them, registration drifted
-    twice as far.
-    """
+    (EDGE_JUMP). size: of the neighbourhood, pixels. Pixels beside a lost return are set to 0 too:
+    returns are lost at grazing angles, and those left there are the worst. With them, registration
+    drifted twice as far."""
     jump = maximum_filter(depth, size) - minimum_filter(depth, size)
     return np.where(jump <= EDGE_JUMP * depth, depth, 0.0)
 
 
 def fuse_frames(frames: Sequence[Frame]) -> Cloud:
-    """Fuse the depth images of frames into one cloud, averaged on a grid.
-
-    A cell is as large as a pixel of the nearest frames on the rock, or larger if the depths are
-    noisy. With `depth_noise` over a quarter of a cell, the images are smoothed first by
-    `filter_depth`. Raises InputError if a frame has no depth image or cannot be read, or no depth
-    can be used.
-    """
+    """Fuse the depth images of frames into one cloud, averaged on a grid. A cell is as large as a
+    pixel of the nearest frames on the rock, or larger if the depths are noisy. With `depth_noise`
+    over a quarter of a cell, the images are smoothed first by `filter_depth`. Raises InputError if
+    a frame has no depth image or cannot be read, or no depth can be used."""
     depths = [frame.depth() for frame in frames]
     returns = [depth[depth > 0] for depth in depths]
     total = sum(map(len, returns))
@@ -121,10 +115,8 @@ def _group_means(values: np.ndarray, index: np.ndarray, groups: int) -> np.ndarr
 
 
 def voxel_means(points: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
-    """Average points [N,3] on a grid with cells of edge `voxel`, metres.
-
-    Returns the mean point of each occupied cell [M,3], and each point's index among these [N].
-    """
+    """Average points [N,3] on a grid with cells of edge `voxel`, metres. Returns the mean point of
+    each occupied cell [M,3], and each point's index among these [N]."""
     if len(points) == 0:
         return points, np.zeros(0, int)
     cells = np.floor((points - points.min(0)) / voxel).astype(np.int64)

@@ -58,11 +58,8 @@ class Edge:
 
 def registration_cloud(frame: Frame, depth: np.ndarray, grid: float) -> tuple[Any, Any]:
     """Points of a frame's depth image [H,W], in the axes of its camera, filtered and averaged on a
-    grid.
-
-    grid: metres. Returns small_gicp's cloud with covariances, and its search tree. Raises
-    InputError if fewer than 100 pixels are left.
-    """
+    grid. grid: metres. Returns small_gicp's cloud with covariances, and its search tree. Raises
+    InputError if fewer than 100 pixels are left."""
     import small_gicp
 
     z = usable_depth(filter_depth(depth, depth_noise(depth)), EDGE)
@@ -84,11 +81,8 @@ def register(
     clouds: list, i: int, j: int, guess: np.ndarray, grid: float, reaches: tuple[float, ...]
 ) -> Edge:
     """Align frame j with frame i by GICP (Segal et al. 2009, small_gicp), from the relative pose
-    `guess`.
-
-    clouds: `registration_cloud` of all frames. reaches: factors on MATCH; one run each, from the
-    result of the run before.
-    """
+    `guess`. clouds: `registration_cloud` of all frames. reaches: factors on MATCH; one run each,
+    from the result of the run before."""
     import small_gicp
 
     (target, tree), (source, _) = clouds[i], clouds[j]
@@ -160,10 +154,8 @@ def optimise(
 
 
 def drifting_odometry(truth: np.ndarray, drift: float, rng: np.random.Generator) -> np.ndarray:
-    """Steps [F-1,4,4] that odometry reports for a flight along poses `truth` [F,4,4].
-
-    drift: factor on all errors; 0 gives the true steps.
-    """
+    """Steps [F-1,4,4] that odometry reports for a flight along poses `truth` [F,4,4]. drift: factor
+    on all errors; 0 gives the true steps."""
     steps = np.linalg.inv(truth[:-1]) @ truth[1:]
     odometry = steps.copy()
     vertical = truth[1:, 2, :3]  # the world's +Z in the axes of the later camera
@@ -185,20 +177,15 @@ def chain(first: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 def step_deviation(step: np.ndarray, drift: float) -> tuple[float, float]:
     """Standard deviations of odometry in one step [4,4]: rotation, radians, and translation,
-    metres.
-
-    Biases count as if they were standard deviations.
-    """
+    metres. Biases count as if they were standard deviations."""
     length = float(np.linalg.norm(step[:3, 3]))
     return drift * (DRIFT_YAW + DRIFT_TURN), drift * (DRIFT_SCALE + DRIFT_SHAKE) * length
 
 
 def agrees(step: np.ndarray, odometry: np.ndarray, drift: float, grid: float) -> bool:
-    """Whether a measured step [4,4] is within TRUST standard deviations of odometry's [4,4].
-
-    The limits are widened by the error of a measurement: half a degree, and one cell of the
-    registration's grid, `grid` metres.
-    """
+    """Whether a measured step [4,4] is within TRUST standard deviations of odometry's [4,4]. The
+    limits are widened by the error of a measurement: half a degree, and one cell of the
+    registration's grid, `grid` metres."""
     difference = np.linalg.inv(odometry) @ step
     turn = np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1))
     turn_deviation, shift_deviation = step_deviation(odometry, drift)

@@ -24,11 +24,9 @@ def _grid() -> np.ndarray:
 def make_ground(
     settings: Arena, rock: trimesh.Trimesh, rng: np.random.Generator
 ) -> trimesh.Trimesh:
-    """Terrain mesh, metres, z about 0: swells, far dunes, ripples, and dust at the rock's foot.
-
-    UVs are in units of a texture tile. Vertex attribute `blend` [V,1], 0 to 1: weight of the second
-    tile of `regolith`.
-    """
+    """Terrain mesh, metres, z about 0: swells, far dunes, ripples, and dust at the rock's foot. UVs
+    are in units of a texture tile. Vertex attribute `blend` [V,1], 0 to 1: weight of the second
+    tile of `regolith`."""
     noise = Noise(rng)
     x, y = np.meshgrid(_grid(), _grid())
     p = np.stack([x, y, np.zeros_like(x)], -1).astype(np.float32)
@@ -69,10 +67,8 @@ def make_stones(
     settings: Arena, rock: trimesh.Trimesh, ground: trimesh.Trimesh, rng: np.random.Generator
 ) -> trimesh.Trimesh | None:
     """Small stones scattered over the ground, one mesh with the vertex attribute `color` (linear
-    RGB).
-
-    None if the settings ask for no stones, or leave no room between clearance and `spread`.
-    """
+    RGB). None if the settings ask for no stones, or leave no room between clearance and
+    `spread`."""
     if not settings.stones:
         return None
     noise = Noise(rng)

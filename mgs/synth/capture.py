@@ -57,9 +57,7 @@ def capture_of(dataset: Dataset) -> Callable[[Frame], Frame]:
 
 def photographer_of(root: Path) -> tuple[Photographer, dict[str, Frame], bool]:
     """Photographer of an on-demand dataset, its frames by name, and whether its poses are exact.
-
-    Raises InputError as `capture_of`.
-    """
+    Raises InputError as `capture_of`."""
     path = root / "config.json"
     config: Any = read_json(path)
     try:

@@ -30,10 +30,7 @@ class Noise:
 
     def octave(self, points: np.ndarray, wavelength: float) -> np.ndarray:
         """Noise at points [..., 3], float32 [...]; wavelength: the shortest, in the unit of the
-        points.
-
-        Each call rotates and shifts the points at random, so calls are independent.
-        """
+        points. Each call rotates and shifts the points at random, so calls are independent."""
         rotation = np.linalg.qr(self.rng.standard_normal((3, 3)))[0]
         offset = self.rng.uniform(0, LATTICE, 3).astype(np.float32)
         turn = (rotation * (LATTICE / PERIOD / wavelength)).astype(np.float32)
@@ -60,11 +57,8 @@ class Noise:
 
     def fracture(self, points: np.ndarray, wavelength: float) -> np.ndarray:
         """Field [N], about -1 to 1, linear within each of many cells: flat faces and narrow edges,
-        as of broken rock.
-
-        points [N,3]; wavelength: mean distance of the cells, in their unit. Cells of a Voronoi
-        diagram of random centres (Worley 1996), each with a random slope.
-        """
+        as of broken rock. points [N,3]; wavelength: mean distance of the cells, in their unit.
+        Cells of a Voronoi diagram of random centres (Worley 1996), each with a random slope."""
         low, high = points.min(0) - wavelength, points.max(0) + wavelength
         centres = self.rng.uniform(low, high, (int(np.prod((high - low) / wavelength)) + 4, 3))
         tilt = self.rng.normal(size=centres.shape)

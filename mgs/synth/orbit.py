@@ -87,11 +87,8 @@ def orbit_cameras(
 def rock_cameras(
     scene: SceneFile, size: tuple[int, int], frames: int, rock: trimesh.Trimesh
 ) -> list[Camera]:
-    """Cameras of the scene's orbit, aimed at the middle of the rock above the ground. size:
-    (width, height), pixels.
-
-    Raises InputError if that part of the rock is not wholly inside a frame.
-    """
+    """Cameras of the scene's orbit, aimed at the middle of the rock above the ground. size: (width,
+    height), pixels. Raises InputError if that part of the rock is not wholly inside a frame."""
     return _aimed(scene, scene.orbit, size, frames, rock, "frame")
 
 

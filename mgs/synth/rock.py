@@ -23,10 +23,8 @@ CELL = 6  # texels along one side of a cell of the texture; two triangles share 
 
 def make_rock(settings: Rock, rng: np.random.Generator) -> trimesh.Trimesh:
     """Weathered procedural rock: ellipsoids cut by planes, marching cubes, displacement, albedo.
-
     Returns a mesh in the world (metres, +Z up), partly below z = 0, with UVs and an sRGB texture.
-    Raises InputError if `detail` is too coarse or too fine for the rock.
-    """
+    Raises InputError if `detail` is too coarse or too fine for the rock."""
     noise = Noise(rng)
     mesh, height = rock_shape(settings, noise)
     return _bake(mesh, height, settings, noise)
@@ -166,11 +164,9 @@ def _relief(mesh: trimesh.Trimesh, settings: Rock, noise: Noise) -> np.ndarray:
 def _bake(
     mesh: trimesh.Trimesh, height: np.ndarray, settings: Rock, noise: Noise
 ) -> trimesh.Trimesh:
-    """The mesh with a texture of its albedo, in which every two triangles have a square cell.
-
-    The albedo is a function of position, evaluated at every texel. No unwrapping is needed, so this
-    works for any shape and stretches nothing. The result's faces share no vertices.
-    """
+    """The mesh with a texture of its albedo, in which every two triangles have a square cell. The
+    albedo is a function of position, evaluated at every texel. No unwrapping is needed, so this
+    works for any shape and stretches nothing. The result's faces share no vertices."""
     n_faces = len(mesh.faces)
     cells = np.arange((n_faces + 1) // 2)
     across = int(np.ceil(np.sqrt(len(cells))))
@@ -214,10 +210,8 @@ def _albedo(
     p: np.ndarray, normal: np.ndarray, height: np.ndarray, settings: Rock, noise: Noise
 ) -> np.ndarray:
     """Albedo, linear RGB [..., 3], at points p [..., 3], metres: two minerals, grains, dark
-    hollows, and dust on what faces up.
-
-    normal [..., 3]: unit; height [...]: displacement of `_relief`, metres.
-    """
+    hollows, and dust on what faces up. normal [..., 3]: unit; height [...]: displacement of
+    `_relief`, metres."""
     size = settings.size
     light, dark, dust = (np.asarray(c, np.float32) for c in (*settings.colours, settings.dust))
     patches = noise.fractal(p, 0.5 * size, 4, 0.6)

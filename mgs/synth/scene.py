@@ -153,12 +153,10 @@ class MitsubaScene:
         return z.reshape(size), mask.reshape(size)
 
     def coverage(self, camera: Camera, mask: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """Share of each pixel's area that the rock covers, float32 [H,W].
-
-        mask: bool [H,W], rock at the pixel's centre. share: [H,W], share of a few random rays that
-        meet the rock. COVERAGE_RAYS rays are cast through pixels at the outline of the mask and
-        where mask and share differ; elsewhere the coverage is the mask.
-        """
+        """Share of each pixel's area that the rock covers, float32 [H,W]. mask: bool [H,W], rock at
+        the pixel's centre. share: [H,W], share of a few random rays that meet the rock.
+        COVERAGE_RAYS rays are cast through pixels at the outline of the mask and where mask and
+        share differ; elsewhere the coverage is the mask."""
         from mgs.synth.rock_layer import lattice
 
         alpha = mask.astype(np.float32)
@@ -208,11 +206,9 @@ def whole_grid(spp: int) -> int:
 
 
 def sensor_dict(camera: Camera) -> dict[str, Any]:
-    """Mitsuba perspective sensor of a camera; a pixel is the mean over its area.
-
-    Samples are correlated multi-jittered: with 16, frames are 3 dB nearer to the truth than with
-    independent ones (docs/data.md).
-    """
+    """Mitsuba perspective sensor of a camera; a pixel is the mean over its area. Samples are
+    correlated multi-jittered: with 16, frames are 3 dB nearer to the truth than with independent
+    ones (docs/data.md)."""
     K, w, h = camera.K, camera.width, camera.height
     film = {"type": "hdrfilm", "width": w, "height": h, "pixel_format": "rgb"}
     return {

@@ -143,11 +143,8 @@ class SceneFile(_Strict):
 
 def load_scene_file(scene: str | Path, **orbit: Any) -> SceneFile:
     """Read a scene by its name (`boulder`) or path (`my.toml`). orbit: values of its orbit that
-    replace those of the file.
-
-    Raises InputError if it does not exist, is not TOML, or has an unknown key or a value out of
-    range.
-    """
+    replace those of the file. Raises InputError if it does not exist, is not TOML, or has an
+    unknown key or a value out of range."""
     path = scene_path(scene)
     data = read_toml(path)
     try:
@@ -177,9 +174,7 @@ def _keys_beside(where: tuple[int | str, ...]) -> list[str]:
 
 def sensor_of(dataset: Path) -> Sensor:
     """Sensor settings of the scene that a dataset was rendered from; defaults without config.json.
-
-    Raises InputError if config.json is damaged.
-    """
+    Raises InputError if config.json is damaged."""
     path = dataset / "config.json"
     recorded = read_json(path) if path.is_file() else {}
     try:
