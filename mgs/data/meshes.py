@@ -271,6 +271,9 @@ def distances_to_mesh(points: np.ndarray, vertices: np.ndarray, faces: np.ndarra
     meshes.add_mesh(pymeshlab.Mesh(vertices, faces))
     meshes.add_mesh(pymeshlab.Mesh(points))
     meshes.compute_scalar_by_distance_from_another_mesh_per_vertex(
-        measuremesh=1, refmesh=0, signeddist=False
+        measuremesh=1,
+        refmesh=0,
+        signeddist=False,
+        maxdist=pymeshlab.PureValue(1e9),  # its default is the extent of the points
     )
     return meshes.mesh(1).vertex_scalar_array()
