@@ -60,6 +60,7 @@ from .splat import Information as Information
 from .splat import ListCache as ListCache
 from .splat import as_drjit as as_drjit
 from .splat import fisher as fisher
+from .splat import fisher_derivatives as fisher_derivatives
 from .splat import groups as groups
 from .splat import jvp as jvp
 from .splat import moved as moved

@@ -17,6 +17,7 @@ import mgs
 from mgs.camera import Camera, heading_and_pitch, look_at
 from mgs.data import flight_plan
 from mgs.data.dataset import load_cameras, load_dataset
+from mgs.data.meshes import distances_to_mesh
 from mgs.data.world import World, unit_up
 from mgs.prior.build import Prior
 from mgs.reports.suggestion import write_suggestion
@@ -66,6 +67,29 @@ def test_views_are_planned_together_and_flown_in_a_short_order(run, site):
     short = suggest(opened, ring, 12, flight={"length": 0.8 * found.metres})
     assert 0 < len(short.plan) < 12
     assert short.metres <= 0.8 * found.metres
+
+
+def test_refined_poses_gain_within_the_limits(run, site):
+    """Every limit binds for some view: band, distance from the mesh, length of the flight."""
+    opened, ring = open_run(run), place_poses("ring", 12, 2.6, (25, 35), site)
+    before, mesh = suggest(opened, ring, 3), opened.prior.mesh
+
+    def apart(plan) -> float:
+        eyes = np.array([view.camera.position for view in plan])
+        return distances_to_mesh(eyes, mesh.vertices, mesh.faces).min()
+
+    safe, most = apart(before.plan) - 0.02, 1.001 * before.metres
+    limits = {"safe_distance": safe, "elevations": (29.0, 31.0), "flight": {"length": most}}
+    found = suggest(opened, ring, 3, refine=True, **limits)
+    assert found.refined[1] > found.refined[0]
+    assert apart(found.plan) >= safe
+    assert found.metres <= most
+    poses = dict(ring)
+    for view in found.plan:
+        shift = view.camera.position - poses[view.name].position
+        assert view.moved == pytest.approx(np.linalg.norm(shift))
+        assert 0.01 < view.moved <= 0.26 + 1e-9
+        assert 29 <= view.elevation <= 31
 
 
 def test_as_few_views_are_planned_as_have_a_share_of_what_all_would_give(run, site):

@@ -63,6 +63,8 @@ class Candidates(BaseModel):
     """Limits of the flight and of its poses."""
     certificate: SearchLimits = SearchLimits()
     """Limits of the search for a better set than the plan."""
+    refine: bool = False
+    """Move each planned pose to where its gain (Eq. 7) is largest near it, within the limits."""
     enough: Annotated[float, Field(gt=0, le=1)] | None = None
     """Share of the criterion's gain of all candidates, with --views auto. Default: 0.95."""
 
@@ -157,6 +159,7 @@ def suggest(
             count,
             safe_distance=safe,
             elevations=band,
+            refine=asked.refine,
             progress=progress,
             **changes,
         )
@@ -307,7 +310,8 @@ def _print(console: Terminal, result: Suggestion, run: Run, crossed: str, place:
     for number, view in enumerate(result.plan, 1):
         bearing, _ = Stop(view.camera.position, "", view.camera).heading_and_pitch(north)
         facing = f"; bearing {bearing:.0f}°" if place else ""
-        console.print(f"{number}: {view.way}{facing}", soft_wrap=True)
+        moved = f"; moved {view.moved:.2f} {run.dataset.unit}" if result.refined else ""
+        console.print(f"{number}: {view.way}{facing}{moved}", soft_wrap=True)
     unit = run.dataset.unit
     plan = f"{len(result.plan)} view{'s' if len(result.plan) > 1 else ''}"
     console.print(
@@ -315,6 +319,8 @@ def _print(console: Terminal, result: Suggestion, run: Run, crossed: str, place:
         f"flight: {result.metres:.1f} {unit} and {result.seconds:.0f} s from the first image "
         f"through {plan} and back"
     )
+    if result.refined:
+        console.print("refined: gain of the plan from {:.4f} to {:.4f}".format(*result.refined))
     if result.certificate:
         console.print(result.certificate.sentence(), soft_wrap=True)
     if crossed:

@@ -15,9 +15,11 @@ from mgs.run.settings import FlightLimits, Mission
 from mgs.scene import Scene, State
 
 
-def allowed(scene: Scene, mission: Mission) -> NDArray[np.bool_]:
-    """Whether the camera may be at each pose [V]: outside `no_fly`, above `clearance`."""
-    positions = scene.positions(scene.frames)
+def allowed(scene: Scene, mission: Mission, positions: Array | None = None) -> NDArray[np.bool_]:
+    """Whether the camera may be at each position [V,3], by default of the frames: outside `no_fly`,
+    above `clearance`."""
+    if positions is None:
+        positions = scene.positions(scene.frames)
     out = np.linalg.norm(positions[:, :2] - scene.centre[:2], axis=1)
     inside = out >= (mission.flight.no_fly or 0.0)
     if mission.flight.clearance is not None:

@@ -34,9 +34,11 @@ from mgs.run.folder import Run
 from mgs.run.loop import appraised, choose_batch
 from mgs.run.policies import Policy
 from mgs.run.policy_file import in_file, is_function, name_of, policy_of
+from mgs.run.refine import refined
 from mgs.run.settings import NbvSettings, check_settings, validated
 from mgs.run.worth import certificate, enough_views
 from mgs.scene import Choice, Scene, State
+from mgs.splat import fisher_derivatives
 
 COARSE = 8000
 """About the most Gaussians on the surface by which candidates are rated. A chosen constant."""
@@ -53,7 +55,8 @@ class View:
     share of what it shows, by squared blending weight, that no image shows, and mean share of the
     prior's variance that is left there. distance: from the last image taken. azimuth, elevation:
     from the middle of the object, degrees; azimuth 0 is +X of the upright world. way: as `way_to`.
-    planned: place in the order of choice, from 1; 0 if not planned.
+    planned: place in the order of choice, from 1; 0 if not planned. moved: distance from the
+    candidate, where `refine` moved it.
     """
 
     name: str
@@ -67,6 +70,7 @@ class View:
     elevation: float
     way: str
     planned: int = 0
+    moved: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,8 @@ class Suggestion:
     reasons for which candidates cannot be flown, with their numbers. corners: points of the way
     before each planned view and before home, where it leads around the no-fly cylinder.
     certificate: bounds of the plan by the policy's criterion, with prices in the order of
-    `ranking`; None where the policy has none, or all candidates are planned.
+    `ranking`; None where the policy has none, or all candidates are planned. refined: gain of the
+    plan by Eq. 7 before and after its poses moved; None without `refine`.
     """
 
     ranking: list[View]
@@ -88,6 +93,7 @@ class Suggestion:
     dropped: dict[str, int]
     corners: list[NDArray[np.float64]]
     certificate: Certificate | None = None
+    refined: tuple[float, float] | None = None
 
 
 def suggest(
@@ -97,6 +103,7 @@ def suggest(
     *,
     safe_distance: float = 0.0,
     elevations: tuple[float, float] | None = None,
+    refine: bool = False,
     progress: Progress = no_progress,
     **settings: Any,
 ) -> Suggestion:
@@ -105,6 +112,7 @@ def suggest(
     views: "auto" for the fewest that have the share `enough` of the gain of all candidates. With a
     limit of the flight it is the most, and the plan is that of `plan_flight`. The
     flight starts and ends at the first image taken. safe_distance, elevations: as `refusals`.
+    refine: move planned poses by `refined`; scores and certificate are those of the candidates.
     settings: fields of `NbvSettings` in place of the run's. Raises InputError if no
     pose can be flown, fewer can than `views`, a setting is invalid, or the policy fails.
     """
@@ -147,15 +155,26 @@ def suggest(
         describe = _describer(scene, state, flyable, weights, in_words)
         rated_views = rated(scene, state, rule, stops)
         ranking = [describe(appraised(scene, state, view, score)[0]) for view, score in rated_views]
-        plan, way = _plan(scene, state, rule, mission, describe)
+        choices, way = _plan(scene, state, rule, mission)
         order = [view for view, _ in rated_views]
-        worth = certificate(scene, state, rule, mission, way[1:-1], order)
+        worth, gains = certificate(scene, state, rule, mission, way[1:-1], order), None
+        if refine:
+            limits = taken, site, safe_distance, elevations
+            flies = lambda camera: refusals([("", camera)], *limits) == [""]  # noqa: E731
+            report("moving the poses", 0, 1)
+            state, gains = refined(scene, state, mission, way, scene.derivatives, flies)
+            weights, planned = _weights(scene, state, len(taken)), state
+            for k, choice in enumerate(choices):
+                choices[k], planned = appraised(scene, planned, choice.view, choice.score)
+            describe = _describer(scene, state, flyable, weights, in_words)
+        chosen = {choice.view: (choice, k) for k, choice in enumerate(choices, 1)}
+        plan = [describe(*chosen[view]) for view in way[1:-1]]
     radius, axis = mission.flight.no_fly or 0.0, scene.centre[:2]
     ends = scene.positions(state.frames)[way]
     corners = [tour.leg_corners(a, b, axis, radius) for a, b in pairwise(ends)]
     metres = tour.tour_length(flight_of(scene, state, mission).legs, way)
     seconds = metres / mission.flight.speed + mission.flight.hover * len(plan)
-    return Suggestion(ranking, plan, metres, seconds, dropped, corners, worth)
+    return Suggestion(ranking, plan, metres, seconds, dropped, corners, worth, gains)
 
 
 def taken_in_order(run: Run) -> list[Frame]:
@@ -211,6 +230,9 @@ def _describer(
 
     def describe(choice: Choice, planned: int = 0) -> View:
         seen, (name, camera) = weights[choice.view], poses[choice.view - taken]
+        frame = state.frames[choice.view]
+        shift = frame.camera.position - (frame.asked or frame.camera).position
+        camera = replace(camera, world_to_camera=frame.camera.world_to_camera)
         x, y, z = offset = positions[choice.view] - scene.centre
         return View(
             name,
@@ -224,6 +246,7 @@ def _describer(
             elevation=float(np.degrees(np.arcsin(z / np.linalg.norm(offset)))),
             way=way(camera),
             planned=planned,
+            moved=float(np.linalg.norm(shift)),
         )
 
     return describe
@@ -234,9 +257,9 @@ def _plan(
     state: State,
     policy: Policy,
     mission: NbvSettings,
-    describe: Callable[..., View],
-) -> tuple[list[View], list[int]]:
-    """Views of the plan in flying order, and the way: indices of its poses from home to home."""
+) -> tuple[list[Choice], list[int]]:
+    """The views of the plan in order of choice, and the way: indices of its poses in flying order,
+    from home to home."""
     flight = flight_of(scene, state, mission)
     if mission.flies:
         if not reachable(scene, state, mission):
@@ -253,8 +276,7 @@ def _plan(
         _, choices, _ = choose_batch(scene, state, policy, mission)
         order = [choice.view for choice in choices]
         order = tour.flying_order(flight.legs, flight.home, order, flight.home)
-    chosen = {choice.view: (choice, k) for k, choice in enumerate(choices, 1)}
-    return [describe(*chosen[view]) for view in order], [flight.home, *order, flight.home]
+    return choices, [flight.home, *order, flight.home]
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,6 +295,10 @@ class _CoarseScene(Scene):
     def fisher(self, model: Gaussians, camera: Camera, estimator: str = "exact") -> np.ndarray:
         return self._measured((camera, estimator))
 
+    def derivatives(self, camera: Camera) -> np.ndarray:
+        """Derivatives of `fisher` by the camera [7,N,Q], without columns of means."""
+        return self.factor * fisher_derivatives(self.initial(()), camera, cache=self.cache)
+
     @cached_property
     def _measured(self) -> Callable[[tuple[Camera, str]], np.ndarray]:
         def measure(key: tuple[Camera, str]) -> np.ndarray:
@@ -284,7 +310,7 @@ class _CoarseScene(Scene):
 
 def _coarse_scene(
     run: Run, images: Sequence[Frame], poses: Sequence[Named], settings: NbvSettings
-) -> tuple[Scene, State]:
+) -> tuple[_CoarseScene, State]:
     """Scene of the images taken, then the poses, with a coarse model; and its state, whose last
     view is the first image, where the flight starts."""
     prior, rows = coarse_prior(run.prior)

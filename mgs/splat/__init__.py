@@ -10,7 +10,7 @@ They start Dr.Jit themselves (`mgs.runtime.start`).
 which draws the same images.
 """
 
-from mgs.splat.information import ESTIMATORS, MEANS, fisher, groups
+from mgs.splat.information import ESTIMATORS, MEANS, fisher, fisher_derivatives, groups
 from mgs.splat.jacobian import jvp, vjp
 from mgs.splat.mitsuba_sensor import camera_from_sensor
 from mgs.splat.posterior import Estimate, Information
@@ -27,6 +27,7 @@ __all__ = [
     "as_drjit",
     "camera_from_sensor",
     "fisher",
+    "fisher_derivatives",
     "groups",
     "jvp",
     "moved",

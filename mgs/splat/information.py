@@ -11,6 +11,7 @@ r g b in each), 3 log-scales, 4 of the quaternion, 1 opacity logit; then 0 or 3 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -26,6 +27,7 @@ from mgs.splat import kernels
 from mgs.splat.derivatives import (
     ByMean,
     Moments,
+    Polynomial,
     by_means,
     geometry,
     mean_product,
@@ -34,7 +36,7 @@ from mgs.splat.derivatives import (
     weighted_sum,
 )
 from mgs.splat.jacobian import vjp
-from mgs.splat.projection import camera_array, project64, projected
+from mgs.splat.projection import Splats, camera_array, moved, project, project64, projected
 from mgs.splat.recording import frozen, one_at_a_time
 from mgs.splat.rendering import ListCache, as_colour, as_drjit, by_block, splats_and_lists
 from mgs.splat.walking import pack, packet_count, sums_by_splat
@@ -105,9 +107,7 @@ def fisher(
         return np.stack([fisher(model, one, *how, weight, chosen) for one, weight in pairs])
     compute = row_named(ESTIMATORS, estimator, "estimator")
     if dr.grad_enabled(camera.traced):
-        raise InputError(
-            "fisher: information has no derivative by the camera; take differences of moved cameras"
-        )
+        raise InputError("fisher: is not differentiated by the camera; use mgs.fisher_derivatives")
     gaussians.check_shapes()
     size = list(groups(gaussians.sh_degree, means).values())[-1].stop
     if not 0 <= alpha_weight <= WEIGHT_MAX:
@@ -247,6 +247,14 @@ def _diagonal(
     gaussians: Gaussians, camera: Any, splats: Any, sums: Moments, by_mean: list[ByMean]
 ) -> Any:
     """Columns of `exact` (`_interleaved`)."""
+    columns = _columns(gaussians, camera, splats, sums, by_mean)
+    return _interleaved(dict(enumerate(columns)), len(columns), len(gaussians))
+
+
+def _columns(
+    gaussians: Gaussians, camera: Any, splats: Any, sums: Moments, by_mean: list[ByMean]
+) -> list[Any]:
+    """Columns of `exact`, differentiable by the camera and the sums."""
     g = geometry(gaussians, camera, splats)
     # Colour: Y_k^2 sum w^2, 0 where the channel is clamped at 0.
     channels = list(zip(sums.w2, g.positive, strict=True))
@@ -255,8 +263,100 @@ def _diagonal(
     columns += [dr.maximum(product_sum(m, m, sums.squared), 0) for m in g.shape]
     columns.append(g.logit * g.logit * sums.squared[0, 0])
     # Means: sum over channels of (s_c q + w g_c)^2.
-    columns += [dr.maximum(means_product(mean, mean, sums), 0) for mean in by_mean]
-    return _interleaved(dict(enumerate(columns)), len(columns), len(gaussians))
+    return columns + [dr.maximum(means_product(mean, mean, sums), 0) for mean in by_mean]
+
+
+@one_at_a_time
+def fisher_derivatives(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Any = (0.0, 0.0, 0.0),
+    cache: ListCache | None = None,
+) -> np.ndarray:
+    """Derivatives of `fisher` by the camera, float32 [7,N,P]: by the six numbers of `moved`, per
+    radian and metre, then by its `zoom`.
+
+    Of the estimator `exact` with frozen means, in two passes over the image for each. Thresholds
+    and depth order are not differentiated, as in `render`; with many Gaussians of a pixel or two,
+    differences of moved cameras also have the steps at ALPHA_MIN. Raises InputError as `fisher`.
+    """
+    model, size = as_drjit(gaussians).map(dr.detach), groups(gaussians.sh_degree)["opacity"].stop
+    if len(gaussians) == 0:
+        return np.zeros((7, 0, size), np.float32)
+    camera, surround, rows = replace(camera), dr.detach(as_colour(background)), []
+    film = (camera.film or camera).seen_from(gaussians.origin)
+    device = camera_array(film)
+    splats, lists, packed = splats_and_lists(model, camera, cache)
+    out = kernels.forward(lists, packed, False)
+    totals = kernels.fisher(lists, packed, surround, False, True)
+    sums = sums_by_splat(lists, totals, kernels.fisher_sums(False, True))
+    for unit in np.eye(7).tolist():
+        # Tangents of the camera's numbers, of the splats, and of their sums.
+        with dr.resume_grad():
+            t = mi.Float64(0.0)
+            dr.enable_grad(t)
+            array = camera_array(moved(film, dr.concat([t * x for x in unit[:6]]), t * unit[6]))
+            dr.forward(t)
+            tangent = dr.grad(array)
+        tangents = _splat_tangents(model, device, tangent)
+        packed_tangents = kernels.pack_tangents(tangents, splats, lists.place)
+        d_out = kernels.jvp(lists, packed, packed_tangents)
+        totals = kernels.fisher_jvp(lists, packed, packed_tangents, out[0], d_out[0], surround)
+        changes = sums_by_splat(lists, totals, kernels.fisher_sums(False, False))
+        polynomial = kernels.log_alpha_tangent(tangents, splats)
+        change = _diagonal_tangent(model, device, tangent, splats, sums, changes, polynomial)
+        rows.append(np.array(change))
+    return np.stack(rows)[:, :, :size]
+
+
+@frozen(lambda gaussians, camera, tangent: gaussians.recorded)
+def _splat_tangents(gaussians: Gaussians, camera: Any, tangent: Any) -> Splats:
+    """Derivative of the splats along a tangent of the `camera_array`."""
+    camera = dr.copy(camera)
+    dr.enable_grad(camera)
+    dr.set_grad(camera, tangent)
+    splats = project(gaussians, camera)
+    dr.forward_to(splats, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+    return dr.grad(splats)
+
+
+@frozen(lambda gaussians, *others: gaussians.recorded)
+def _diagonal_tangent(
+    gaussians: Gaussians,
+    camera: Any,
+    tangent: Any,
+    splats: Any,
+    sums: list[Any],
+    changes: list[Any],
+    polynomial: Polynomial,
+) -> Any:
+    """Derivative of the columns of `exact` along a tangent of the camera (`_interleaved`).
+
+    sums: of `kernels.fisher` with means. changes: of `kernels.fisher_jvp`. polynomial: tangent of
+    ln alpha, which is ln 2 (log2 o' - 2 xi xi' - 2 eta eta').
+    """
+    # xi' and eta' are polynomials of first order in xi and eta.
+    half = {power: c / (-2 * kernels.LN2) for power, c in polynomial.items()}
+    d_xi = {(-1, 0): half[1, 0], (0, 0): half[2, 0], (-1, 1): half[1, 1]}
+    d_eta = {(0, -1): half[0, 1], (0, 0): half[0, 2]}
+    squared = dict(zip(kernels.fisher_moments(False, True)[0], sums[1:], strict=True))
+    camera, moments = dr.copy(camera), [dr.copy(one) for one in sums[: len(changes)]]
+    dr.enable_grad(camera, moments)
+    dr.set_grad(camera, tangent)
+    dr.set_grad(moments[0], changes[0])
+    powers = kernels.fisher_moments(False, False)[0]
+    for (a, b), moment, change in zip(powers, moments[1:], changes[1:], strict=True):
+        # The sum of |s|^2 xi^a eta^b changes with |s|^2, and by (a xi'/xi + b eta'/eta) of each
+        # pixel. d_xi, d_eta: by the powers that they add.
+        for factor, by in ((a, d_xi), (b, d_eta)):
+            if factor:
+                moved_by = {(a + x, b + y): c for (x, y), c in by.items()}
+                change = change + factor * weighted_sum(moved_by, squared)
+        dr.set_grad(moment, change)
+    named = Moments([moments[0]] * 3, dict(zip(powers, moments[1:], strict=True)), [])
+    columns = _columns(gaussians, camera, splats, named, [])
+    dr.forward_to(columns, flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+    return _interleaved(dict(enumerate(dr.grad(columns))), len(columns), len(gaussians))
 
 
 def block(

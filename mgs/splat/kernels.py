@@ -126,6 +126,32 @@ def pack_tangents(tangents: Splats, splats: Splats, place: Any) -> Any:
     )
 
 
+def _tangents_at(lists: BlockLists, packed_tangents: Any, pair: Any) -> tuple[Any, Any, Any]:
+    """What `pack_tangents` packed for the splat of a pair: coefficients of the tangent of ln alpha,
+    tangents of its colour and of its depth."""
+    place = dr.gather(mi.UInt32, lists.splat, pair)
+    (*first, xi_xi), (xi_eta, eta_eta, d_depth, _), (*d_colour, _) = (
+        dr.gather(mi.Vector4f, packed_tangents, place * 3 + part) for part in range(3)
+    )
+    return [*first, xi_xi, xi_eta, eta_eta], d_colour, d_depth
+
+
+def _blend_tangent(
+    by_log_alpha: list[Any], raw: Any, xi: Any, eta: Any, T: Any, d_alpha_so_far: Any
+) -> tuple[Any, ...]:
+    """The four results of `blend`, then the tangents of alpha and w."""
+    one, by_xi, by_eta, xi_xi, xi_eta, eta_eta = by_log_alpha
+    alpha, w, after, room = blend(raw, T)
+    # d ln alpha = one + by_eta eta + eta_eta eta^2 + (by_xi + xi_eta eta) xi + xi_xi xi^2.
+    constant = dr.fma(dr.fma(eta_eta, eta, by_eta), eta, one)
+    linear = dr.fma(xi_eta, eta, by_xi)
+    d_log_alpha = dr.fma(dr.fma(xi_xi, xi, linear), xi, constant)
+    # d alpha = alpha d ln alpha, 0 where alpha is clamped; then dw = T d alpha + alpha dT.
+    drawn = dr.select(room, alpha, 0)
+    d_alpha = dr.select(raw <= ALPHA_MAX, drawn * d_log_alpha, 0)
+    return alpha, w, after, room, d_alpha, dr.fma(d_alpha, T, -drawn * d_alpha_so_far)
+
+
 @frozen(recorded_sizes)
 def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, ...]:
     """Derivative of the output of `forward` along tangents of the splats (`pack_tangents`), in the
@@ -142,24 +168,13 @@ def jvp(lists: BlockLists, packed: Any, packed_tangents: Any) -> tuple[Any, ...]
     pixels = [[t, *(dr.zeros(mi.Float, len(lane.first)) for _ in range(5))] for t in T]
 
     def start(pair: Any, splat: Splats) -> tuple[list[Any], list[Any], list[Any]]:
-        place = dr.gather(mi.UInt32, lists.splat, pair)
-        (*first, xi_xi), (xi_eta, eta_eta, d_depth, _), (*d_colour, _) = (
-            dr.gather(mi.Vector4f, packed_tangents, place * 3 + part) for part in range(3)
-        )
-        return [*first, xi_xi, xi_eta, eta_eta], [*splat.colour, splat.depth], [*d_colour, d_depth]
+        by_log_alpha, d_colour, d_depth = _tangents_at(lists, packed_tangents, pair)
+        return by_log_alpha, [*splat.colour, splat.depth], [*d_colour, d_depth]
 
     def draw(of_splat: Any, raw: Any, xi: Any, eta: Any, pixel: list[Any]) -> list[Any]:
-        (one, by_xi, by_eta, xi_xi, xi_eta, eta_eta), numbers, tangents = of_splat
-        transmittance, d_alpha_so_far, *sums = pixel
-        alpha, w, after, room = blend(raw, transmittance)
-        # d ln alpha = one + by_eta eta + eta_eta eta^2 + (by_xi + xi_eta eta) xi + xi_xi xi^2.
-        constant = dr.fma(dr.fma(eta_eta, eta, by_eta), eta, one)
-        linear = dr.fma(xi_eta, eta, by_xi)
-        d_log_alpha = dr.fma(dr.fma(xi_xi, xi, linear), xi, constant)
-        # d alpha = alpha d ln alpha, 0 where alpha is clamped; then dw = T d alpha + alpha dT.
-        alpha = dr.select(room, alpha, 0)
-        d_alpha = dr.select(raw <= ALPHA_MAX, alpha * d_log_alpha, 0)
-        dw = dr.fma(d_alpha, transmittance, -alpha * d_alpha_so_far)
+        by_log_alpha, numbers, tangents = of_splat
+        T, d_alpha_so_far, *sums = pixel
+        _, w, after, _, _, dw = _blend_tangent(by_log_alpha, raw, xi, eta, T, d_alpha_so_far)
         # d(sum of w n) grows by n dw + w dn.
         sums = [
             dr.fma(n, dw, dr.fma(w, dn, s))
@@ -253,7 +268,7 @@ def adjoint(
         pixels.append([T[pixel], sum(v * d for v, d in zip(values, slopes, strict=True))])
     count = ADJOINT_SUMS[means]
 
-    def visit(splat: Splats, rows: list[PixelRow], pixels: Any) -> Any:
+    def visit(_pair: Any, splat: Splats, rows: list[PixelRow], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
         sums, (r, g, b) = [mi.Float(0)] * 10, splat.colour
         for j, row in enumerate(rows):
@@ -390,7 +405,7 @@ def fisher(
     squared, mixed = fisher_moments(cross, means)
     count, of_colour = fisher_sums(cross, means, roots is not None), 1 if roots is None else 3
 
-    def visit(splat: Splats, rows: list[PixelRow], pixels: Any) -> Any:
+    def visit(_pair: Any, splat: Splats, rows: list[PixelRow], pixels: Any) -> Any:
         new, alive = [], mi.Bool(False)
         sums = [mi.Float(0)] * count
         for j, row in enumerate(rows):
@@ -447,6 +462,61 @@ def fisher(
 
 
 @frozen(recorded_sizes)
+def fisher_jvp(
+    lists: BlockLists, packed: Any, packed_tangents: Any, out: Any, d_out: Any, background: Any
+) -> Any:
+    """Derivative of the sums of `fisher`, without `cross` and `means`, along tangents of the splats
+    (`pack_tangents`) at constant xi and eta.
+
+    They are 2 w dw, then 2 <s, ds> times the monomials, whose change the caller adds. With S the
+    colour behind, ds_c = c dw + w dc - dS_c alpha / (1 - alpha) - S_c dalpha / (1 - alpha)^2.
+    out, d_out: rgba of `forward` and of `jvp`. background: Color3f, linear RGB.
+    """
+    lane, T = lanes(lists)
+    # State of a pixel: T, the tangent of its alpha so far, S and dS, at first of the whole pixel.
+    pixels: list[list[Any]] = []
+    for pixel, t in enumerate(T):
+        rgba, d_rgba = (dr.gather(mi.Vector4f, x, lane.first + pixel) for x in (out, d_out))
+        behind = [dr.fma(1 - rgba[3], b, rgba[c]) for c, b in enumerate(background)]
+        d_behind = [dr.fma(-d_rgba[3], b, d_rgba[c]) for c, b in enumerate(background)]
+        pixels.append([t, dr.zeros(mi.Float, len(lane.first)), *behind, *d_behind])
+    squared, count = fisher_moments(False, False)[0], fisher_sums(False, False)
+
+    def visit(pair: Any, splat: Splats, rows: list[PixelRow], pixels: Any) -> Any:
+        by_log_alpha, d_colour, _ = _tangents_at(lists, packed_tangents, pair)
+        new, alive, sums = [], mi.Bool(False), [mi.Float(0)] * count
+        for j, row in enumerate(rows):
+            m = [mi.Float(0)] * 5  # sums over the row of 2 <s, ds> xi^a
+            for x, (raw, xi) in enumerate(zip(row.raw_alpha, row.xi, strict=True)):
+                raw = computed_after(raw, [sums[0], *m] if x else sums if j else [])
+                T, so_far, *behind = pixels[j * lane.columns + x]
+                alpha, w, after, room, d_alpha, dw = _blend_tangent(
+                    by_log_alpha, raw, xi, row.eta, T, so_far
+                )
+                alive |= room
+                odds, power = alpha / (1 - alpha), mi.Float(0)
+                d_odds = d_alpha / dr.square(1 - alpha)
+                for c, (n, dn) in enumerate(zip(splat.colour, d_colour, strict=True)):
+                    grown = dr.fma(n, dw, w * dn)  # d(c w)
+                    behind[c] = S = dr.fma(-n, w, behind[c])
+                    behind[3 + c] = dS = behind[3 + c] - grown
+                    power = dr.fma(n * w - S * odds, grown - dS * odds - S * d_odds, power)
+                new.append([after, so_far + dw, *behind])
+                sums[0] = dr.fma(2 * w, dw, sums[0])
+                power = dr.select(room & (raw <= ALPHA_MAX), 2 * power, 0)
+                for a in range(5):
+                    m[a] = m[a] + power
+                    power = power * xi
+            eta2 = row.eta * row.eta
+            moments = [_monomial(m, power, row.eta, eta2) for power in squared]
+            sums[1:] = [a + b for a, b in zip(sums[1:], moments, strict=True)]
+        return new, alive, sums
+
+    by_pair = walk_and_store(lists, packed, lane, pixels, visit, count)
+    return sums_by_place(lists, by_pair, count, mi.Float64)
+
+
+@frozen(recorded_sizes)
 def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
     """Sum over pixels of alpha^2 |D|^2 of each splat, to be read by `sums_by_splat` (one sum,
     Float64). A pixel is affine in the alpha of each splat, with slope D. So setting alpha to 0
@@ -457,7 +527,7 @@ def removal(lists: BlockLists, packed: Any, background: Any) -> Any:
     behind = _finished(pixels, background, mi.Float)
     dr.eval(behind)
 
-    def visit(splat: Splats, rows: list[PixelRow], pixels: Any) -> Any:
+    def visit(_pair: Any, splat: Splats, rows: list[PixelRow], pixels: Any) -> Any:
         new, alive, total = [], mi.Bool(False), mi.Float(0)
         for pixel, (transmittance, *behind) in enumerate(pixels):
             raw = rows[pixel // lane.columns].raw_alpha[pixel % lane.columns]

@@ -334,8 +334,8 @@ def walk_and_store(
 ) -> Any:
     """Draw each lane's list as `walk` does, and store sums over the pixels of each pair.
 
-    visit(splat, rows, pixels) -> (pixels, alive, sums): draws one splat. alive: mask of lanes with
-        an unfinished pixel. sums: `count` Floats.
+    visit(pair, splat, rows, pixels) -> (pixels, alive, sums): draws one splat. alive: mask of lanes
+        with an unfinished pixel. sums: `count` Floats.
 
     Returns the sums of all pairs in the order of the lists, padded to packets of four; 0 for pairs
     that were not visited because all pixels of their block were finished. A lane that draws a whole
@@ -359,7 +359,7 @@ def walk_and_store(
         pair: Any, pairs: list[tuple[Any, Splats, list[PixelRow]]], pixels: Any
     ) -> tuple[Any, Any]:
         ((_, splat, rows),) = pairs
-        pixels, alive, sums = visit(splat, rows, pixels)
+        pixels, alive, sums = visit(pair, splat, rows, pixels)
         store(pair, sums)
         return pixels, alive
 
