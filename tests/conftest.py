@@ -1,6 +1,7 @@
 """Shared set-up: one processor for each worker, the variant before any test module imports kernels,
 and common fixtures."""
 
+import gc
 import os
 import shutil
 from pathlib import Path
@@ -26,10 +27,14 @@ import tiny  # noqa: E402
 from mgs.data.dataset import load_dataset  # noqa: E402
 
 LONGEST = """
-setups view docs sweep refit photographs page synth scene structure_from_motion plugin capture
-kernels determinism fisher stress chart detectors survey prior world end_to_end derivatives exposure
-borders_data import directional nbv robustness evaluate agreement suggest
+docs page view photographs structure_from_motion synth capture prior setups end_to_end import loop
+scene poses agreement suggest chart nbv hostile borders_data sweep refit evaluate world options
+directional survey bad_input compact detectors exposure stress fisher derivatives kernels
 """
+
+
+def pytest_collection_finish():
+    gc.freeze()  # each evaluation collects garbage, and would look through all that is imported
 
 
 def pytest_collection_modifyitems(items):

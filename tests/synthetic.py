@@ -106,7 +106,7 @@ def edit(
     (root / name).write_text(json.dumps(data))  # NaN, which write_json refuses, too
 
 
-def write_colmap(dataset: Dataset, root: Path, binary: bool) -> None:
+def write_colmap(dataset: Dataset, root: Path, binary: bool, count: int = 2000) -> None:
     """Export to COLMAP: one camera, and points on the rock and the ground, tracked where seen."""
     import pycolmap
 
@@ -118,9 +118,9 @@ def write_colmap(dataset: Dataset, root: Path, binary: bool) -> None:
     lens = pycolmap.Camera(model="PINHOLE", **size, params=params, camera_id=1)
     model.add_camera_with_trivial_rig(lens)
     rng = np.random.default_rng(0)
-    sphere = rng.standard_normal((6000, 3))
+    sphere = rng.standard_normal((count, 3))
     rock = CENTRE + AXES * sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
-    ground = np.column_stack([rng.uniform(-2, 2, (9000, 2)), np.zeros(9000)])
+    ground = np.pad(rng.uniform(-2, 2, (3 * count // 2, 2)), ((0, 0), (0, 1)))
     outside = (((ground - CENTRE) / AXES) ** 2).sum(1) > 1
     points = np.concatenate([rock[rock[:, 2] > 0], ground[outside]])
     for k, frame in enumerate(dataset.frames, 1):

@@ -243,7 +243,7 @@ def test_figures_and_pages_take_names_literally(hostile):
 def test_a_page_about_a_strangers_run_is_safe(browser, hostile, tmp_path, scripts):
     """Nothing of the run is executed or loaded, with scripts and without; and if markup got in, the
     policy of the page would stop it."""
-    with opened(browser, hostile.as_uri(), 1280, 900, scripts=scripts) as (tab, wrong):
+    with opened(browser, hostile.as_uri(), 800, 500, scripts=scripts) as (tab, wrong):
         assert tab.locator(f"text={EVIL}").first.is_visible()
         if scripts:
             views = tab.locator(".figures .plot").last  # names its views
@@ -256,13 +256,13 @@ def test_a_page_about_a_strangers_run_is_safe(browser, hostile, tmp_path, script
     text = hostile.read_text().replace("<h1>", "<h1><script>owned=1</script>" + EVIL)
     (tmp_path / "injected.html").write_text(text)
     address = (tmp_path / "injected.html").as_uri()
-    with opened(browser, address, 1280, 900, scripts=scripts) as (tab, wrong):
+    with opened(browser, address, 800, 500, scripts=scripts) as (tab, wrong):
         assert tab.locator("h1 img").count() == 1
         if scripts:
             assert tab.evaluate("typeof owned") == "undefined"
 
 
-@pytest.mark.parametrize(("width", "height", "scheme"), [(1280, 900, "light"), (390, 844, "dark")])
+@pytest.mark.parametrize(("width", "height", "scheme"), [(900, 600, "light"), (390, 600, "dark")])
 def test_the_page_in_a_browser(browser, page, width, height, scheme):
     """Loads without a network and without errors, fits the width, draws its plots, and its controls
     do what they say."""

@@ -72,7 +72,7 @@ def colmap(exact: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, rng = tmp_path_factory.mktemp("colmap") / "data", np.random.default_rng(0)
     cameras = perturb([frame.camera for frame in exact.frames], 0.0015, 0.03, rng)
     frames = [replace(f, camera=c) for f, c in zip(exact.frames, cameras, strict=True)]
-    synthetic.write_colmap(replace(exact, frames=tuple(frames)), folder, True)
+    synthetic.write_colmap(replace(exact, frames=tuple(frames)), folder, True, 6000)
     model = pycolmap.Reconstruction(folder / "sparse/0")
     spoil_points(model, rng)
     model.transform(pycolmap.Sim3d(SCALE, pycolmap.Rotation3d(TURN), SHIFT))

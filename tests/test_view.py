@@ -267,7 +267,7 @@ def of_viser(message) -> bool:
     return "Computed radius is NaN" in message.text
 
 
-WIDTH, HEIGHT = 1000, 640
+WIDTH, HEIGHT = 800, 520
 
 
 def start_camera(subject) -> Camera:
@@ -353,7 +353,7 @@ def test_the_viewer_in_a_browser(browser, run):
         for view in subject.views:
             ((x, y),), (z,) = camera.project([view.frame.camera.position])
             # Neither under the panel nor under the notice of viser.
-            if z > 0 and 30 < x < 600 and 250 < y < HEIGHT - 30:
+            if z > 0 and 30 < x < 430 and 250 < y < HEIGHT - 30:
                 free.append((view, x, y))
         clicked, x, y = free[-1]
         tab.wait_for_timeout(1500)
@@ -375,7 +375,7 @@ def test_the_viewer_in_a_browser(browser, run):
         own = chosen.frame.camera
         there = own.resized(round(own.width * HEIGHT / own.height))
         narrow = layers.kernel_image(subject, there, "colour")[0].astype(int)
-        rows, columns = slice(260, 460), slice(WIDTH // 2 - 100, WIDTH // 2 + 50)
+        rows, columns = slice(260, 420), slice(WIDTH // 2 - 100, WIDTH // 2 + 50)
         shift = (WIDTH - there.width) // 2
         expected_there = narrow[rows, columns.start - shift : columns.stop - shift]
         tick(tab, "Exact at rest", True)
