@@ -131,8 +131,7 @@ def _from_columns(
     coefficients = 1 + rest // 3
     if rest % 3 or coefficients not in (1, 4, 9, 16):
         raise InputError(
-            f"{path}: {rest} f_rest properties fit no SH degree from 0 to 3; "
-            "expected 0, 9, 24 or 45"
+            f"{path}: {rest} f_rest properties fit no SH degree; expected 0, 9, 24 or 45"
         )
     names = _ply_names(coefficients)
     wrong = {n: "is missing" for n in names if n not in columns and n not in ("nx", "ny", "nz")}
@@ -200,13 +199,11 @@ def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
         dtype = table.dtype[name] if name in (table.dtype.names or ()) else None
         if dtype is None or dtype.kind != kind or dtype.itemsize < 4:
             raise InputError(
-                f"{path}: a compressed PLY without a usable {name!r}; "
-                "export it again, or uncompressed"
+                f"{path}: a compressed PLY without a usable {name!r}; export it uncompressed"
             )
     if len(chunks) * CHUNK < n:
         raise InputError(
-            f"{path}: {len(chunks)} chunks are too few for {n} splats, {CHUNK} to a chunk; "
-            "export it again"
+            f"{path}: {len(chunks)} chunks are too few for {n} splats; export it again"
         )
     chunk = np.arange(n) // CHUNK
 

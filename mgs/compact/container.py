@@ -107,8 +107,7 @@ def split(data: bytes, path: Path) -> tuple[Header, dict[Key, bytes]]:
     flags, degree, cut, layers, n, tiles, packets, *reals, digest = numbers
     if version != VERSION:
         raise InputError(
-            f"{path}: has version {version} of the format, and this mgs reads {VERSION}; "
-            "use the mgs that made it"
+            f"{path}: is of version {version}, and this mgs reads {VERSION}; update mgs"
         )
     if degree > MAX_SH_DEGREE:
         raise InputError(f"{path}: has SH degree {degree}, and {MAX_SH_DEGREE} is the most{again}")

@@ -62,8 +62,7 @@ def opened(path: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise InputError(
-            f"{path}: is a ROS bag, and rosbags, which reads it, is not installed; "
-            "`pip install mgs[ros]`"
+            f"{path}: a ROS bag needs rosbags, which is not installed; `pip install mgs[ros]`"
         ) from None
     if path.suffix in STORAGE and (path.parent / "metadata.yaml").is_file():
         path = path.parent

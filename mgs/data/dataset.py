@@ -93,8 +93,7 @@ class Dataset:
         folder = self.root / SURVEY_FOLDER
         if not folder.is_dir():
             raise InputError(
-                f"{self.root}: has neither images nor a survey to build a prior of; "
-                "give one with `prior`"
+                f"{self.root}: has neither images nor a survey for a prior; give one with `prior`"
             )
         return load_dataset(folder, up=self.world.up)
 
@@ -171,8 +170,7 @@ def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]
     distorted = any(both.get(key) not in (None, 0) for key in DISTORTION)
     if distorted or (both.get("camera_model") or "OPENCV") not in PINHOLES:
         raise InputError(
-            f"{where} is distorted, or not of a pinhole camera; "
-            "undistort the images with `mgs import`"
+            f"{where} is distorted, or no pinhole camera; undistort images with `mgs import`"
         )
     absent = [key for key in INTRINSICS if both.get(key) is None]
     if absent:
@@ -187,8 +185,7 @@ def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]
         pose = np.array(record["transform_matrix"], np.float64)
     except (TypeError, ValueError, OverflowError):
         raise InputError(
-            f"{where} has no usable intrinsics or pose; fl_x fl_y cx cy w h and a 4x4 matrix "
-            "are needed"
+            f"{where} has no usable intrinsics or pose; give fl_x fl_y cx cy w h, a 4x4 matrix"
         ) from None
     return posed_camera(where, K, width, height, pose)
 
@@ -270,8 +267,7 @@ def _frame(
         paths[field] = root / record[key] if record.get(key) else None
         if paths[field] and not on_demand and not paths[field].is_file():
             raise InputError(
-                f"{where}: {key} {record[key]} does not exist in {root}; "
-                "restore it or remove the frame"
+                f"{where}: {key} {record[key]} does not exist; restore it or remove the frame"
             )
     name = Path(record["file_path"]).stem
     return as_captured(Frame(name, camera, timestamp, **paths, on_demand=on_demand), world)
@@ -340,8 +336,7 @@ def target_of(frame: Frame, with_alpha: bool = False) -> np.ndarray:
     empty, since a fit to black would remove the rock."""
     if not frame.mask().any():
         raise InputError(
-            f"{frame.mask_path}: the rock mask of frame {frame.name} is empty; "
-            "correct it, or remove the frame"
+            f"{frame.mask_path}: its rock mask is empty; correct it, or remove frame {frame.name}"
         )
     rgba, weight = frame.target()
     alpha = [rgba[..., 3]] if with_alpha else []

@@ -173,8 +173,7 @@ def shrunk(
     width, height = camera.width // factor, camera.height // factor
     if factor < 1 or not width or not height:
         raise InputError(
-            f"import: downscale {factor} leaves nothing of {camera.width}x{camera.height}; "
-            "give 1 or more"
+            f"import: downscale {factor} leaves nothing of {camera.width}x{camera.height}; lower it"
         )
 
     def smaller(pixels: np.ndarray, smooth: bool) -> np.ndarray:

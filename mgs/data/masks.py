@@ -33,8 +33,7 @@ def make_masks(
     for frame in dataset.frames:
         if frame.mask_path is not None or frame.rock_path is not None:
             raise InputError(
-                f"frame {frame.name}: has a mask already; "
-                "import the data without masks to make others"
+                f"frame {frame.name}: has a mask already; import the data without to make others"
             )
     tests = dataset.test_views()
     if tests is not None and not has_masks(tests.frames):
@@ -51,8 +50,7 @@ def make_masks(
         thumbnails.append(_outlined(rgb, mask))
     if not visible:
         raise InputError(
-            f"{dataset.root}: the mesh is in no image; mesh and poses do not fit, "
-            "make masks with another"
+            f"{dataset.root}: the mesh is in no image; make masks with one that fits the poses"
         )
     write_sheet(dataset.root / SHEET, thumbnails, ACROSS)
     write_transforms(dataset.root, frames, dataset.world)

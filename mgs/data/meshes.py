@@ -109,8 +109,7 @@ def _check(path: object, vertices: np.ndarray, faces: np.ndarray) -> None:
         raise InputError(f"{path}: face {face} names {what}; repair the mesh")
     if np.abs(vertices).max() > FURTHEST:
         raise InputError(
-            f"{path}: has vertices further than {FURTHEST:g} m from the origin; "
-            "repair or scale the mesh"
+            f"{path}: has vertices further than {FURTHEST:g} m from the origin; scale the mesh"
         )
     if not face_crosses(np.asarray(vertices, np.float64), faces).any():
         raise InputError(f"{path}: none of its faces has an area; repair the mesh")

@@ -288,8 +288,7 @@ def objective(
     start = gaussians if start is None else start
     if start.sh.shape != gaussians.sh.shape:
         raise InputError(
-            f"start: has colours of shape {start.sh.shape}, "
-            f"expected {gaussians.sh.shape}, that of the Gaussians"
+            f"start: has colours of shape {start.sh.shape}, the Gaussians {gaussians.sh.shape}"
         )
     # A copy, because Dr.Jit uses NumPy's memory in place. If parameters and start shared memory
     # when a step is recorded, its replays would take them for the same array (Dr.Jit 1.5).

@@ -382,8 +382,7 @@ def load_prior(folder: str | Path) -> Prior:
         backed, world = int(numbers["backed"]), World(unit_up(numbers["up"]))
     if not np.isfinite(columns).all() or len(columns) < 2:
         raise InputError(
-            f"{path}: has NaN values, or fewer than two points; "
-            "make the prior again with `mgs prior`"
+            f"{path}: has NaN values, or fewer than two points; make it again with `mgs prior`"
         )
     if not (0 < spacing < np.inf and 0 < tolerance < np.inf):
         raise InputError(

@@ -160,8 +160,7 @@ def _bounds(frames: Sequence[Frame]) -> tuple[np.ndarray, float]:
         cones.append((frame.camera.position, tangent))
     if not cones:
         raise InputError(
-            "prior: every mask is empty or fills its image; "
-            "give masks that are white on the object only"
+            "prior: every mask is empty or full; give masks that are white on the object only"
         )
     centre = nearest_point([position for position, _ in cones], rays)
     half = MARGIN * max(np.linalg.norm(at - centre) * tangent for at, tangent in cones)

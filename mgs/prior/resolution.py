@@ -61,8 +61,7 @@ def resolution(
     in_view = np.isfinite(pixel) & (areas > 0)
     if not in_view.any():
         raise InputError(
-            "prior: no frame has the mesh in its image, so nothing says how many Gaussians; "
-            "give `gaussians`"
+            "prior: no frame shows the mesh, so nothing says how many Gaussians; give `gaussians`"
         )
     area = float(areas[in_view].sum())
     typical = float(np.sqrt(area / (areas[in_view] / pixel[in_view] ** 2).sum()))

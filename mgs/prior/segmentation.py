@@ -103,8 +103,7 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
         core = np.abs(residual) < tolerance
         if core.sum() < 3:
             raise InputError(
-                "cloud: no ground around what the cameras look at; "
-                "photograph more ground, or give `mesh`"
+                "cloud: no ground near what the cameras look at; photograph it, or give `mesh`"
             )
         spread = np.abs(residual[core] - np.median(residual[core]))
         sigma = SIGMA_FROM_MAD * float(np.median(spread))

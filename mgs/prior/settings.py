@@ -46,15 +46,13 @@ class PriorSettings:
         what the surface is made of instead."""
         if self.poisson_depth is not None:
             raise InputError(
-                "prior: `poisson_depth` shapes a mesh that is built of a cloud, "
-                f"but {why}; leave out either"
+                f"prior: `poisson_depth` shapes a mesh of a cloud, but {why}; leave out either"
             )
 
     def __post_init__(self) -> None:
         if isinstance(self.gaussians, int) and self.gaussians < 2:
             raise InputError(
-                f"prior: {self.gaussians} Gaussians are too few for a model; "
-                "ask for more with `gaussians`"
+                f"prior: {self.gaussians} Gaussians are too few for a model; raise `gaussians`"
             )
         if self.spacing is not None and not self.spacing > 0:
             raise InputError(f"prior: spacing {self.spacing} m must be positive")
@@ -66,11 +64,9 @@ class PriorSettings:
             raise InputError(f"prior: density {self.density} must be positive; correct it")
         if self.poisson_depth is not None and not 3 <= self.poisson_depth <= 12:
             raise InputError(
-                f"prior: Poisson depth {self.poisson_depth} is not within 3 to 12; "
-                "correct `poisson_depth`"
+                f"prior: `poisson_depth` {self.poisson_depth} is not within 3 to 12; correct it"
             )
         if not 0 <= self.backing <= 1:
             raise InputError(
-                f"prior: backing {self.backing} is a number of Gaussians per sample, 0 to 1; "
-                "correct `backing`"
+                f"prior: `backing` {self.backing} is Gaussians per sample, 0 to 1; correct it"
             )

@@ -212,8 +212,7 @@ def _checked_count(samples: float) -> int:
     count = round(samples)
     if count < 2:
         raise InputError(
-            f"prior: {count} samples are too few for a model; "
-            "ask for more Gaussians (or a smaller `spacing`)"
+            f"prior: {count} samples are too few for a model; ask for more, or less `spacing`"
         )
     return count
 

@@ -75,8 +75,7 @@ def fuse_frames(frames: Sequence[Frame]) -> Cloud:
     total = sum(map(len, returns))
     if total == 0:
         raise InputError(
-            "cloud: no depth image has a return (all pixels are 0); "
-            "check the depth files or their unit (metres)"
+            "cloud: no depth image has a return; check the depth files, or their unit (metres)"
         )
     stride = max(1, int(np.ceil(np.sqrt(total / MAX_FUSED_PIXELS))))
     # The lower quartile of depths is about that of the rock; most of a frame is ground behind it.

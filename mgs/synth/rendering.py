@@ -336,14 +336,12 @@ def _meter(
         depth, mask = scene.cast(cameras[index])
         if not mask.any():
             raise InputError(
-                f"scene: the rock is hidden in frame {index}; "
-                "raise orbit.altitude, or lower rock.buried"
+                f"scene: frame {index} shows no rock; raise orbit.altitude, or lower rock.buried"
             )
         means.append(float(rgb[mask].mean()))
         if not np.isfinite(means[-1]):
             raise InputError(
-                f"scene: the rock has pixels that are NaN or infinite in frame {index}; "
-                "repair its mesh"
+                f"scene: the rock is NaN or infinite in frame {index}; repair its mesh"
             )
         values.append(rgb.max(-1)[depth > 0])
     target = ROCK_EXPOSURE / float(np.mean(means))

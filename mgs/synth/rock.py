@@ -102,8 +102,7 @@ def _body(settings: Rock, noise: Noise) -> trimesh.Trimesh:
     shape = np.ceil((high - low + 0.3 * extent) / step) + 1
     if shape.prod() > MAX_GRID:
         raise InputError(
-            f"scene: rock.detail {settings.detail} m is too fine for a rock of "
-            f"{settings.size} m; raise it"
+            f"scene: rock.detail {settings.detail} m is too fine for {settings.size} m; raise it"
         )
     shape = shape.astype(int)
     nodes = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
@@ -121,8 +120,7 @@ def _body(settings: Rock, noise: Noise) -> trimesh.Trimesh:
     distance = gaussian_filter(distance, 0.7)
     if distance.min() >= 0:  # nothing is inside
         raise InputError(
-            f"scene: rock.detail {settings.detail} m is too coarse for a rock of "
-            f"{settings.size} m; lower it"
+            f"scene: rock.detail {settings.detail} m is too coarse for {settings.size} m; lower it"
         )
     vertices, faces, _, _ = marching_cubes(distance, 0.0, spacing=(step,) * 3)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
