@@ -1,7 +1,5 @@
-"""Gaussians in files: PLY, compressed PLY, binary glTF, SPZ, and what `mgs.compact` writes.
-
-`load_gaussians` tells the format from the first bytes of a file, not from its name.
-"""
+"""Gaussians in files: PLY, compressed PLY, binary glTF, SPZ, and what `mgs.compact` writes, told
+apart by their first bytes."""
 
 from __future__ import annotations
 

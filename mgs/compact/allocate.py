@@ -1,10 +1,6 @@
-"""Allocation of bits: steps of the coefficients by what errors cost, and order of the packets.
-
-Let h be the squared change of the images by a unit change of a coefficient. With steps c / sqrt(h)
-every rounding costs the same, c^2 / 12, which spends bits best (reverse water-filling, Cover and
-Thomas 2006, 10.3.3). A coefficient below about a step becomes 0 and costs next to nothing: its node
-keeps the prior's value, or the mean of its neighbourhood.
-"""
+"""Allocation of bits: steps c / sqrt(h), with h what errors cost (docs/bytes.md), so that every
+rounding costs c^2 / 12 (reverse water-filling, Cover and Thomas 2006, 10.3.3), and order of the
+packets."""
 
 from __future__ import annotations
 

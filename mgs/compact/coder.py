@@ -1,8 +1,5 @@
-"""Integers as bytes: adaptive range coding with the package constriction.
-
-Probabilities are counts of what was coded before, so no table is sent, and they are the same on
-every machine. One function serves both directions: a decoder gets zeros in place of the numbers.
-"""
+"""Integers as bytes by adaptive range coding (constriction). One function serves both directions: a
+decoder gets zeros in place of the numbers."""
 
 from __future__ import annotations
 

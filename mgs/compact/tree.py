@@ -1,11 +1,6 @@
-"""A binary tree of cells in space, and a transform of values along it.
-
-Cells are numbered by Morton codes, so neighbours are near each other, and cells with the same
-leading bits form a node. The transform (RAHT: de Queiroz and Chou 2016) replaces two children by
-their weighted sum, which goes on to the parent, and their weighted difference, a coefficient. It is
-orthonormal, and smooth values have small differences. All is arithmetic of integers and of float64
-with +, *, / and sqrt, element by element, which IEEE 754 defines to the last bit.
-"""
+"""A binary tree of cells in space by Morton codes, and RAHT along it (de Queiroz and Chou 2016):
+two children become their weighted sum, which goes on to the parent, and difference, a coefficient.
+Only +, *, / and sqrt of float64, element by element, which IEEE 754 defines to the last bit."""
 
 from __future__ import annotations
 

@@ -1,9 +1,5 @@
-"""ROS 1 and ROS 2 bags, read by rosbags: camera_info, colour, depth, and poses.
-
-Poses are a chain of frames from that of the images to the root, which becomes the world. Its steps
-come from tf, else from odometry; a PoseStamped counts only where the user names its topic.
-Keyframes are unpacked into files.
-"""
+"""ROS 1 and ROS 2 bags, read by rosbags: images, camera_info, and poses as a chain of frames of tf
+or odometry from that of the images to the root, which becomes the world. Keyframes are unpacked."""
 
 from __future__ import annotations
 

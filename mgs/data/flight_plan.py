@@ -1,8 +1,6 @@
-"""Flight plans for a drone: QGroundControl's .plan, MAVLink's .waypoints, and KML.
-
-The world's +Z is up; by default +X is east and +Y north. Sources: QGroundControl's "Plan File
-Format", MAVLink's common message set, OGC KML 2.3.
-"""
+"""Flight plans for a drone: QGroundControl's .plan ("Plan File Format"), MAVLink's .waypoints
+(common message set), and KML (OGC 2.3). The world's +Z is up; by default +X is east and +Y
+north."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""Folders of robots and scanners with a pose for each image: TUM RGB-D, Open3D, RTAB-Map exports.
-
-Each reader returns keyframes, in metres.
-"""
+"""Folders of robots and scanners with a pose for each image: TUM RGB-D, Open3D, RTAB-Map exports;
+each reader returns keyframes, in metres."""
 
 from __future__ import annotations
 

@@ -1,9 +1,5 @@
-"""Structure from motion by pycolmap: matches between pictures, points at known poses, and poses of
-photographs alone.
-
-Random numbers have fixed seeds, and pictures enter the database in order, so results repeat. Bundle
-adjustments of more than 50,000 observations use several threads, which sum in any order.
-"""
+"""Structure from motion by pycolmap. Seeds are fixed and pictures enter the database in order, so
+results repeat, but bundle adjustments of over 50,000 observations sum in any order."""
 
 from __future__ import annotations
 

@@ -1,9 +1,5 @@
-"""Where data came from: the world of a dataset's files, and the upright one in which mgs works.
-
-`load_dataset` and `load_prior` turn what they read so that +Z is up; whatever leaves mgs is turned
-back. Between the two nothing names an upward direction. A world that is upright already is not
-touched, bit for bit.
-"""
+"""Worlds of files, and the upright one in which mgs works: what is read is turned so that +Z is up,
+what leaves is turned back, and between the two nothing names an upward direction."""
 
 from __future__ import annotations
 

@@ -1,17 +1,11 @@
 """Choose by evidence which kinds of parameters each Gaussian learns, and the SH degree of the
-colours.
-
-The evidence is the likelihood of the images, averaged over the prior of the parameters. In
-Laplace's approximation with the exact diagonal H, learning one parameter adds
+colours (docs/parsimony.md). In Laplace's approximation with the exact diagonal H, learning one
+parameter adds
 
     gain = 1/2 (H + lam) delta^2 / sigma^2 - 1/2 log((H + lam) / lam)
 
-nats to the log evidence (MacKay 1992). Here lam = (sigma / tau)^2, and delta is how far the fit
-moved the parameter from its start. Parameters that gain least are left out too, while Phi, the
-objective of the fit, rises by no more than is allowed: each raises it by 1/2 (H + lam) delta^2.
-
-The SH degree is chosen by blocked cross-validation (Roberts et al. 2017): neighbours in azimuth are
-left out together, so the others must predict views beyond them.
+nats to the log evidence (MacKay 1992), with delta how far the fit moved it from its start; without
+it Phi rises by 1/2 (H + lam) delta^2.
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
-"""Fit Gaussians to posed images: lower the objective of `mgs.fit.objective`.
-
-One optimiser step uses one image. A pass uses every image once, in random order.
-"""
+"""Fit Gaussians to posed images: lower the objective of `mgs.fit.objective` by steps on one image
+each. A pass uses every image once, in random order."""
 
 from __future__ import annotations
 

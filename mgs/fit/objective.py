@@ -1,24 +1,10 @@
-"""Objective of a fit: the negative logarithm of the posterior of the Gaussians' parameters, with
-its gradient, and the diagonal of its curvature.
-
-Model: a pixel is the rendered value plus noise of standard deviation sigma, and each parameter is
-normally distributed around its start with standard deviation tau. The negative logarithm of the
-posterior, up to a constant and times sigma^2, is
+"""Objective of a fit (docs/fit.md, One objective), its gradient, and the diagonal of its curvature
+J^T J + lam, with the Jacobian J of all images; the two are of squared differences under any loss.
 
     Phi = 1/2 sum over images, pixels and channels of (rendered - target)^2
-        + 1/2 sum over parameters of lam (theta - start)^2
+        + 1/2 sum over parameters of lam (theta - start)^2,   lam = (sigma / tau)^2
 
-with lam = (sigma / tau)^2 (`mgs.policy.criteria.regularisation`). Its curvature is J^T J + lam,
-with the Jacobian J of all images: the matrix whose diagonal the criteria use. With lam = 0 it is
-maximum likelihood, the paper's Eq. 2 up to a constant.
-
-Another loss (`mgs.fit.losses`) can take the place of the squared differences. Curvature and
-`Objective.gradient` are always of squared ones.
-
-Alpha may be a fourth channel with noise sigma_alpha. Its squared differences then count
-alpha_weight = (sigma / sigma_alpha)^2 times. The criteria ignore alpha.
-
-Means are frozen by default, as in the paper. Means that are "free" are parameters like the others.
+Alpha may be a fourth channel, whose squared differences count (sigma / sigma_alpha)^2 times.
 """
 
 from __future__ import annotations

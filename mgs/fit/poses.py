@@ -1,13 +1,10 @@
-"""Refine the poses of views about a model that was fitted to them.
-
-One Gauss-Newton step of the six numbers of a view's pose, its motion from the pose that came with
-the image (rotation vector, then translation, in the camera's axes). It lowers
+"""Refine the poses of views about a model that was fitted to them: Gauss-Newton steps of their
+motions from the poses that came with the images (rotation vector, then translation, in the camera's
+axes). They lower
 
     1/2 sum of w (rendered - target)^2  +  1/2 sum of lam motion^2,   lam = (sigma / tau)^2
 
-with the weights w of the pixels, the noise sigma of an independent pixel, and the standard
-deviation tau of the motion. The prior on motions and, with frozen means, the surface fix the gauge:
-no view is held. `mgs.learning.refine_poses` lets steps and fits take turns.
+with the weights w of the pixels. `mgs.learning.refine_poses` lets steps and fits take turns.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
-"""The mesh prior (paper, section III-A): build it from a dataset or a mesh, save and load it.
-
-Steps: cloud, ground plane, rock, Poisson mesh, samples of its surface. Without depth,
-`mgs.prior.photographs` builds the mesh from triangulated points or from masks.
-"""
+"""The mesh prior (paper, section III-A): build it from a dataset or a mesh, save and load it
+(docs/prior.md)."""
 
 from __future__ import annotations
 

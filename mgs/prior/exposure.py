@@ -1,9 +1,5 @@
-"""Exposure differences between photographs: a gain per image and channel, before any fit.
-
-Where two images show the same surface samples, the ratio of mean colours is the ratio of their
-gains. All gains are the least-squares solution over all pairs (Brown and Lowe 2007, "Automatic
-Panoramic Image Stitching using Invariant Features", section 6), of logarithms, so it is linear.
-"""
+"""Gains of photographs, before any fit, of the ratios of colours of the surface that they share:
+least squares of their logarithms over all pairs (Brown and Lowe 2007, section 6)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
 """The figure of a prior: cloud, ground plane, rock cluster, mesh and samples from one side.
-
-"Picture coordinates" are right, up, and towards the viewer, in metres.
-"""
+"Picture coordinates" are right, up, and towards the viewer, in metres."""
 
 from __future__ import annotations
 

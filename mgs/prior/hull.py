@@ -1,8 +1,5 @@
-"""The visual hull: what lies inside the masks of all frames (Laurentini 1994), by carving.
-
-A point has a value per frame: its projection's distance inside the mask's outline, times the size
-of a pixel there. The least value is positive inside the hull; marching cubes find its surface.
-"""
+"""The visual hull by carving (Laurentini 1994): marching cubes where the least distance of a
+point's projections inside the masks' outlines, times the size of a pixel there, is 0."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
-"""Initial Gaussians from the prior and some frames (paper, section III-A), with an opaque backing.
-
-With one layer of Gaussians, as in the paper, bright patches become transparent, and the far side of
-the rock shows through. So every second Gaussian on the surface has a larger, opaque one a spacing
-behind it (docs/fit.md). All are fitted alike.
-"""
+"""Initial Gaussians from the prior and some frames (paper, section III-A): one layer, and for every
+second one a larger, opaque one behind it, so that the far side does not show through
+(docs/fit.md)."""
 
 from __future__ import annotations
 

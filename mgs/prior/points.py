@@ -1,8 +1,5 @@
-"""Points of the object, with normals, from a triangulated cloud.
-
-Points are judged one by one (track, reprojection error), then by masks, else by ground plane and
-density clusters (HDBSCAN), and last by their neighbours.
-"""
+"""Points of the object, with normals, from a triangulated cloud: judged one by one, then by masks,
+else by ground plane and density clusters (HDBSCAN), and last by their neighbours."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
-"""Sample spacing that the training images can resolve, and the number of samples that follows.
-
-A detail of period under two pixels is not in an image (Nyquist). Samples closer than the pixels of
-the closest camera differ by noise only.
-"""
+"""Sample spacing that the training images can resolve: a detail of a period under two pixels is in
+no image (Nyquist), and samples closer than the closest camera's pixels differ by noise only."""
 
 from __future__ import annotations
 

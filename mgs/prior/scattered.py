@@ -1,7 +1,5 @@
-"""Random start: a prior for photographs whose object has no known surface.
-
-Points that came with the cameras, if there are any, take the place of as many random ones.
-"""
+"""Random start: a prior for photographs whose object has no known surface. Points that came with
+the cameras take the place of as many random ones."""
 
 from __future__ import annotations
 

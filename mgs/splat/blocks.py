@@ -1,13 +1,9 @@
-"""Block lists: for every block of pixels, the splats that touch it, front to back.
+"""Block lists: for every block of BLOCK_X x BLOCK_Y pixels, the splats that touch it, front to
+back.
 
-A block is a rectangle of BLOCK_X x BLOCK_Y pixels, drawn by one SIMD lane (`mgs.splat.walking`). A
-splat that touches five blocks makes five (splat, block) *pairs*, one in each block's list.
-
-Lists stay valid while no footprint changes (`changes`). If the means stay, so does the depth order
-in each camera, and new lists take it over from old ones.
-
-Blocks are grouped into square *tiles*, and splats are stored tile by tile, so that splats of
-neighbouring blocks are near one another in memory. The position of a splat is called its *place*.
+A splat that touches five blocks makes five (splat, block) *pairs*. Blocks are grouped into square
+*tiles*; splats are stored tile by tile, and the position of one is its *place*. Lists stay valid
+while no footprint changes (`changes`), and their depth order while the means stay.
 """
 
 from __future__ import annotations

@@ -1,14 +1,10 @@
 """The kernels: forward (image), jvp (its tangents), adjoint (gradients), fisher (sums for the
-Fisher information), removal (change of the image when a splat is removed).
+Fisher information), removal (change of the image when a splat is removed). Symbols:
+docs/notation.md.
 
-`walking.py` has the parts that they share. The last three need the colour S composited behind each
-splat at each pixel. They draw the image front to back once more and subtract: S = C - (colour so
-far), with C the finished pixel. The same instructions then make the same decisions (thresholds,
-finished pixels) as the forward kernel, and none need be stored.
-
-These three store sums for each (splat, block) pair, and a second kernel adds those of each splat.
-The order of all additions is fixed, so reruns are bitwise equal with any number of threads.
-Symbols: docs/notation.md.
+The last three draw the image front to back once more and subtract, S = C - (colour so far), so they
+make the same decisions. They store sums for each (splat, block) pair, and a second kernel adds
+those of each splat in a fixed order.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
-"""Registers the Mitsuba plugins of mgs when imported.
-
-A plugin class belongs to one Mitsuba variant, so the files in `plugins/` run for the current
-variant and again for every variant set later.
-"""
+"""Registers the Mitsuba plugins of mgs when imported: the files in `plugins/` run for the current
+variant, and again for every variant set later, to which their classes belong."""
 
 from __future__ import annotations
 

@@ -1,11 +1,7 @@
-"""Fisher information of many views as an operator, without its matrix: products, solutions,
-log-determinant and samples of the posterior.
-
-With all P N parameters in one vector, H = sum over the views of J^T W J is the information of the
-images, and H + lam the precision of the posterior times sigma_e^2 (docs/notation.md). H has a row
-for each parameter and couples all Gaussians that share a pixel. `fisher` gives its diagonal blocks
-alone. A product H v takes one forward and one reverse pass over each view.
-"""
+"""Fisher information of many views as an operator: products, solutions, log-determinant and samples
+of the posterior. H = sum over the views of J^T W J has a row for each of P N parameters and couples
+all Gaussians that share a pixel; `fisher` gives its diagonal blocks alone. A product H v takes two
+passes a view."""
 
 from __future__ import annotations
 

@@ -1,18 +1,9 @@
-"""EWA projection of Gaussians to splats, the 2D Gaussians that the kernels draw. Differentiated by
-Dr.Jit, backward and forward.
+"""EWA projection of Gaussians to splats, differentiated by Dr.Jit: footprints as *whitenings*,
 
-A splat's footprint is stored not as a conic (inverse of its 2D covariance) but as a *whitening*: a
-linear map of pixel offsets (dx, dy) from the splat's centre to coordinates (xi, eta) in which the
-footprint is a circle,
+    xi = white_x (dx - shear dy),   eta = white_y dy,   alpha = 2^(log2_opacity - xi^2 - eta^2),
 
-    xi = white_x (dx - shear dy),   eta = white_y dy,   alpha = 2^(log2_opacity - xi^2 - eta^2).
-
-It is the Cholesky factor of the conic, scaled so that the exponent is one of 2. For thin footprints
-(1:1000) the terms of a conic cancel in float32; these do not. Where a splat is drawn, xi and eta
+in double, rounded to float32 once (docs/splatting.md, Project). Where a splat is drawn, xi and eta
 are of order one, so the fourth powers in the Fisher information lose no digits.
-
-The projection is computed in double and rounded to float32 once. In single precision its errors
-would be the largest of the renderer.
 """
 
 from __future__ import annotations

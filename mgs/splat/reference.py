@@ -1,11 +1,6 @@
-"""Reference implementation in plain float64 NumPy: every Gaussian on every pixel, with the names
-and constants of the kernels.
-
-Each function has a fast counterpart in Dr.Jit and a test that compares both. In some pixels float32
-may decide a threshold differently; `margins` finds them, so that tests can exclude them.
-Derivatives are written independently of the kernels, as dense Jacobians, and are tested against
-central differences.
-"""
+"""Reference implementation in plain float64 NumPy, with the names and constants of the kernels:
+every Gaussian on every pixel, and derivatives as dense Jacobians, written independently of the
+kernels."""
 
 from __future__ import annotations
 

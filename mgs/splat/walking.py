@@ -1,14 +1,9 @@
 """Shared parts of the kernels: how a lane draws the splats of its block, and how sums reach the
-splats.
+splats (docs/splatting.md, Walk).
 
-The image is cut into blocks of BLOCK_X x BLOCK_Y pixels, one per SIMD lane. A lane reads its
-block's list of splats front to back and draws each on all pixels of the block. So a splat is read
-once for 32 pixels, whose contributions to it are added before they are stored: on a CPU, splatting
-is limited by reads and writes at scattered addresses, not by arithmetic. On a GPU a lane draws one
-pixel (`lane_size`), and the 32 lanes of a warp share a block's list and add up their contributions.
-
-Python loops over a block's pixels are unrolled while Dr.Jit traces a kernel. No Python loop runs
-over Gaussians or the image. Symbols: docs/notation.md.
+A lane draws a block's pixels, so that a splat is read once for 32 of them and their contributions
+are added before they are stored: scattered addresses, not arithmetic, limit a CPU. On a GPU a lane
+draws one pixel (`lane_size`). Loops over a block's pixels are unrolled. Symbols: docs/notation.md.
 """
 
 from __future__ import annotations

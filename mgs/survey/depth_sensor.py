@@ -1,12 +1,9 @@
-"""A depth camera with the noise of the Kinect (structured light, 640x480), and the survey's filter.
+"""A depth camera with the noise of the Kinect, and the survey's filter. Depth images are [H,W]
+z-depth in metres, 0 = no return.
 
-- axial and lateral noise (along and across the camera's axis): Nguyen, Izadi and Lovell, "Modeling
-  Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT 2012;
-- quantisation: Khoshelham and Elberink, "Accuracy and resolution of Kinect depth data", Sensors
-  12(2), 2012;
-- lost returns on grazing surfaces: no published curve; ours rises linearly with the angle.
-
-Depth images are [H,W] z-depth in metres, 0 = no return.
+Sources: Nguyen, Izadi and Lovell, 3DIMPVT 2012 (axial and lateral noise); Khoshelham and Elberink,
+Sensors 12(2), 2012 (quantisation). Lost returns on grazing surfaces have no published curve; ours
+is linear.
 """
 
 from __future__ import annotations

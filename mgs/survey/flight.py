@@ -1,8 +1,6 @@
-"""The survey: a flight along the dataset's orbit with a noisy depth camera and drifting odometry.
-
-Registering the measured depth images gives a consistent trajectory. The first pose is known, all
-others are estimated. Poses are [4,4] camera-to-world, metres.
-"""
+"""The survey: a flight along the dataset's orbit with a noisy depth camera and drifting odometry,
+whose first pose is known and whose others are registered. Poses are [4,4] camera-to-world,
+metres."""
 
 from __future__ import annotations
 

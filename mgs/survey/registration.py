@@ -1,9 +1,5 @@
-"""Registration: relative poses of a flight's cameras from their depth images.
-
-Clouds of two frames are aligned (GICP), loops are closed, and all relative poses are reconciled
-(pose graph). Odometry that drifts gives the first guess. Poses are [4,4] camera-to-world, metres; a
-step is the pose of the next camera in the axes of the one before.
-"""
+"""Relative poses of a flight's cameras from their depth images: GICP, loops, pose graph. Poses are
+[4,4] camera-to-world, metres; a step is the next camera's in the axes of the one before."""
 
 from __future__ import annotations
 

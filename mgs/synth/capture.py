@@ -1,7 +1,5 @@
-"""Images of an on-demand dataset (`mgs synth-orbit --on-demand`), rendered when a run takes them.
-
-The variant must be set before this module is imported (`mgs.runtime.start`).
-"""
+"""Images of an on-demand dataset, rendered when a run takes them. The variant must be set before
+this module is imported (`mgs.runtime.start`)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
-"""The picture of the rock alone, from the same rendering as the whole image.
-
-The variant must be set before this module is imported: an integrator is a class of the variant.
-"""
+"""The picture of the rock alone, from the same rendering as the whole image. The variant must be
+set before this module is imported: an integrator is a class of the variant."""
 
 from __future__ import annotations
 
