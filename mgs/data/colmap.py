@@ -16,7 +16,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.data.agreement import observed
 from mgs.data.dataset import FRAME_INTERVAL
-from mgs.data.lens import Lens
+from mgs.data.lens import Lens, parameter_names
 from mgs.data.shots import Shot, Source, frame_name, natural
 from mgs.data.structure import cloud_of
 from mgs.errors import InputError
@@ -54,20 +54,18 @@ def _is_whole(path: Path) -> bool:
                 place += _bytes_of_sensors(data, place)
             if place > len(data):
                 return False
-    except (struct.error, ValueError, OverflowError, IndexError):
+    except (struct.error, ValueError, OverflowError, LookupError):
         return False
     return True
 
 
 @cache
 def _parameters(model: int) -> int:
-    """Number of parameters of a camera model. Raises ValueError if there is no such model."""
-    from pycolmap import Camera, CameraModelId
+    """Number of parameters of a camera model. Raises KeyError if there is no such model."""
+    from pycolmap import CameraModelId
 
-    models = {int(each): each for each in CameraModelId.__members__.values() if int(each) >= 0}
-    if model not in models:
-        raise ValueError(model)
-    return len(Camera.create_from_model_id(1, models[model], 1.0, 1, 1).params)
+    names = {int(each): name for name, each in CameraModelId.__members__.items() if int(each) >= 0}
+    return len(parameter_names(names[model]))
 
 
 def _bytes_of_sensors(data: bytes, place: int) -> int:
@@ -229,8 +227,6 @@ def _camera(where: str, image: Any) -> tuple[Camera, Lens | None]:
     pose[:3] = world.matrix()
     names = [name.strip() for name in lens.params_info.split(",")]
     values = dict(zip(names, lens.params, strict=True))
-    if lens.model_name in ("SIMPLE_RADIAL", "SIMPLE_RADIAL_FISHEYE"):
-        values["k1"] = values.pop("k")
     intrinsic = ("f", "fx", "fy", "cx", "cy")
     rest = {name: value for name, value in values.items() if name not in intrinsic}
     K = np.eye(3) if "w" in names else lens.calibration_matrix()

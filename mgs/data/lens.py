@@ -40,7 +40,8 @@ class Lens:
         """Lens of a model of COLMAP, K [3,3], and coefficients by COLMAP's names; None for a
         pinhole. Raises InputError, which begins with `where`, for another model, and for a
         coefficient that the model lacks."""
-        values = {name: value for name, value in values.items() if value}
+        one = model in ("SIMPLE_RADIAL", "SIMPLE_RADIAL_FISHEYE")  # whose k is k1 of the others
+        values = {"k1" if one and k == "k" else k: value for k, value in values.items() if value}
         if not np.isfinite([*values.values()]).all():
             raise InputError(f"{where} has a distortion that is not finite; correct it")
         if "PINHOLE" in model or (model in GENERAL and not values and "FISHEYE" not in model):

@@ -279,8 +279,6 @@ def record_camera(
             f"{where} has k4, which the OPENCV model lacks; undistort the images first, or give "
             "camera_model FULL_OPENCV or OPENCV_FISHEYE"
         )
-    if model in ("SIMPLE_RADIAL", "SIMPLE_RADIAL_FISHEYE") and "k" in values:
-        values["k1"] = values.pop("k")
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0, 0, 0, 1]])
     pose, mended = orthonormal(pose)

@@ -129,15 +129,10 @@ def _view(frame: Frame) -> _View:
     """View of a frame, with a mask of at most MOST_PIXELS, since all are kept in memory."""
     camera, smaller = shrunk_to(frame.camera, MOST_PIXELS)
     mask = smaller(frame.mask().astype(np.uint8) * 255, True) >= 128
-    return _View(camera, _signed_distance(mask))
-
-
-def _signed_distance(mask: np.ndarray) -> np.ndarray:
-    """Distance [H,W] of pixel centres from a mask's outline, pixels, positive inside, float32."""
     far = np.full(mask.shape, float(max(mask.shape)))
     inside = far if mask.all() else distance_transform_edt(mask) - 0.5
     outside = distance_transform_edt(~mask) - 0.5 if mask.any() else far
-    return np.where(mask, inside, -outside).astype(np.float32)
+    return _View(camera, np.where(mask, inside, -outside).astype(np.float32))
 
 
 def _bounds(frames: Sequence[Frame]) -> tuple[np.ndarray, float]:

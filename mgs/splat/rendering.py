@@ -111,15 +111,9 @@ class ListCache:
     def _build(
         self, key: bytes, splats: Splats, camera: Camera, older: BlockLists | None = None
     ) -> BlockLists:
-        """New lists, kept if there is room."""
-        lists = blocks.build(splats, camera, older)
+        """New lists, held. Then those used longest ago are dropped, or the new ones (the class)."""
+        lists = self._lists[key] = blocks.build(splats, camera, older)
         self.builds += 1
-        self._keep(key, lists)
-        return lists
-
-    def _keep(self, key: bytes, lists: BlockLists) -> None:
-        """Hold new lists, then drop those used longest ago or the new ones (see the class)."""
-        self._lists[key] = lists
         clock, uses = self._clock, self._used
         while len(self._lists) > 1 and self.nbytes > self.budget:
             # The oldest leaves if the new one was used less than half as long ago.
@@ -131,6 +125,7 @@ class ListCache:
                 break
         if len(uses) > REMEMBERED:
             self._used = {other: uses[other] for other in self._lists if other in uses}
+        return lists
 
 
 def as_colour(background: Any) -> Any:
