@@ -27,17 +27,13 @@ UNIT = 20  # binary digits of normals. The grids hide the last bits, in which ma
 
 @dataclass(frozen=True)
 class Start:
-    """Start of the Gaussians, which sender and receiver both compute from a prior.
+    """Start of the Gaussians, which sender and receiver both compute from a prior."""
 
-    means: [N,3] metres, upright world. quats: [N,4] wxyz of any norm. layer: [N] 1 behind the
-    surface, else 0. digest: hash of the samples. inset: depth below the mesh, metres.
-    """
-
-    means: np.ndarray
-    quats: np.ndarray
-    layer: np.ndarray
-    digest: bytes
-    inset: float
+    means: np.ndarray  # [N,3] metres, upright world
+    quats: np.ndarray  # [N,4] wxyz of any norm
+    layer: np.ndarray  # [N] 1 behind the surface, else 0
+    digest: bytes  # hash of the samples
+    inset: float  # depth below the mesh, metres
 
 
 def start_of(prior: Prior, inset: float) -> Start:

@@ -60,16 +60,11 @@ Error = Callable[[Convention, float], float]  # error(convention, zoom) of such 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well poses and pictures fit.
+    """How well poses and pictures fit."""
 
-    error: median of a pair of neighbours, and the quantile SOUND of the pairs, pixels; None where
-    only the directions of the cameras could be compared. evidence: what was compared. problem: what
-    is wrong with the poses, empty if they fit.
-    """
-
-    error: float | None
-    evidence: str
-    problem: str = ""
+    error: float | None  # quantile SOUND over pairs of neighbours, pixels; None: of directions
+    evidence: str  # what was compared
+    problem: str = ""  # what is wrong with the poses; empty if they fit
 
 
 def agreement(frames: Sequence[Frame], matcher: Matcher, masked: bool = True) -> Agreement | None:

@@ -20,17 +20,12 @@ MAX_SEEN_THROUGH = 0.05  # largest share of points seen through, median over nei
 
 @dataclass(frozen=True)
 class Check:
-    """Result of `check_dataset`.
+    """Result of `check_dataset`."""
 
-    problems: one line each, with the frame or file and the cure. mask_share: mean share of rock
-    pixels. depth_range: least and largest depth of the rock, metres; zeros without depth.
-    seen_through: median of `seen_through` over neighbouring frames; NaN without depth.
-    """
-
-    problems: list[str]
-    mask_share: float
-    depth_range: tuple[float, float]
-    seen_through: float
+    problems: list[str]  # one line each, with the frame or file and the cure
+    mask_share: float  # mean share of rock pixels
+    depth_range: tuple[float, float]  # of the rock, metres; zeros without depth
+    seen_through: float  # median of `seen_through` over neighbours; NaN without depth
 
 
 def taken_frames(dataset: Dataset) -> list[Frame]:

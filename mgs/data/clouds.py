@@ -21,17 +21,12 @@ NEAREST_SHARE = 0.25  # share of cameras with a point in view taken to have seen
 
 @dataclass(frozen=True)
 class SparseCloud:
-    """Triangulated points in the world.
+    """Triangulated points in the world. None: unknown."""
 
-    points: [N,3]. views: [N,3] unit, mean direction to the cameras that saw each point, or its
-    normal. track: [N] number of images that saw it. error: [N] mean reprojection error, pixels.
-    None: unknown.
-    """
-
-    points: np.ndarray
-    views: np.ndarray | None = None
-    track: np.ndarray | None = None
-    error: np.ndarray | None = None
+    points: np.ndarray  # [N,3]
+    views: np.ndarray | None = None  # [N,3] unit, mean direction to its cameras, or normal
+    track: np.ndarray | None = None  # [N] number of images that saw it
+    error: np.ndarray | None = None  # [N] mean reprojection error, pixels
 
     def upright(self, world: World) -> SparseCloud:
         """The same cloud, of the files of a dataset, in its upright world (`World.enter`)."""

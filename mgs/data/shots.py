@@ -30,50 +30,37 @@ HELD = {  # EXIF orientation -> axes of the camera of the turned picture, in tho
 
 @dataclass(frozen=True)
 class Shot:
-    """One frame to import, with its camera before undistortion, and its files.
-
-    lens: None for a pinhole. timestamp: seconds. depth_unit: metres per step of a depth image of
-    whole numbers; float_unit: of one of floating-point numbers. turned: its files are turned by
-    their EXIF orientation.
-    """
+    """One frame to import, with its camera before undistortion, and its files."""
 
     name: str
     camera: Camera
-    lens: Lens | None
-    timestamp: float
+    lens: Lens | None  # None for a pinhole
+    timestamp: float  # seconds
     image: Path
     depth: Path | None = None
-    depth_unit: float = 1.0
+    depth_unit: float = 1.0  # metres per step of a depth image of whole numbers
     mask: Path | None = None
     rock: Path | None = None
-    float_unit: float = 1.0
-    turned: bool = False
+    float_unit: float = 1.0  # metres in one of floating-point numbers
+    turned: bool = False  # its files are turned by their EXIF orientation
 
 
 @dataclass(frozen=True)
 class Source:
-    """Data to import.
-
-    left_out: number of listed images that are not imported, by reason. notes: lines for the user.
-    sparse: triangulated points. up, unit ("m" or "unit"): None if the source does not say.
-    no_cloud: file of points that the source names and that does not exist. tests: names of the
-    shots that the source sets apart. origin: what was subtracted from all positions. fit: how well
-    poses and points fit. place: latitude, longitude and altitude of the world's 0, where +Y is
-    north; empty if unknown.
-    """
+    """Data to import."""
 
     kind: str
     shots: list[Shot]
-    left_out: Counter[str] = field(default_factory=Counter)
-    notes: tuple[str, ...] = ()
-    sparse: SparseCloud | None = None
-    up: Vector | None = None
-    unit: str | None = None
-    no_cloud: Path | None = None
-    tests: frozenset[str] = frozenset()
-    fit: Agreement | None = None
-    origin: Vector = (0.0, 0.0, 0.0)
-    place: str = ""
+    left_out: Counter[str] = field(default_factory=Counter)  # listed images not imported, by reason
+    notes: tuple[str, ...] = ()  # lines for the user
+    sparse: SparseCloud | None = None  # triangulated points
+    up: Vector | None = None  # None: the source does not say
+    unit: str | None = None  # "m" or "unit", None as for up
+    no_cloud: Path | None = None  # file of points that is named and does not exist
+    tests: frozenset[str] = frozenset()  # names of the shots that the source sets apart
+    fit: Agreement | None = None  # of poses and points
+    origin: Vector = (0.0, 0.0, 0.0)  # what was subtracted from all positions
+    place: str = ""  # latitude, longitude and altitude of 0, if known; +Y is north
 
     def in_metres(self, unit: float) -> Source:
         """Scale cameras and points by `unit` metres. Raises InputError unless it is positive."""

@@ -36,19 +36,13 @@ SPLITS = 6  # times that `split` is called, in the first half of the passes
 
 @dataclass(frozen=True)
 class Slopes:
-    """Means over the steps since the last call of a control.
+    """Means over the steps since the last call of a control."""
 
-    gradient: norm of the derivative of an image's mean loss by a Gaussian's centre in the image, in
-        units of half its width and height, mean over the images that show the Gaussian [N].
-    before, step: number of steps made until the last call and until now.
-    extent: size of the scene, metres (`extent_of`). most: largest number of Gaussians.
-    """
-
-    gradient: np.ndarray
-    before: int
-    step: int
-    extent: float
-    most: int
+    gradient: np.ndarray  # [N] |d loss / d centre|, per half image side, mean over its images
+    before: int  # steps made until the last call
+    step: int  # and until now
+    extent: float  # of the scene, metres (`extent_of`)
+    most: int  # largest number of Gaussians
 
 
 @dataclass(frozen=True)

@@ -56,14 +56,10 @@ class Images:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Gain of SH degree 1 over degree 0 in the squared error of views left out, dB.
+    """Gain of SH degree 1 over degree 0 in the squared error of views left out, dB."""
 
-    gain: mean over the views. error: its standard error; views of one block, which share their
-    fits, count as independent.
-    """
-
-    gain: float
-    error: float
+    gain: float  # mean over the views
+    error: float  # standard error; views of a block, which share fits, count apart
 
     @property
     def pays(self) -> bool:
@@ -73,18 +69,13 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class LeanModel:
-    """A model in which each Gaussian learned only what pays.
-
-    whole: the model of the first fit, which learned everything. learned: {kind: [N]} whether each
-    Gaussian learned it. parameters: number of learned parameters. left_out: None if the degree was
-    not chosen.
-    """
+    """A model in which each Gaussian learned only what pays."""
 
     gaussians: Gaussians
-    whole: Gaussians
-    learned: dict[str, Mask]
-    parameters: int
-    left_out: LeftOut | None
+    whole: Gaussians  # of the first fit, which learned everything
+    learned: dict[str, Mask]  # {kind: [N]} whether each Gaussian learned it
+    parameters: int  # number that is learned
+    left_out: LeftOut | None  # None if the degree was not chosen
 
 
 def kinds(sh_degree: int, means: str = "frozen") -> dict[str, slice]:
@@ -104,16 +95,12 @@ def regularisation(settings: ModelSettings, sh_degree: int) -> NDArray[np.float6
 
 @dataclass(frozen=True)
 class Worth:
-    """Worth of each kind of each Gaussian's parameters.
+    """Worth of each kind of each Gaussian's parameters."""
 
-    gain: {kind: [N]} gain of log evidence, nats. rise: {kind: [N]} rise of Phi without it, (pixel
-    value)^2. phi: Phi itself. unseen: [N] Gaussians that no image shows.
-    """
-
-    gain: dict[str, NDArray[np.float64]]
-    rise: dict[str, NDArray[np.float64]]
-    phi: float
-    unseen: Mask
+    gain: dict[str, NDArray[np.float64]]  # {kind: [N]} of log evidence, nats
+    rise: dict[str, NDArray[np.float64]]  # {kind: [N]} of Phi without it, (pixel value)^2
+    phi: float  # Phi itself
+    unseen: Mask  # [N] Gaussians that no image shows
 
 
 def worth(
@@ -198,7 +185,7 @@ def directional_gain(
     say: Callable[[str], None] = lambda stage: None,
 ) -> LeftOut:
     """Gain of colours of degree 1 over degree 0 on views left out: fits of both degrees without
-    each of BLOCKS blocks of neighbours in `images.order`."""
+    each of BLOCKS blocks of neighbours in `images.order` (Roberts et al. 2017)."""
     decibels = []
     for done, block in enumerate(np.array_split(np.asarray(images.order), BLOCKS)):
         say(f"fitting without some views, {done + 1} of {BLOCKS}")

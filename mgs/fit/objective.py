@@ -33,16 +33,11 @@ Vector = list[Any]  # of each array of `mgs.gaussians.learned`, a TensorXf of it
 
 @dataclass
 class Target:
-    """Target of a fit as the kernels take it.
+    """Target of a fit as the kernels take it."""
 
-    values: mi.Float [H*W*S], with S = 3 to 5 channels as in `mgs.fit.fitting.fit_gaussians`.
-    alpha_factor: factor of the differences in alpha, mi.Float [1]; None: alpha is not compared.
-    stored: S.
-    """
-
-    values: Any
-    alpha_factor: Any
-    stored: int
+    values: Any  # mi.Float [H*W*S], channels as in `mgs.fit.fitting.fit_gaussians`
+    alpha_factor: Any  # of the differences in alpha, mi.Float [1]; None: not compared
+    stored: int  # S, 3 to 5
 
     @property
     def channels(self) -> int:
@@ -137,15 +132,11 @@ class View:
 
 @dataclass
 class ParameterPrior:
-    """Normal distribution of the learned parameters around their start.
-
-    lam: of each learned array, a Float of one number or one per parameter.
-    share: 1 / number of images, Float: the part of the prior that belongs to one image.
-    """
+    """Normal distribution of the learned parameters around their start."""
 
     start: Gaussians
-    lam: dict[str, Any]
-    share: Any
+    lam: dict[str, Any]  # of each learned array, a Float of one number or one per parameter
+    share: Any  # 1 / number of images, Float: the part that belongs to one image
 
     @property
     def means(self) -> str:
@@ -336,19 +327,10 @@ def with_gradients(model: Gaussians, prior: ParameterPrior) -> Gaussians:
     return replace(model, **values)
 
 
-def _sizes(model: Gaussians, prior: ParameterPrior, view: View) -> tuple[Any, ...]:
-    return prior.means, *model.recorded, *view.recorded_sizes
-
-
-@frozen(_sizes)
+@frozen(lambda model, prior, view: (prior.means, *model.recorded, *view.recorded_sizes))
 def _image_gradient(model: Gaussians, prior: ParameterPrior, view: View) -> Vector:
     """Derivative of half the summed squared error of one image."""
     copy = with_gradients(model, prior)
     error = (view.rendered(copy).array - view.target.pixels) * view.target.weights
     dr.backward(0.5 * dr.sum(dr.square(error)))
-    return _gradients(copy, prior)
-
-
-def _gradients(copy: Gaussians, prior: ParameterPrior) -> Vector:
-    """Gradients of a copy made by `with_gradients`, by learned parameter."""
     return [dr.grad(getattr(copy, name)) for name in prior.lam]

@@ -46,17 +46,12 @@ def removal_cost(
 
 @dataclass(frozen=True)
 class Pruned:
-    """Result of `prune`.
+    """Result of `prune`."""
 
-    kept: indices of the remaining Gaussians [M].
-    noise: allowed rms change of pixel values, linear RGB.
-    predicted, actual: rms change, as predicted by `removal_cost` and as measured.
-    """
-
-    kept: np.ndarray
-    noise: float
-    predicted: float
-    actual: float
+    kept: np.ndarray  # indices of the remaining Gaussians [M]
+    noise: float  # allowed rms change of pixel values, linear RGB
+    predicted: float  # rms change, by `removal_cost`
+    actual: float  # as measured
 
 
 def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float) -> Pruned:

@@ -23,12 +23,11 @@ MOST_GAUSSIANS = 200_000  # most that cameras decide: close-ups ask for millions
 
 @dataclass(frozen=True)
 class Resolution:
-    """pixel: of the closest camera, on the surface, metres, rms over the area. spacing: of the
-    samples, metres. area: square metres."""
+    """What the closest camera resolves."""
 
-    pixel: float
-    spacing: float
-    area: float
+    pixel: float  # on the surface, metres, rms over the area
+    spacing: float  # of the samples, metres
+    area: float  # square metres
 
     @property
     def samples(self) -> int:

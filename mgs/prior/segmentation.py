@@ -36,16 +36,12 @@ FLOOR_UPRIGHT = 0.9  # least cosine between their normals and the ground's
 
 @dataclass(frozen=True)
 class Plane:
-    """The ground plane normal . x = offset, metres.
+    """The ground plane normal . x = offset, metres."""
 
-    normal: [3] unit, on the side of the cameras. sigma: robust standard deviation of the inliers'
-    distances, metres. tolerance: points below this height are ground, metres.
-    """
-
-    normal: np.ndarray
+    normal: np.ndarray  # [3] unit, on the side of the cameras
     offset: float
-    sigma: float
-    tolerance: float
+    sigma: float  # robust standard deviation of the inliers' distances, metres
+    tolerance: float  # points below this height are ground, metres
 
     @classmethod
     def from_estimate(cls, points: np.ndarray) -> Plane:
@@ -188,19 +184,14 @@ def estimate_normals(points: np.ndarray, views: np.ndarray, roughness: float = 0
 
 @dataclass(frozen=True)
 class SegmentedCloud:
-    """A cloud of P points, divided into ground, rock and the rest.
-
-    plane: None if there is none or it was not needed. ground: [P] bool, points on the plane.
-    rock_points, rock_normals: [M,3] points, metres, and unit normals of which the mesh is built:
-    without the ground at the rock's foot. eps (metres), clusters: DBSCAN's.
-    """
+    """A cloud of P points, divided into ground, rock and the rest."""
 
     cloud: Cloud
-    plane: Plane | None
-    ground: np.ndarray
-    rock_points: np.ndarray
-    rock_normals: np.ndarray
-    eps: float
+    plane: Plane | None  # None if there is none or it was not needed
+    ground: np.ndarray  # [P] bool, points on the plane
+    rock_points: np.ndarray  # [M,3] of which the mesh is built, without the ground at its foot
+    rock_normals: np.ndarray  # [M,3] unit
+    eps: float  # of DBSCAN, metres
     clusters: int
 
 

@@ -29,13 +29,12 @@ SAMPLE_BYTES = 3400  # memory per sample, bytes, mostly for pairs of candidates 
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface and its origin. mesh: closed, world. cell: resolution, units of the world.
-    numbers: items of prior.json. segmented: the cloud, if any."""
+    """A surface and its origin."""
 
-    mesh: Mesh
-    cell: float
-    numbers: dict[str, Any]
-    segmented: SegmentedCloud | None = None
+    mesh: Mesh  # closed, world
+    cell: float  # resolution, units of the world
+    numbers: dict[str, Any]  # items of prior.json
+    segmented: SegmentedCloud | None = None  # the cloud, if any
 
 
 def poisson_mesh(

@@ -44,10 +44,7 @@ PAIR_BYTES = 128  # peak memory per pair, bytes
 
 @dataclass
 class Footprints:
-    """Ellipses for which lists were built, Float [N] each. Fields as in `Splats`.
-
-    level: xi^2 + eta^2 at the rim, plus SLACK; not positive for splats that are in no list.
-    """
+    """Ellipses for which lists were built, Float [N] each. Fields as in `Splats`."""
 
     mean_x: Any
     mean_y: Any
@@ -55,43 +52,30 @@ class Footprints:
     shear: Any
     white_x: Any
     white_y: Any
-    level: Any
+    level: Any  # xi^2 + eta^2 at the rim, plus SLACK; not positive: in no list
 
 
 @dataclass
 class BlockLists:
     """Lists of all blocks: M (splat, block) pairs, sorted by block, tile by tile, then by depth.
+    Splats have places by the tile of their centre, then block, then depth. Pairs have slots, front
+    to back, so that those of one splat are consecutive and kernels can add up its sums."""
 
-    Each splat has a place, its position in memory: by the tile of its centre, then block, then
-    depth. Each pair has a slot: slots go front to back, so those of one splat are consecutive, and
-    kernels can add up the sums of a splat's pairs.
-
-    order: Gaussians front to back, UInt32 [N]. place: place of each Gaussian's splat, UInt32 [N].
-    splat: place of each pair's splat, UInt32 [M]. pair: pair at each slot, UInt32 [M]. Both are
-        padded (`_room`).
-    slot_start, slot_end: range of slots of the splat at each place, UInt32 [N].
-    block: block of each lane, counted row by row, UInt32 [L]. Lanes go tile by tile, in a tile the
-        longest list first.
-    start, end: range of each lane's pairs, UInt32 [L].
-    left, top, right, bottom: the image on its film, pixels; blocks_x: blocks per row; UInt32 [1].
-    footprints: for which the lists were built.
-    """
-
-    order: Any
-    place: Any
-    splat: Any
-    pair: Any
-    slot_start: Any
+    order: Any  # Gaussians front to back, UInt32 [N]
+    place: Any  # place of each Gaussian's splat, UInt32 [N]
+    splat: Any  # place of each pair's splat, UInt32 [M], padded (`_room`)
+    pair: Any  # pair at each slot, UInt32 [M], padded
+    slot_start: Any  # range of slots of the splat at each place, UInt32 [N]
     slot_end: Any
-    block: Any
-    start: Any
+    block: Any  # of each lane, counted row by row, UInt32 [L]; in a tile the longest list first
+    start: Any  # range of each lane's pairs, UInt32 [L]
     end: Any
-    left: Any
+    left: Any  # the image on its film, pixels, UInt32 [1]
     top: Any
     right: Any
     bottom: Any
-    blocks_x: Any
-    footprints: Footprints
+    blocks_x: Any  # blocks per row, UInt32 [1]
+    footprints: Footprints  # for which the lists were built
 
     @cached_property
     def nbytes(self) -> int:
@@ -160,23 +144,10 @@ def build(splats: Splats, camera: Camera, older: BlockLists | None = None) -> Bl
     splat, pair, start, end = _by_block(owner, number, _tile_numbers(blocks_x, blocks_y))
     start, end = dr.gather(mi.UInt32, start, numbers), dr.gather(mi.UInt32, end, numbers)
     lane = _lanes_by_tile(end - start, numbers, _tile_numbers(blocks_x, blocks_y))
-    lists = BlockLists(
-        order=order,
-        place=place,
-        splat=splat,
-        pair=pair,
-        slot_start=slot_start,
-        slot_end=slot_end,
-        block=lane,
-        start=dr.gather(mi.UInt32, start, lane),
-        end=dr.gather(mi.UInt32, end, lane),
-        left=dr.opaque(mi.UInt32, left),
-        top=dr.opaque(mi.UInt32, top),
-        right=dr.opaque(mi.UInt32, right),
-        bottom=dr.opaque(mi.UInt32, bottom),
-        blocks_x=dr.opaque(mi.UInt32, blocks_x),
-        footprints=foot,
-    )
+    ranges = (dr.gather(mi.UInt32, part, lane) for part in (start, end))
+    edges = (dr.opaque(mi.UInt32, side) for side in (left, top, right, bottom, blocks_x))
+    slots = splat, pair, slot_start, slot_end
+    lists = BlockLists(*(order, place, *slots, lane, *ranges, *edges, foot))
     dr.eval(lists)
     return lists
 

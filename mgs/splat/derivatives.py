@@ -39,44 +39,31 @@ Polynomial = Mapping[Powers, Any]
 
 @dataclass
 class Geometry:
-    """Derivatives by all parameters of a Gaussian but its mean; Dr.Jit arrays [N].
+    """Derivatives by all parameters of a Gaussian but its mean; Dr.Jit arrays [N]."""
 
-    shape: derivative of ln alpha by each of 3 log-scales and 4 quaternion entries, polynomials in
-        1, xi^2, xi eta and eta^2.
-    logit: derivative of ln alpha by the opacity logit, 1 - opacity.
-    basis: values of the K spherical harmonics.
-    positive: for r, g, b: 1, or 0 where the colour is clamped at 0.
-    """
-
-    shape: Sequence[Polynomial]
-    logit: Any
-    basis: list[Any]
-    positive: list[Any]
+    shape: Sequence[
+        Polynomial
+    ]  # of ln alpha by 3 log-scales, 4 quaternion entries, even in xi, eta
+    logit: Any  # of ln alpha by the opacity logit, 1 - opacity
+    basis: list[Any]  # values of the K spherical harmonics
+    positive: list[Any]  # for r, g, b: 1, or 0 where the colour is clamped at 0
 
 
 @dataclass
 class ByMean:
-    """Derivatives by one coordinate of the mean, per metre.
+    """Derivatives by one coordinate of the mean, per metre."""
 
-    log_alpha: of ln alpha, a polynomial.
-    colour: of r, g, b of the splat; empty for SH degree 0.
-    """
-
-    log_alpha: Polynomial
-    colour: list[Any]
+    log_alpha: Polynomial  # of ln alpha
+    colour: list[Any]  # of r, g, b of the splat; empty for SH degree 0
 
 
 @dataclass
 class Moments:
-    """Sums over pixels, Dr.Jit Float64 [N].
+    """Sums over pixels, Dr.Jit Float64 [N]."""
 
-    w2: for r, g, b, of w^2, the same unless pixels are weighted. squared: moments with |s|^2.
-    mixed: for r, g, b, moments with w s_c; empty if not needed.
-    """
-
-    w2: list[Any]
-    squared: Polynomial
-    mixed: list[Polynomial]
+    w2: list[Any]  # for r, g, b, of w^2, the same unless pixels are weighted
+    squared: Polynomial  # moments with |s|^2
+    mixed: list[Polynomial]  # for r, g, b, moments with w s_c; empty if not needed
 
 
 def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:

@@ -27,32 +27,21 @@ LOG2E = 1.4426950408889634
 
 @dataclass
 class Splats:
-    """N projected Gaussians, Dr.Jit arrays [N]: Float from `project`, Float64 from `project64`.
+    """N projected Gaussians, Dr.Jit arrays [N]: Float from `project`, Float64 from `project64`."""
 
-    mean_x, mean_y: centre, pixels from the corner of the film (`Camera.film`).
-    shear (no unit), white_x, white_y (1/px): the whitening, see the module.
-    log2_opacity: base-2 logarithm of the opacity, times its compensation if antialiased.
-    depth: z-depth of the centre, metres.
-    red, green, blue: colour seen from the camera, linear RGB, at least 0.
-    visible: mask of centres in front of the near plane. The fields above mean nothing elsewhere.
-    finite: mask of Gaussians without NaN, infinity or colour coefficient beyond SH_MAX.
-    mean_x_rest, mean_y_rest (px), shear_rest: rounding errors of mean_x, mean_y and shear, up to
-        3e-5 px in a 640x480 image. Not differentiated.
-    """
-
-    mean_x: Any
+    mean_x: Any  # centre, pixels from the corner of the film (`Camera.film`)
     mean_y: Any
-    shear: Any
-    white_x: Any
+    shear: Any  # the whitening (see the module): shear has no unit
+    white_x: Any  # 1/px
     white_y: Any
-    log2_opacity: Any
-    depth: Any
-    red: Any
+    log2_opacity: Any  # times its compensation if antialiased
+    depth: Any  # z-depth of the centre, metres
+    red: Any  # colour seen from the camera, linear RGB, at least 0
     green: Any
     blue: Any
-    visible: Any = None
-    finite: Any = None
-    mean_x_rest: Any = None
+    visible: Any = None  # mask of centres before the near plane; elsewhere fields mean nothing
+    finite: Any = None  # mask without NaN, infinity or colour coefficient beyond SH_MAX
+    mean_x_rest: Any = None  # rounding errors, up to 3e-5 px in 640x480; not differentiated
     mean_y_rest: Any = None
     shear_rest: Any = None
 

@@ -27,21 +27,15 @@ from mgs.splat.constants import (
 
 @dataclass
 class Projected:
-    """Projected Gaussians.
+    """Projected Gaussians."""
 
-    means2d: [N,2] px, on the film (`Camera.film`). cov2d: [N,2,2] px^2, EPS2D included. depths: [N]
-    m, 1 where not visible.
-    opacities: [N], of it compensations [N] the factor of antialiased Gaussians, else 1. colours:
-    [N,3] linear RGB. visible: [N] bool, in front of the near plane.
-    """
-
-    means2d: np.ndarray
-    cov2d: np.ndarray
-    depths: np.ndarray
-    opacities: np.ndarray
-    compensations: np.ndarray
-    colours: np.ndarray
-    visible: np.ndarray
+    means2d: np.ndarray  # [N,2] px, on the film (`Camera.film`)
+    cov2d: np.ndarray  # [N,2,2] px^2, EPS2D included
+    depths: np.ndarray  # [N] m, 1 where not visible
+    opacities: np.ndarray  # [N], times the compensations
+    compensations: np.ndarray  # [N] factor of antialiased Gaussians, else 1
+    colours: np.ndarray  # [N,3] linear RGB
+    visible: np.ndarray  # [N] bool, in front of the near plane
 
 
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:

@@ -98,17 +98,15 @@ def lane_size() -> tuple[int, int]:
 
 @dataclass
 class Lane:
-    """Work of each lane. columns, rows: `lane_size`. left, top: centre of its first pixel, px,
-    Float [L]. start, end: range of its pairs in `BlockLists.splat`, UInt32 [L]. first: place of its
-    first pixel in the output of kernels, UInt32 [L]."""
+    """Work of each lane."""
 
-    columns: int
+    columns: int  # `lane_size`
     rows: int
-    left: Any
+    left: Any  # centre of its first pixel, px, Float [L]
     top: Any
-    start: Any
+    start: Any  # range of its pairs in `BlockLists.splat`, UInt32 [L]
     end: Any
-    first: Any
+    first: Any  # place of its first pixel in the output of kernels, UInt32 [L]
 
 
 def lanes(lists: BlockLists) -> tuple[Lane, list[Any]]:
@@ -144,12 +142,11 @@ def lanes(lists: BlockLists) -> tuple[Lane, list[Any]]:
 
 @dataclass
 class PixelRow:
-    """One row of a lane's pixels under one splat: eta of the row; xi and raw alpha, before
-    thresholds, of each pixel."""
+    """One row of a lane's pixels under one splat."""
 
     eta: Any
-    xi: list[Any]
-    raw_alpha: list[Any]
+    xi: list[Any]  # of each pixel
+    raw_alpha: list[Any]  # of each pixel, before thresholds
 
 
 # Polynomial for 2^x on [-1/2, 1/2], x^0 first: relative error 3e-9, exact at x = 0 (Remez).

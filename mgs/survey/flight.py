@@ -60,20 +60,15 @@ class SurveySettings:
 
 @dataclass(frozen=True)
 class Survey:
-    """Result of a flight of F frames.
+    """Result of a flight of F frames."""
 
-    truth: [F,4,4] poses as flown; odometry, registered, optimised: [F,4,4] estimates (STAGES).
-    depths: F measured depth images [H,W], metres, 0 = no return. edges: the F - 1 registrations of
-    consecutive frames; loops: accepted loop closures.
-    """
-
-    truth: np.ndarray
-    odometry: np.ndarray
+    truth: np.ndarray  # [F,4,4] poses as flown
+    odometry: np.ndarray  # [F,4,4] estimates (STAGES)
     registered: np.ndarray
     optimised: np.ndarray
-    depths: list[np.ndarray]
-    edges: list[Edge]
-    loops: list[Edge]
+    depths: list[np.ndarray]  # F measured depth images [H,W], metres, 0 = no return
+    edges: list[Edge]  # the F - 1 registrations of consecutive frames
+    loops: list[Edge]  # accepted loop closures
 
 
 def fly(

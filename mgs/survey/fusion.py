@@ -24,20 +24,14 @@ FILTERED_SHARE = 0.5  # noise after the bilateral filter, over before; measured 
 
 @dataclass(frozen=True)
 class Cloud:
-    """A fused cloud of N points.
+    """A fused cloud of N points."""
 
-    points: [N,3] world, metres. views: [N,3] unit, mean direction to the cameras that saw each
-    point. voxel: cell of the grid, metres, about the distance between neighbours. noise: standard
-    deviation of the measured depths before filtering, metres. pixels: number of fused depths.
-    sparse: distance between neighbours where only far cameras look, metres.
-    """
-
-    points: np.ndarray
-    views: np.ndarray
-    voxel: float
-    noise: float
-    pixels: int
-    sparse: float = 0.0
+    points: np.ndarray  # [N,3] world, metres
+    views: np.ndarray  # [N,3] unit, mean direction to the cameras that saw each point
+    voxel: float  # cell of the grid, metres, about the distance between neighbours
+    noise: float  # standard deviation of the depths before filtering, metres
+    pixels: int  # number of fused depths
+    sparse: float = 0.0  # distance between neighbours that only far cameras see, metres
 
 
 @dataclass(frozen=True)

@@ -38,18 +38,13 @@ TRUST = 5.0  # largest accepted difference from odometry, in its standard deviat
 
 @dataclass(frozen=True)
 class Edge:
-    """A measured relative pose, an edge of the pose graph.
+    """A measured relative pose, an edge of the pose graph."""
 
-    i, j: frame numbers; relative: [4,4] pose of camera j in the axes of camera i, metres; overlap:
-    share of the points of frame j that match frame i; registered: False if `relative` is
-    odometry's.
-    """
-
-    i: int
+    i: int  # frame numbers
     j: int
-    relative: np.ndarray
-    overlap: float
-    registered: bool = True
+    relative: np.ndarray  # [4,4] pose of camera j in the axes of camera i, metres
+    overlap: float  # share of the points of frame j that match frame i
+    registered: bool = True  # False if `relative` is odometry's
 
 
 def registration_cloud(frame: Frame, depth: np.ndarray, grid: float) -> tuple[Any, Any]:

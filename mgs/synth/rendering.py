@@ -221,17 +221,13 @@ def _with_noise(out: Path, frames: list[Frame], noise: PoseNoise, seed: int) -> 
 
 @dataclass(frozen=True)
 class Photographer:
-    """Renders frames of one scene.
-
-    exposure: factor on radiance; spp: samples per pixel; seed: root seed of the rendering; denoise:
-    as `MitsubaScene.render`.
-    """
+    """Renders frames of one scene."""
 
     scene: MitsubaScene
-    exposure: float
-    spp: int
-    seed: int
-    denoise: bool
+    exposure: float  # factor on radiance
+    spp: int  # samples per pixel
+    seed: int  # root seed of the rendering
+    denoise: bool  # as `MitsubaScene.render`
 
     def take(self, frame: Frame) -> None:
         """Render a frame and write its files, which depend on its name and camera alone."""

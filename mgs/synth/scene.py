@@ -33,17 +33,13 @@ _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])  # x to the left, y up, z
 
 @dataclass(frozen=True)
 class Rendered:
-    """One frame, linear radiance before exposure.
+    """One frame, linear radiance before exposure. Depth and mask are taken along the rays through
+    the pixel centres."""
 
-    rgb: [H,W,3], mean over the pixel. rock: [H,W,4], the rock alone, premultiplied by alpha, and
-    alpha, its share of the pixel. depth: [H,W] z-depth, metres, 0 = sky. mask: bool [H,W]. Depth
-    and mask are taken along the rays through the pixel centres.
-    """
-
-    rgb: np.ndarray
-    rock: np.ndarray
-    depth: np.ndarray
-    mask: np.ndarray
+    rgb: np.ndarray  # [H,W,3], mean over the pixel
+    rock: np.ndarray  # [H,W,4], the rock alone, premultiplied by alpha, its share of the pixel
+    depth: np.ndarray  # [H,W] z-depth, metres, 0 = sky
+    mask: np.ndarray  # bool [H,W]
 
 
 Layers = tuple[np.ndarray, np.ndarray, np.ndarray]  # result of `mgs.synth.rock_layer.render_layers`
@@ -51,16 +47,12 @@ Layers = tuple[np.ndarray, np.ndarray, np.ndarray]  # result of `mgs.synth.rock_
 
 @dataclass(frozen=True)
 class Traced:
-    """One frame before it is denoised.
+    """One frame before it is denoised."""
 
-    light: RGB; guides: RGB (unused), albedo and normal, None if nothing is to be denoised. alpha:
-    float32 [H,W], share of the pixel that the rock covers. depth, mask: as in `Rendered`.
-    """
-
-    light: Layers
-    guides: Layers | None
-    alpha: np.ndarray
-    depth: np.ndarray
+    light: Layers  # RGB
+    guides: Layers | None  # RGB (unused), albedo, normal; None if nothing is to be denoised
+    alpha: np.ndarray  # float32 [H,W], share of the pixel that the rock covers
+    depth: np.ndarray  # as in `Rendered`
     mask: np.ndarray
 
     def developed(self) -> Rendered:
