@@ -68,5 +68,5 @@ class PriorSettings:
             )
         if not 0 <= self.backing <= 1:
             raise InputError(
-                f"prior: `backing` {self.backing} is Gaussians per sample, 0 to 1; correct it"
+                f"prior: {self.backing} Gaussians per sample are not 0 to 1; correct `backing`"
             )
