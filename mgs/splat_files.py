@@ -240,8 +240,7 @@ def _read_spz(path: Path) -> Gaussians:
 def _write_spz(path: Path, gaussians: Gaussians) -> None:
     """Write an SPZ of version 3, y up. Positions take as many fractional bits as their size allows.
     Values outside the format's range are clipped: log-scales to -10 to 5.9, coefficients of degree
-    0 to +-3.3, and the others to +-1. Raises InputError if the steps of the positions would be
-    coarser than the Gaussians."""
+    0 to +-3.3, and the others to +-1."""
     codec = _spz_codec(path)
     g = mirrored(gaussians, _axes(RUB))
     largest = max(float(np.abs(g.means).max()), 1e-6)

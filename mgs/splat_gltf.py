@@ -137,8 +137,7 @@ def _y_up_from_model(gltf: Gltf) -> np.ndarray:
 
 
 def _joined(path: Path, parts: list[Gaussians]) -> Gaussians:
-    """One model of several parts, with their highest SH degree. Raises InputError if they differ in
-    a mark."""
+    """One model of several parts, with their highest SH degree."""
     first, degree = parts[0], max(part.sh_degree for part in parts)
     if len(parts) == 1:
         return first
@@ -152,7 +151,6 @@ def _joined(path: Path, parts: list[Gaussians]) -> Gaussians:
 
 
 def _gaussians(gltf: Gltf, primitive: dict[str, Any]) -> Gaussians:
-    """Gaussians of a primitive, in its own coordinates."""
     extension, index = primitive["extensions"][EXTENSION], primitive["attributes"]
     if extension.get("extensions"):
         kind = next(iter(extension["extensions"]))

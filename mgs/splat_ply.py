@@ -112,7 +112,6 @@ def parse_ply(path: str | Path) -> Gaussians:
 
 
 def _parse_any_comment(path: Path) -> PlyData:
-    """PlyData.read that also accepts comments that are not ASCII."""
     try:
         return PlyData.read(str(path))
     except UnicodeDecodeError:
@@ -126,7 +125,6 @@ def _parse_any_comment(path: Path) -> PlyData:
 def _from_columns(
     path: Path, columns: Mapping[str, np.ndarray], n: int, antialiased: bool, linear: bool
 ) -> Gaussians:
-    """Gaussians from properties of the 3DGS layout, [n] each. Raises InputError."""
     rest = sum(re.fullmatch("f_rest_[0-9]+", name) is not None for name in columns)
     coefficients = 1 + rest // 3
     if rest % 3 or coefficients not in (1, 4, 9, 16):
@@ -242,8 +240,7 @@ def _unit_quats(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
 def _decompress_sh(path: Path, ply: PlyData, n: int) -> dict[str, np.ndarray]:
     """Properties f_rest_* of a compressed PLY, an array [n] each; {} if it has only degree 0. They
     are bytes, which divide the range -4 to 4 into 256 steps. A byte stands for the middle of its
-    step, but 0 and 255 for -4 and 4. Raises InputError if the element `sh` is not n rows of
-    bytes."""
+    step, but 0 and 255 for -4 and 4."""
     if "sh" not in ply:
         return {}
     table = ply["sh"].data
@@ -298,7 +295,6 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
 
 
 def _table(types: list[tuple[str, str]], columns: list[np.ndarray]) -> np.ndarray:
-    """Rows of a PLY element from its columns."""
     rows = np.empty(len(columns[0]), types)
     for (name, _), column in zip(types, columns, strict=True):
         rows[name] = column

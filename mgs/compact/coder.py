@@ -20,7 +20,6 @@ UNSEEN = 0.02  # count of a symbol that was never coded
 
 
 def _library() -> Any:
-    """The package constriction. Raises InputError if it is not installed."""
     try:
         import constriction
     except ImportError:

@@ -174,7 +174,6 @@ class Tree:
 
 
 def _pose_topics(reader: Any) -> str:
-    """Topics of poses that could be given as pose."""
     kinds = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
     topics = [one.topic for one in reader.connections if one.msgtype.rpartition("/")[2] in kinds]
     return ", ".join(sorted(set(topics))) or "none"
@@ -307,8 +306,7 @@ def _rows(message: Any, kind: str) -> np.ndarray:
 def _metres(message: Any, scratch: Path) -> np.ndarray | None:
     """Depth of an image [H,W] float32, metres; None for an encoding that is not supported. A
     compressedDepth image holds a PNG. Its numbers are millimetres, or for 32FC1 a / depth + b, with
-    0 for no depth (compressed_depth_image_transport). scratch: temporary file. Raises InputError if
-    the PNG is damaged."""
+    0 for no depth (compressed_depth_image_transport). scratch: temporary file."""
     if not hasattr(message, "format"):
         if message.encoding not in DEPTHS:
             return None

@@ -94,7 +94,6 @@ def check_dataset(
 
 
 def _test_problems(dataset: Dataset) -> Iterator[str]:
-    """Problem of test views that have no masks where the frames have."""
     tests = dataset.test_views()
     if tests is not None and has_masks(dataset.frames) and not has_masks(tests.frames):
         yield (

@@ -86,7 +86,6 @@ def models_in(source: Path) -> list[Path]:
 
 
 def _is_model(folder: Path) -> bool:
-    """Whether a folder holds the three files of a model."""
     return any(
         all((folder / f"{name}.{kind}").is_file() for name in ("cameras", "images", "points3D"))
         for kind in ("bin", "txt")
@@ -146,7 +145,6 @@ def _observed(image: Any, reconstruction: Any) -> tuple[Camera, np.ndarray, np.n
 
 
 def _image_count(model: Path) -> int:
-    """Number of images of a model."""
     path = model / "images.bin"
     if not path.is_file():
         return len(_names_in_text(model / "images.txt"))
@@ -182,7 +180,6 @@ def _opened(model: Path) -> tuple[Any, dict[int, str]]:
 
 
 def _has_mark(path: Path) -> bool:
-    """Whether a text begins with the byte-order mark of UTF-8."""
     with path.open("rb") as file:
         return file.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8
 
@@ -219,7 +216,6 @@ def _is_number(word: str) -> bool:
 
 
 def _camera(where: str, image: Any) -> tuple[Camera, Lens | None]:
-    """Camera and lens of an image of pycolmap."""
     lens = image.camera
     pose, world = np.eye(4), image.cam_from_world()
     if not np.linalg.norm(world.rotation.quat) > 0.5:  # pycolmap normalises all but 0

@@ -241,7 +241,6 @@ def load_origin(path: str | Path) -> Vector:
 
 
 def _origin_of(path: Path, data: dict[str, Any]) -> Vector:
-    """Origin in a transforms.json. Raises InputError unless it is three finite numbers."""
     origin = data.get("origin", [0.0, 0.0, 0.0])
     if not isinstance(origin, list) or len(origin) != 3:
         raise InputError(f"{path}: its origin is no list of three numbers; correct it")

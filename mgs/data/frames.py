@@ -85,8 +85,7 @@ class Frame:
         return self.target()[0][..., :3]
 
     def _existing(self, path: Path) -> Path:
-        """Return `path`, a file of the camera's size by its header. Raises InputError if no run has
-        taken this on-demand frame yet, and as `image_size`."""
+        """Return `path`, a file of the camera's size by its header."""
         if self.on_demand and not path.exists():
             raise InputError(
                 f"{path}: does not exist, since no run has taken frame {self.name} of this "

@@ -108,8 +108,7 @@ def import_source(
 
 
 def _mask_file(masks: Path, shot: Shot, shots: Sequence[Shot]) -> Path:
-    """Mask file of a shot, named as its image with or without folders. Raises InputError if there
-    is none, or if it could be that of several images."""
+    """Mask file of a shot, named as its image with or without folders."""
     if not masks.is_dir():
         raise InputError(f"{masks}: no such folder; give the folder of the masks")
     if path := find_image(masks, shot.name):

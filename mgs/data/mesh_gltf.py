@@ -52,7 +52,6 @@ def load_gltf_mesh(
 
 
 def _shape(gltf: Gltf, primitive: dict[str, Any], place: Transform) -> trimesh.Trimesh | None:
-    """Mesh of a primitive without its colours; None of lines and points."""
     attributes = primitive["attributes"]
     positions = gltf.json["accessors"][attributes["POSITION"]]
     if primitive.get("extensions") and not {"bufferView", "sparse"} & set(positions):

@@ -94,7 +94,6 @@ def load_mesh(path: str | Path, coloured: bool = True) -> trimesh.Trimesh:
 
 
 def _check(path: object, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Raise InputError as `load_mesh` for unusable vertices and faces."""
     if len(faces) == 0:
         raise InputError(f"{path}: has no faces; give a triangle mesh, not points or lines")
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
@@ -116,7 +115,6 @@ def _check(path: object, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 
 def _load(path: Path, coloured: bool) -> Any:
-    """Read a file with trimesh, or a glTF. Raises errors of many types."""
     import trimesh
 
     from mgs.data.mesh_gltf import load_gltf_mesh

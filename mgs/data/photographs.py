@@ -113,7 +113,6 @@ def _usable(paths: Sequence[Path]) -> tuple[list[Path], dict[str, str]]:
 
 
 def _pairs(count: int) -> list[tuple[int, int]]:
-    """Pairs of photographs to match."""
     steps = list(range(1, count))
     if count > EXHAUSTIVE:
         steps = [*range(1, NEAR + 1), *(2**k for k in range(4, count.bit_length()))]
@@ -199,7 +198,6 @@ def _and_names(why: dict[str, str]) -> str:
 
 
 def _turned(shot: Shot) -> Shot:
-    """Shot whose camera is that of the picture turned by its EXIF orientation."""
     return replace(shot, turned=True) if exif_orientation(shot.image) > 1 else shot
 
 

@@ -216,7 +216,6 @@ def opencv_lens(where: str, K: np.ndarray, distortion: Sequence[float]) -> Lens 
 
 
 def _pose(path: Path, row: list[float]) -> np.ndarray:
-    """Camera-to-world of x, y, z and a quaternion."""
     try:
         return rigid(row[:3], row[3:])
     except ValueError:
@@ -235,7 +234,6 @@ def _shot(
     depth: Path | None,
     unit: float = 1e-3,
 ) -> Shot:
-    """Keyframe of a pose, camera-to-world; depth: file that may not exist."""
     try:
         camera = Camera(K, *image_size(image), np.linalg.inv(pose))
     except np.linalg.LinAlgError:

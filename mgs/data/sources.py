@@ -147,8 +147,7 @@ def _recognised(
 
 
 def _split_apart(source: Path, images: Path | None, test_split: str) -> Source:
-    """The split of NeRF-synthetic data that becomes test views. Raises InputError where it is the
-    training split, or does not exist."""
+    """The split of NeRF-synthetic data that becomes test views."""
     path = source / f"transforms_{test_split}.json"
     if path.name == TRAINING or not path.is_file():
         fault = "is the training split" if path.name == TRAINING else f"there is no {path}"

@@ -101,7 +101,6 @@ class Matcher:
             )
 
     def _extract(self, places: Sequence[int]) -> None:
-        """Find the features of pictures that have none yet."""
         import pycolmap
 
         groups = defaultdict[str, list[int]](list)

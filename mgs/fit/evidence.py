@@ -269,7 +269,6 @@ def fitted(
 
 
 def _masks(learns: Mapping[str, Mask], coefficients: int) -> dict[str, np.ndarray]:
-    """Masks of `LeanModel.learned` that broadcast to the learned arrays."""
     # Opacities have shape [N], all others more dimensions.
     masks = {kind: mask if kind == "opacity" else mask[:, None] for kind, mask in learns.items()}
     directional = masks.pop(DIRECTIONAL, None)

@@ -265,6 +265,5 @@ def _pass(
 
 
 def _is_finite(model: Gaussians) -> bool:
-    """Whether all parameters are finite."""
     parts = [dr.all(dr.isfinite(getattr(model, name).array)) for name in ARRAYS]
     return bool(dr.all(parts)[0])

@@ -194,7 +194,6 @@ class Objective:
         )
 
     def _summed(self, total: Vector, of_photo: Callable[[Photo], Vector]) -> Vector:
-        """A vector plus the vectors of all photos."""
         for photo in self.photos:
             total = [a + b for a, b in zip(total, of_photo(photo), strict=True)]
             dr.eval(total)
@@ -218,7 +217,6 @@ class Objective:
         ]
 
     def _information(self, model: Gaussians, photo: Photo) -> Vector:
-        """Exact Fisher information of one image."""
         means, weight = self.prior.means, self.alpha_weight
         F = fisher(model, photo.camera, cache=self.cache, means=means, alpha_weight=weight)
         columns = zip(self.offsets(model), groups(model.sh_degree, means).values(), strict=True)
@@ -292,8 +290,7 @@ def filled(values: float | np.ndarray, shape: tuple[int, ...]) -> Any:
 
 
 def _photo(gaussians: Gaussians, camera: Camera, target: np.ndarray, alpha_weight: float) -> Photo:
-    """A `Photo` from a target of a fit, in the space in which the Gaussians are blended. Raises
-    InputError if its shape is not that of the camera, or alpha has a weight and it has no alpha."""
+    """A `Photo` from a target of a fit, in the space in which the Gaussians are blended."""
     factor, target = None, np.asarray(target)
     if target.ndim != 3 or target.shape[:2] != (camera.height, camera.width):
         size = f"[{camera.height},{camera.width},3 to 5], that of its camera"

@@ -190,8 +190,7 @@ def _place(dataset: Dataset) -> dict[str, Any]:
 
 
 def _random_prior(dataset: Dataset, settings: PriorSettings, shown: Sequence[Frame]) -> Prior:
-    """The prior of the source "random". shown: frames whose masks are read. Raises InputError as
-    `check_photographs`, `check_masks` and `scattered`."""
+    """The prior of the source "random". shown: frames whose masks are read."""
     check_photographs(dataset.frames, of_object=not (dataset.root / CLOUD).is_file())
     check_masks(shown)
     mesh, points, normals, spacing, numbers = scattered(dataset, settings, shown)
@@ -203,7 +202,6 @@ def _random_prior(dataset: Dataset, settings: PriorSettings, shown: Sequence[Fra
 def _depth_surface(
     dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]
 ) -> Surface:
-    """The surface of the source "depth"."""
     segmented = segment_dataset(dataset, settings, on_stage)
     check_masks(dataset.frames)
     cloud, plane = segmented.cloud, segmented.plane

@@ -162,7 +162,6 @@ def _tile_number(block: Any, blocks_x: int) -> Any:
 
 
 def _tile_numbers(blocks_x: int, blocks_y: int) -> int:
-    """Number of values of `_tile_number`."""
     return -(-blocks_x // TILE) * -(-blocks_y // TILE) * TILE * TILE
 
 
@@ -293,8 +292,7 @@ def _pairs(
 
 
 def _total(counts: Any, most: int, what: str) -> int:
-    """Sum of UInt32 counts, each at most `most`, in 64 bits if needed. Raises InputError beyond
-    MAX_PAIRS, and as `check_room`."""
+    """Sum of UInt32 counts, each at most `most`, in 64 bits if needed."""
     if len(counts) == 0:
         return 0
     total = int(dr.sum(counts if len(counts) * most < 1 << 32 else mi.UInt64(counts))[0])

@@ -142,8 +142,7 @@ def fisher(
 
 
 def _weights(weights: Any, camera: Camera, alpha_weight: float) -> np.ndarray | None:
-    """Weights of pixels and channels, [H,W,4]; those of alpha are 1 if not given. Raises InputError
-    as `fisher`."""
+    """Weights of pixels and channels, [H,W,4]; those of alpha are 1 if not given."""
     if weights is None:
         return None
     shape, values = (camera.height, camera.width), np.asarray(weights)
@@ -246,7 +245,6 @@ def exact(
 def _diagonal(
     gaussians: Gaussians, camera: Any, splats: Any, sums: Moments, by_mean: list[ByMean]
 ) -> Any:
-    """Columns of `exact` (`_interleaved`)."""
     columns = _columns(gaussians, camera, splats, sums, by_mean)
     return _interleaved(dict(enumerate(columns)), len(columns), len(gaussians))
 

@@ -76,7 +76,6 @@ def _checked_tangent(gaussians: Gaussians, name: str, tangent: Any) -> Any:
 
 
 def _untraced(camera: Camera | Sequence[Camera]) -> Camera | list[Camera]:
-    """The same cameras without Dr.Jit values."""
     return replace(camera) if isinstance(camera, Camera) else [replace(one) for one in camera]
 
 

@@ -74,5 +74,4 @@ def _traced(to_world: Any, fov: Any, ppo_x: Any, ppo_y: Any, width: int, height:
 
 
 def _number(value: Any) -> float:
-    """Value of a Mitsuba Float with one entry."""
     return float(np.asarray(value, np.float64).ravel()[0])

@@ -287,8 +287,7 @@ def render(
 
 
 def _stacked(images: Sequence[Image]) -> Image:
-    """One image of several of one size, which come first in its shapes. Raises InputError as
-    `render`."""
+    """One image of several of one size, which come first in its shapes."""
     if len({tuple(image.alpha.shape) for image in images}) != 1:
         raise InputError("render: takes one or more cameras of one image size; draw others apart")
 

@@ -92,7 +92,6 @@ def draw_survey(
 
 
 def _trajectories(axis, survey: Survey) -> None:
-    """True and estimated flight from above, and loop closures."""
     axis.plot(*survey.truth[:, :2, 3].T, color="0.6", lw=5, label="truth", solid_capstyle="round")
     for name, colour in COLOURS.items():
         x, y = getattr(survey, name)[:, :2, 3].T
@@ -118,7 +117,6 @@ def _errors(axis, survey: Survey, numbers: dict[str, Any]) -> None:
 
 
 def _depth_error(axis, dataset: Dataset, survey: Survey, numbers: dict[str, Any]) -> None:
-    """Measured minus true depth of the first frame, as an image."""
     depth, true = survey.depths[0], dataset.frames[0].depth()
     error = np.where((depth > 0) & (true > 0), 1e3 * (depth - true), np.nan)
     limit = max(3e3 * numbers["depth_error_on_rock"], 1.0)

@@ -16,7 +16,6 @@ TEXELS = 1024  # texels along one side of the tile
 
 
 def _grid() -> np.ndarray:
-    """Grid lines of the terrain along either axis [ROWS], metres: even within 7 m, wider beyond."""
     u = np.linspace(-1, 1, ROWS)
     return 7 * u + (REACH - 7) * u**9
 

@@ -322,8 +322,7 @@ def _meter(
 ) -> float:
     """Exposure for the whole orbit, metered on the rock in four evenly spaced cameras. Where that
     would clip more than MAX_CLIPPED of rock and ground, it is lowered, which `say` reports; that is
-    judged in final quality, since the noise of few samples makes too many pixels bright. Raises
-    InputError if a camera does not see the rock, or its brightness is not finite."""
+    judged in final quality, since the noise of few samples makes too many pixels bright."""
     indices = np.unique(np.linspace(0, len(cameras), 4, endpoint=False).astype(int))
     means, values = [], []
     for index in indices:

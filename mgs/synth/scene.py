@@ -215,7 +215,6 @@ def sensor_dict(camera: Camera) -> dict[str, Any]:
 
 
 def _to_world(camera: Camera) -> np.ndarray:
-    """Pose [4,4] of a camera with Mitsuba's axes."""
     return camera.camera_to_world @ _MITSUBA_FROM_OPENCV
 
 
@@ -258,7 +257,6 @@ def _rock_bsdf(rock: trimesh.Trimesh, settings: Rock) -> dict[str, Any]:
 
 
 def _mesh(name: str, mesh: trimesh.Trimesh, bsdf: dict[str, Any]) -> Any:
-    """A mi.Mesh of a trimesh mesh, with normals, UVs and attributes."""
     uv = getattr(mesh.visual, "uv", None)
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict({"type": "twosided", "material": bsdf})
