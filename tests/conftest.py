@@ -82,12 +82,14 @@ def browser():
 
 @pytest.fixture(scope="module")
 def coarse_arena():
-    """A ground of few vertices and texels, since it is most of a scene's cost."""
+    """Ground and stones of few vertices and texels, since they are most of a scene's cost."""
     from mgs.synth import arena
 
+    stone = arena._stone
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(arena, "ROWS", 60)
         patched.setattr(arena, "TEXELS", 64)
+        patched.setattr(arena, "_stone", lambda noise, detail: stone(noise, 0.08))
         yield
 
 

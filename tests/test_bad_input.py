@@ -245,7 +245,6 @@ BROKEN = {
 
 @pytest.mark.parametrize("words", BROKEN)
 def test_broken_pixels(capsys, dataset, prior, tmp_path, words):
-    """They are found when a frame is used; frame 0 is a seed."""
     BROKEN[words](dataset)
     arguments = ["nbv", dataset, "--out", tmp_path / "out", "--prior", prior, "--budget", 1]
     assert words in refused(capsys, arguments)

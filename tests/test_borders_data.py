@@ -126,7 +126,6 @@ MODELS = {
 
 @pytest.mark.parametrize("model", MODELS)
 def test_every_lens_of_colmap_is_one_of_transforms_json(data, model):
-    """The lens has the parameters under the names that COLMAP gives them."""
     import pycolmap
 
     change = {"camera_model": model, **MODELS[model]}
@@ -211,7 +210,6 @@ def write_far(tmp_path, far):
 
 
 def test_masks_in_folders_are_those_of_their_images(data, tmp_path, capsys):
-    """Two cameras with pictures of the same names."""
 
     def change(json):
         for k, frame in enumerate(json["frames"]):

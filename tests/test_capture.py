@@ -192,7 +192,6 @@ def test_the_survey_gives_the_prior_of_the_whole_dataset(full, poses):
 
 
 def test_the_run_is_that_on_the_whole_dataset(full, prior, captured, tmp_path):
-    """The same choices and model; PSNR is over the views that have images."""
     whole = tmp_path / "whole"
     command("nbv", full.root, "--prior", prior, "--out", whole, *RUN)
     assert taken(captured) == taken(whole)
@@ -261,7 +260,6 @@ def test_every_command_that_reads_a_run_reads_this_one(captured, tmp_path, capsy
 
 
 def test_a_run_builds_its_prior_from_the_survey(fresh, tmp_path, capsys):
-    """Without the images of the candidates."""
     run = tmp_path / "run"
     command("nbv", fresh.root, "--out", run, "--gaussians", 300, *RUN, "--budget", 1)
     assert sorted(there(fresh)) == sorted(taken(run))

@@ -26,7 +26,6 @@ from studies.frame.program import study_of
 
 
 def test_times_are_ratios_to_a_reference_that_is_timed_beside_each_call(monkeypatch):
-    """A machine that becomes four times as slow: the ratio stays."""
     slowness = iter([1, 1, 4, 4])
     cost = {"reference": 0.5, "work": 2.0}
 

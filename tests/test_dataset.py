@@ -161,7 +161,6 @@ def test_check_passes_a_sound_dataset(tmp_path):
 
 
 def test_check_finds_wrong_depth_units_and_wrong_axes(tmp_path):
-    """Depth 30 % too large, and OpenCV poses in an OpenGL file."""
     dataset = _write(tmp_path / "far", count=12)
     for frame in dataset.frames:
         write_exr(frame.depth_path, {"Z": 1.3 * frame.depth()})

@@ -16,23 +16,14 @@ from mgs.evaluation import evaluate_model, render_view
 from mgs.images import write_png
 from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.settings import PriorSettings
+from mgs.run import detectors
 from mgs.run.checks import predicted_psnr
-from mgs.run.detectors import (
-    DETECTORS,
-    Before,
-    ViewIndicators,
-    alarms,
-    before_fit,
-    means_drift,
-    outline_margin,
-    step_indicators,
-    view_indicators,
-)
+from mgs.run.detectors import DETECTORS, ViewIndicators, alarms, step_indicators, view_indicators
 from mgs.run.ending import why_ended
 from mgs.run.nbv import run_nbv
 from mgs.splat import as_drjit
 
-FITS = Before(outline=0.001, offset=0.01)
+FITS = detectors.Before(outline=0.001, offset=0.01)
 GOOD = ViewIndicators(FITS, 0.05, 0.02, 1e-3, ratios=(-0.08, 0.0, 0.08), pixels=2000)
 NOWHERE = np.zeros((0, 3))
 FALLING = (1.0, 0.5, 0.3, 0.25, 0.249, 0.248)
@@ -106,9 +97,9 @@ def test_the_outline_is_the_share_of_pixels_that_disagree_by_more_than_the_margi
     shifted = (columns >= 8) & (columns < 18)  # 3 pixels to the right
     alpha = np.where(shifted, 0.9, 0.2) * np.ones((8, 1))
     for margin, share in {1: 4 / 13, 2: 2 / 13, 3: 0}.items():
-        assert before_fit(mask, alpha, margin).outline == pytest.approx(share)
-    assert before_fit(mask, alpha, 1).offset == pytest.approx(3 / np.sqrt(80))
-    assert before_fit(mask, 0 * alpha, 1).offset == 1
+        assert detectors.before_fit(mask, alpha, margin).outline == pytest.approx(share)
+    assert detectors.before_fit(mask, alpha, 1).offset == pytest.approx(3 / np.sqrt(80))
+    assert detectors.before_fit(mask, 0 * alpha, 1).offset == 1
 
 
 def test_views_that_are_hard_to_fit_are_no_outliers_beside_others_of_their_side():
@@ -168,7 +159,7 @@ def test_the_margin_is_a_pixel_and_the_size_of_a_gaussian():
 
     def margin(size, means=model.means):
         log_scales = np.full_like(model.log_scales, np.log(size))
-        return outline_margin(replace(model, log_scales=log_scales, means=means), camera)
+        return detectors.outline_margin(replace(model, log_scales=log_scales, means=means), camera)
 
     depth = np.median(camera.project(model.means)[1])
     assert margin(1e-6) == 2
@@ -192,7 +183,7 @@ def test_a_perfect_render_explains_all_and_a_single_colour_nothing():
 
 def test_drift_is_in_standard_deviations_of_the_prior():
     start = np.zeros((5, 3))
-    assert means_drift(start + np.array([0.2, 0, 0]), start, 0.1) == pytest.approx(2)
+    assert detectors.means_drift(start + np.array([0.2, 0, 0]), start, 0.1) == pytest.approx(2)
 
 
 @pytest.fixture(scope="module")
@@ -261,7 +252,6 @@ def test_the_excess_of_the_last_views_is_scaled_by_the_gains():
 
 
 def test_a_side_that_no_seed_saw_is_no_drift_of_the_exposure(rock, tmp_path):
-    """Gaussians that no seed saw are grey, and the rock is not."""
     given = {"policy": "farthest", "budget": 3, "seeds": 1, "train": {"passes": 15}}
     state = run_nbv(rock, tmp_path / "run", **given).state
     assert not any("exposure" in warning for warning in warnings(state))

@@ -169,7 +169,6 @@ def test_many_views_leave_no_error_behind(over_dome):
 
 
 def test_a_resumed_run_has_the_same_bits():
-    """Views one by one, all at once, or after other views."""
     points, pool, dome = scene(1, 50)
     one_by_one = updated(points, pool, dome)
     for count in range(1, 5):
@@ -292,7 +291,6 @@ def test_a_path_ends_where_nothing_is_in_reach():
 
 @pytest.mark.parametrize("policy", ["coverage", "directional-d", "directional-i"])
 def test_views_are_chosen_without_looking_at_any_fit(loaded, tmp_path, policy):
-    """A run whose model is black after every fit takes the same views."""
 
     def black(*arguments):
         fit = tiny.fit(*arguments)
@@ -355,7 +353,6 @@ def flown(loaded, out, policy, **limits):
 
 @pytest.mark.parametrize("policy", ["directional-d", "directional-i"])
 def test_a_run_takes_the_views_of_its_plan(loaded, tmp_path, policy):
-    """Whatever order; after another view a new plan is made."""
     scene, after, mission, chosen = flown(loaded, tmp_path / "run", policy)
 
     def planned(views):
@@ -390,7 +387,6 @@ def test_a_run_records_what_its_plan_is_worth(loaded, tmp_path, policy):
 
 @pytest.mark.parametrize("policy", ["directional-d", "directional-i"])
 def test_a_run_with_limited_reach_follows_its_path(loaded, tmp_path, policy):
-    """After another view a new path is planned."""
     scene, after, mission, chosen = flown(loaded, tmp_path / "run", policy, nearest=2)
     for step in range(4):
         state = after(chosen[:step])

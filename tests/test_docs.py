@@ -106,7 +106,6 @@ def test_the_program_in_the_readme_runs(dataset, tmp_path, monkeypatch):
 
 @every_page
 def test_every_link_and_picture_leads_somewhere(page):
-    """`make docs` tries the anchors."""
     tokens = MARKDOWN.parse(page.read_text(encoding="utf-8"))
     inline = [child for token in tokens for child in token.children or []]
     links = [str(one.attrs.get("href") or one.attrs.get("src") or "") for one in inline]

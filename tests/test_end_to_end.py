@@ -93,7 +93,6 @@ def test_a_fit_shows_a_view_before_its_end(dataset, run, tmp_path, capsys, monke
 
 
 def test_interrupted_in_the_middle_of_a_step_then_resumed(dataset, run, tmp_path):
-    """The resumed process takes the same views, and its model is the same bit for bit."""
     out = tmp_path / "run"
     arguments = ["nbv", dataset, "--out", out, "--prior", run / "prior", *VIEWS]
     process = subprocess.run(

@@ -173,7 +173,6 @@ def random_view(rng):
 
 @given(seed=st.integers(0, 10_000))
 def test_surface_metrics_follow_their_definitions(seed):
-    """Against sums over single pixels."""
     truth, weight, mask, true_depth, alpha, depth = random_view(np.random.default_rng(seed))
     found = compare_surface(
         truth, alpha, depth, mask, weight, fractional=True, true_depth=true_depth

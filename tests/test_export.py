@@ -75,7 +75,6 @@ def test_a_model_comes_back(tmp_path, kind, degree):
 
 
 def test_a_glb_says_how_far_its_positions_reach(tmp_path):
-    """As glTF requires."""
     model = gaussians(0, n=30)
     path = tmp_path / "x.glb"
     write_gaussians(path, model, "glb", np.eye(3))

@@ -15,20 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mgs import files
 from mgs.colour import linear_from_srgb
 from mgs.data.meshes import load_mesh
 from mgs.errors import InputError
-from mgs.files import (
-    TOKEN,
-    atomic_folder,
-    atomic_path,
-    copy_file,
-    locked,
-    read_json,
-    working_in,
-    write_csv,
-    write_json,
-)
+from mgs.files import TOKEN, atomic_folder, atomic_path, copy_file, locked, read_json, write_json
 from mgs.images import read_exr, read_mask, read_png, read_rgba, read_values, write_exr, write_png
 
 
@@ -48,7 +39,7 @@ def test_what_the_disk_says_is_one_line(tmp_path):
 
 def test_records_with_other_keys_share_one_csv(tmp_path):
     records = [{"a": 1, "b": None}, {"c": "x, y", "a": 0.5}]
-    assert write_csv(tmp_path / "a.csv", records) == tmp_path / "a.csv"
+    assert files.write_csv(tmp_path / "a.csv", records) == tmp_path / "a.csv"
     assert (tmp_path / "a.csv").read_bytes() == b'a,b,c\n1,,\n0.5,,"x, y"\n'
 
 
@@ -135,14 +126,13 @@ def test_a_folder_that_fails_leaves_all_as_it_was(tmp_path, there):
 
 
 def test_what_ended_processes_left_in_a_folder_is_removed(tmp_path):
-    """But nothing of a process that runs, and nothing of the user."""
     (tmp_path / "renders").mkdir()
     ended = [f".a.{process}-{TOKEN}.part.ply" for process in (os.getpid(), 2**30)]
     kept = {f".a.1-{TOKEN}.part.ply", ".a.part", f".a.{2**30}.part.ply", f".b.{2**30}-{TOKEN}.part"}
     for name in [*ended, *sorted(kept)[:-1]]:
         (tmp_path / "renders" / name).touch()
     (tmp_path / "renders" / max(kept)).mkdir()
-    with working_in(tmp_path):
+    with files.working_in(tmp_path):
         assert {path.name for path in (tmp_path / "renders").iterdir()} == kept
 
 

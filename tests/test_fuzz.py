@@ -26,6 +26,7 @@ import trimesh
 from PIL import Image
 from test_recordings import WRITERS
 
+from mgs import images
 from mgs.cli.app import CURES
 from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
 from mgs.data.dataset import load_dataset
@@ -33,16 +34,7 @@ from mgs.data.meshes import load_mesh
 from mgs.data.sources import read_source
 from mgs.errors import InputError
 from mgs.files import read_json, write_json
-from mgs.images import (
-    exif_exposure,
-    image_size,
-    read_exr,
-    read_mask,
-    read_rgba,
-    read_values,
-    write_exr,
-    write_png,
-)
+from mgs.images import exif_exposure, image_size, read_mask, read_values, write_exr, write_png
 from mgs.prior.build import load_prior
 from mgs.reports.evaluation import evaluate_run
 from mgs.reports.page import write_page
@@ -100,7 +92,7 @@ MOST_GROWTH = 2 << 30
 def read_image(path: Path) -> None:
     image_size(path)
     exif_exposure(path)
-    read_rgba(path)
+    images.read_rgba(path)
 
 
 def png(path: Path) -> None:
@@ -264,7 +256,7 @@ LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]]
     "PNG": ("a.png", png, read_image),
     "JPEG": ("a.jpg", lambda path: Image.effect_noise((32, 24), 50).save(path), read_image),
     "depth": ("d.png", lambda path: Image.new("I;16", (32, 24), 9).save(path), read_values),
-    "EXR": ("a.exr", exr, read_exr),
+    "EXR": ("a.exr", exr, images.read_exr),
     "PLY": ("a.ply", lambda path: write_ply(path, tiny.initial([])), read_ply),
     "compressed PLY": ("c.ply", compressed, read_ply),
     "MGS": ("a.mgs", lambda path: shutil.copy(CORPUS / "MGS/one.mgs", path), load_gaussians),

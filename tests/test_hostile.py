@@ -19,22 +19,11 @@ import tiny
 from program import command, said
 from refusals import listing, refused
 
+from mgs import files
 from mgs.cli.printing import step_lines
 from mgs.data.dataset import load_dataset
 from mgs.errors import InputError
-from mgs.files import (
-    atomic_folder,
-    atomic_path,
-    below,
-    check_writable,
-    folder_locked,
-    locked,
-    remove_file,
-    remove_leftovers,
-    scratch_folder,
-    write_csv,
-    write_json,
-)
+from mgs.files import atomic_folder, atomic_path, below, folder_locked, locked, scratch_folder
 from mgs.images import image_size
 from mgs.reports.page_plots import curve_plot
 from mgs.run.checks import predicted_psnr
@@ -366,7 +355,7 @@ METRICS = [
 @pytest.mark.parametrize("change", METRICS, ids=str)
 def test_a_value_of_a_wrong_type_in_metrics(capsys, stranger, change):
     sound = {"images": 3, "all": {"count": 0}, "held_out": {"count": 0}, "views": []}
-    write_json(stranger / "metrics.json", sound | change)
+    files.write_json(stranger / "metrics.json", sound | change)
     line = refused(capsys, ["report", stranger, "--html", stranger / "a.html"], stranger)
     assert f"metrics.json: is damaged ({next(iter(change))}" in line
 
@@ -400,10 +389,10 @@ def test_nothing_below_a_locked_folder_is_written_through_a_link(outside, tmp_pa
                 pass
         for path in (run / "renders/a", outside / "a"):
             with pytest.raises(InputError, match=r"leads out of|is not in"):
-                remove_file(run, path)
+                files.remove_file(run, path)
         with atomic_path(run / "b") as temporary:  # the link itself is replaced
             temporary.write_text("ours")
-        remove_leftovers(run)
+        files.remove_leftovers(run)
         assert (run / "b").read_text() == "ours"
         assert not (run / "b").is_symlink()
     with pytest.raises(InputError, match="leads out of"):
@@ -461,14 +450,14 @@ def test_a_device_is_not_replaced(tmp_path, make):
     os.mkfifo(pipe)
     for path in (pipe, Path("/dev/null"), Path("/dev/stdout")):
         with pytest.raises(InputError, match="is a device or a pipe"):
-            check_writable(path)
+            files.check_writable(path)
         with pytest.raises(InputError, match="is a device or a pipe"), atomic_path(path):
             pass
     assert pipe.is_fifo()
 
 
 def test_half_characters_of_names_are_written(tmp_path):
-    write_csv(tmp_path / "a.csv", [{"name": "a\udcff"}])
+    files.write_csv(tmp_path / "a.csv", [{"name": "a\udcff"}])
     assert (tmp_path / "a.csv").read_bytes() == b"name\na\\udcff\n"
 
 

@@ -13,17 +13,9 @@ from mgs.camera import Camera, look_at
 from mgs.data.dataset import Dataset
 from mgs.errors import InputError
 from mgs.images import write_png
+from mgs.prior import initial
 from mgs.prior.build import Prior, build_prior, load_prior, prior_from_mesh, save_prior
-from mgs.prior.initial import (
-    GREY,
-    IN_PLANE_SCALE,
-    INITIAL_OPACITY,
-    INSET,
-    THICKNESS,
-    initial_gaussians,
-    pixel_on,
-    warm_start,
-)
+from mgs.prior.initial import GREY, IN_PLANE_SCALE, THICKNESS, initial_gaussians, pixel_on
 from mgs.prior.settings import PriorSettings
 from mgs.rotation import rotmat_from_quat
 from mgs.run.inputs import prior_digest
@@ -49,14 +41,14 @@ def test_shapes_scales_and_rotations(prior, dataset):
     assert seen.shape == (2000,)
     off = gaussians.means - prior.points
     pixel = pixel_on(prior, [frame.camera for frame in dataset.frames[::3]])
-    assert np.allclose(off, -INSET[True] * pixel * prior.normals, atol=1e-6)
+    assert np.allclose(off, -initial.INSET[True] * pixel * prior.normals, atol=1e-6)
     on_it = initial_gaussians(prior, dataset.frames[::3], pixel=0)[0]
     assert np.allclose(on_it.means, prior.points, atol=1e-6)
     expected = prior.spacing * np.array([IN_PLANE_SCALE, IN_PLANE_SCALE, THICKNESS])
     assert np.allclose(np.exp(gaussians.log_scales), expected, rtol=1e-5)
     thin = rotmat_from_quat(gaussians.quats)[:, :, 2]
     assert np.allclose(thin, prior.normals, atol=1e-5)
-    assert np.allclose(gaussians.opacities, INITIAL_OPACITY, atol=1e-6)
+    assert np.allclose(gaussians.opacities, initial.INITIAL_OPACITY, atol=1e-6)
 
 
 def test_a_warm_start_gives_new_images_to_what_none_saw_before(prior, dataset):
@@ -68,7 +60,7 @@ def test_a_warm_start_gives_new_images_to_what_none_saw_before(prior, dataset):
     assert new.mean() > 0.05
     learned = np.random.default_rng(0).normal(0, 0.1, before.sh.shape).astype(np.float32)
     model = replace(before, sh=before.sh + learned, log_scales=before.log_scales + 1)
-    found = warm_start(model, before, start)
+    found = initial.warm_start(model, before, start)
     np.testing.assert_allclose(found.sh[new], start.sh[new] + learned[new], atol=1e-6)
     seen_now = initial_gaussians(prior, dataset.frames[1:2])[1]
     np.testing.assert_array_equal(found.sh[~seen_now], model.sh[~seen_now])

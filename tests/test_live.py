@@ -383,16 +383,9 @@ def test_the_simulated_drone(tmp_path, capfd):
     command("synth-orbit", world, "--on-demand", *orbit)
     tool = Path(__file__).parent.parent / "tools/drone.py"
     program = f"{sys.executable} {tool} {world} {{pose}} {{out}} --fail 0.4 --noise 0.02"
-    flying = [
-        "--capture-command",
-        program,
-        "--set",
-        "capture.tries=4",
-        "--set",
-        "capture.timeout=200",
-    ]
-    settings = ["--seeds", 3, "--budget", 2, "--set", "train.passes=2", "--gaussians", 200]
-    command("nbv", world, *settings, *flying, "--out", run)
+    settings = "--seeds 3 --budget 2 --gaussians 200 --set train.passes=2 --set capture.tries=4"
+    settings += " --set capture.timeout=200"
+    command("nbv", world, *settings.split(), "--capture-command", program, "--out", run)
     assert "try 1 of 4" in capfd.readouterr().err
     assert len(steps(run)) == 3
     shutil.rmtree(run / "dataset/flight")

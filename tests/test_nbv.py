@@ -386,6 +386,5 @@ def test_moves_can_be_limited_to_the_nearest_poses(loaded, tmp_path):
     [(1, [0]), (2, [0, 2]), (3, [0, 2, 3]), (9, [0, 1, 2, 3, 4])],
 )
 def test_the_nearest_poses(count, nearest):
-    """Ties go to the first pose."""
     positions = np.array([[0.0, 0, 0], [3, 0, 0], [1, 0, 0], [-1, 0, 0], [9, 0, 0]])
     assert poses.nearest_poses(positions, np.zeros(3), count) == nearest

@@ -169,7 +169,6 @@ def test_corners_of_a_camera_project_to_those_of_its_image():
 
 
 def test_old_metrics_are_left_out(runs, tmp_path):
-    """No metrics of the model: no numbers, and a note."""
     run = shutil.copytree(runs[0], tmp_path / "run")
     metrics = read_json(run / "metrics.json")
     write_json(run / "metrics.json", metrics | {"images": 5})
@@ -234,7 +233,6 @@ def hostile(tmp_path_factory):
 
 
 def test_figures_and_pages_take_names_literally(hostile):
-    """A name is no formula to matplotlib and no markup to the page."""
     command("diagnose", hostile.parent / EVIL, "--views", EVIL)
     assert EVIL not in hostile.read_text()
 
@@ -264,8 +262,6 @@ def test_a_page_about_a_strangers_run_is_safe(browser, hostile, tmp_path, script
 
 @pytest.mark.parametrize(("width", "height", "scheme"), [(900, 600, "light"), (390, 600, "dark")])
 def test_the_page_in_a_browser(browser, page, width, height, scheme):
-    """Loads without a network and without errors, fits the width, draws its plots, and its controls
-    do what they say."""
     with opened(browser, page.as_uri(), width, height, scheme) as (tab, wrong):
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
         background = tab.evaluate("getComputedStyle(document.body).backgroundColor")

@@ -133,7 +133,6 @@ def floating(root: Path, cameras: list[Camera]) -> Dataset:
 
 
 def test_the_hull_of_a_convex_body_seen_from_all_sides_is_that_body(tmp_path, monkeypatch):
-    """Also if large masks are carved with in blocks."""
     monkeypatch.setattr(hull, "COARSE", 24)
     dataset = floating(tmp_path / "d", lattice(30))
     found = visual_hull(dataset.frames)
@@ -489,7 +488,9 @@ def test_random_points_are_fewer_than_those_of_the_cameras(colmap, tmp_path, mon
     assert (asked["n"], asked["triangulated"]) == (5000, many["triangulated"])
 
 
-def test_photographs_without_masks_are_fitted_whole_from_their_points(colmap, tmp_path, capsys):
+def test_photographs_without_masks_are_fitted_whole_from_their_points(
+    colmap, tmp_path, capsys, coarse_priors
+):
     """Not from the surface of the object, which cannot explain what is around it."""
     command("import", colmap, "--out", tmp_path / "d")
     command("prior", tmp_path / "d", "--gaussians", "300")
@@ -517,15 +518,8 @@ def test_a_fit_with_adaptive_density_is_a_run_as_3dgs(tmp_path, capsys, monkeypa
     capsys.readouterr()
     line = refused(capsys, [*fitted, "--set", "train.most_gaussians=0"], tmp_path / "run")
     assert "train.most_gaussians = 0: must be at least 1" in line
-    command(
-        *fitted,
-        "--passes",
-        8,
-        "--set",
-        "train.most_gaussians=310",
-        "--set",
-        "train.rates.mean=0.01",
-    )
+    more = "--passes 8 --set train.most_gaussians=310 --set train.rates.mean=0.01"
+    command(*fitted, *more.split())
     settings = read_json(tmp_path / "run/config.json")["settings"]
     train = settings["train"]
     assert (settings["sh"], train["means"], train["optimiser"]) == (3, "free", "adam")

@@ -130,7 +130,6 @@ def test_colours_in_display_space(ply):
 
 
 def test_antialiasing_is_a_property(ply):
-    """By default as the file says."""
     assert load(ply).integrator().gaussians.antialiased == read_ply(ply).antialiased
     images = {}
     for kind in (True, False):
@@ -156,7 +155,6 @@ def test_a_changed_parameter_changes_the_image(ply):
 
 
 def test_gradients_are_those_of_the_api(ply):
-    """Gradients of each parameter, means included, through colour, alpha and depth of a crop."""
     scene = load(ply, sensor_dict({"pixel_format": "rgba"} | CROP), depth=True)
     params = mi.traverse(scene)
     for name in ARRAYS:
@@ -181,7 +179,6 @@ def test_samples_and_seeds_change_nothing(ply):
 
 
 def test_files_lie_beside_the_scene(ply, tmp_path):
-    """A scene file in XML names its PLY relative to itself."""
     write_ply(tmp_path / "beside.ply", gaussians())
     (tmp_path / "scene.xml").write_text(
         '<scene version="3.0.0"><sensor type="perspective"/><integrator type="mgs_splat">'
@@ -250,7 +247,6 @@ def test_a_parameter_that_is_not_finite_is_named(ply):
 
 @pytest.mark.parametrize("space", ["linear", "srgb"])
 def test_forward_mode_is_that_of_the_api(ply, space):
-    """`dr.forward` through `mi.render` against `jvp`: colour, alpha and depth."""
     film, background = {"pixel_format": "rgba"}, (0.2, 0.1, 0.3)
     options = {"depth": True, "colour_space": space, "background": list(background)}
     scene = load(ply, sensor_dict(film), **options)
@@ -344,7 +340,6 @@ def test_registered_at_import(ply, tmp_path):
 
 
 def test_the_documented_example(tmp_path, monkeypatch):
-    """The program in docs/mitsuba.md runs, and lowers its loss."""
     page = (Path(__file__).parent.parent / "docs/mitsuba.md").read_text()
     program = page.split("```python\n")[1].split("```")[0]
     monkeypatch.chdir(tmp_path)

@@ -57,7 +57,6 @@ def test_scores_are_never_negative_and_grow_with_what_is_seen(F, more, H, name):
     information, information, information, st.sampled_from(["d-optimal", "a-optimal", "fisherrf"])
 )
 def test_returns_diminish(F, H, seen, name):
-    """Submodularity, for a fixed model."""
     score = SCORES[name]
     assert score(F, H + seen, LAM) <= score(F, H, LAM) * (1 + 1e-12)
 
@@ -125,7 +124,6 @@ def test_rounding_below_zero_counts_as_no_information():
 
 
 def test_angle_spreads_over_a_dome():
-    """Wherever the centre is; distance has no influence."""
     taken = np.array([[2.0, 0, 0]])
     candidates = np.array([[0, 0, 9.0], [-0.5, 0, 0], [4, 0.1, 0], [0, 2, 0]])
     for centre in (CENTRE, np.array([3.0, 4.0, 5.0])):

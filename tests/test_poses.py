@@ -36,7 +36,6 @@ def test_the_jacobian_is_that_of_the_reference():
 
 
 def test_poses_are_found_again_under_the_true_model():
-    """And a tight prior holds them where they are."""
     true = [make_camera(eye=eye) for eye in EYES]
     model = calm(lambda seed: make_clamped(seed, n=10), true[0], 30)
     rng, std = np.random.default_rng(1), np.array([4e-3] * 3 + [8e-3] * 3)

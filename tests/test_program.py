@@ -186,7 +186,6 @@ def test_a_frame_without_rock_is_refused_before_it_is_fitted_to(dataset, tmp_pat
 
 
 def test_a_mean_over_no_view_is_left_out(dataset):
-    """JSON has no NaN."""
     loaded, model, seeds = load_dataset(dataset), tiny.initial([]), [0, 4, 8]
     blacken(dataset, *(set(range(12)) - set(seeds)))
     measure = psnr_measure(loaded, ListCache())
@@ -214,7 +213,6 @@ def test_demo_refuses_results_of_another_seed(tmp_path, capsys, made):
 
 
 def test_a_replaced_prior_is_one_line_on_resume(dataset, prior, tmp_path, capsys):
-    """With the old one back the run goes on."""
     run, known = tiny.write_run(tmp_path / "run", dataset, prior), load_prior(prior)
     change_settings(run, budget=1)
     prior.rename(tmp_path / "kept")
@@ -248,7 +246,6 @@ def test_a_damaged_setting_is_named_with_its_file(dataset, prior, tmp_path, caps
 
 
 def test_options_win_over_a_file_of_settings(dataset, prior, tmp_path, capsys, monkeypatch):
-    """The config.json of a run is such a file, too."""
     monkeypatch.setattr(nbv_command, "resume_and_print", lambda *given, **more: None)
     file, first, second = (tmp_path / name for name in ("mine.toml", "first", "second"))
     text = f'dataset = "{dataset.name}"\nprior = "{prior}"\nseeds = 3\nbudget = 2\n'

@@ -17,17 +17,8 @@ from scipy.stats import multivariate_normal
 from mgs import learning
 from mgs.camera import Camera, look_at
 from mgs.errors import InputError
-from mgs.fit.evidence import (
-    BLOCKS,
-    DIRECTIONAL,
-    Images,
-    Worth,
-    kinds,
-    lean_fit,
-    paying,
-    regularisation,
-    worth,
-)  # fmt: skip
+from mgs.fit import evidence
+from mgs.fit.evidence import BLOCKS, DIRECTIONAL, Worth, kinds, lean_fit, paying, worth
 from mgs.fit.fitting import fit_gaussians
 from mgs.fit.settings import TrainSettings
 from mgs.gaussians import LEARNED
@@ -68,7 +59,7 @@ def images_of(truth, start, views=VIEWS):
     targets = [np.asarray(render(truth, camera).rgb) for camera in cameras]
     noisy = [target + rng.normal(0, 0.002, target.shape) for target in targets]
     known = [np.dstack([target, np.ones(target.shape[:2])]).astype(np.float32) for target in noisy]
-    return Images(cameras, known, lambda of: start, range(views))
+    return evidence.Images(cameras, known, lambda of: start, range(views))
 
 
 @given(st.integers(1, 6), st.floats(0.01, 3), st.floats(0.05, 4), st.integers(0, 10**6))
@@ -188,7 +179,7 @@ def test_few_views_leave_no_choice_of_a_degree():
 
 
 def test_lambda_of_each_kind():
-    lam, of = regularisation(SETTINGS, 2), kinds(2)
+    lam, of = evidence.regularisation(SETTINGS, 2), kinds(2)
     assert list(of) == ["colour", DIRECTIONAL, "scale", "rotation", "opacity"]
     assert [columns.stop for columns in of.values()] == [3, 27, 30, 34, 35]
     assert np.allclose(lam[of["colour"]], 0.02**2)

@@ -197,7 +197,6 @@ def test_antialiasing(folder, marked):
 
 @pytest.mark.parametrize("space", ["linear", "srgb"])
 def test_background_is_as_displayed(folder, space):
-    """Behind a model without Gaussians."""
     foreign_ply(folder / "x.ply", gaussians(0, n=0))
     run(folder, "--colour-space", space, "--background", 1, 0.5, 0.25)
     expected = np.broadcast_to([1, 0.5, 0.25], (HEIGHT, WIDTH, 3))

@@ -87,7 +87,6 @@ def images(figure):
 
 
 def test_report_writes_every_figure(runs, tmp_path, drawn):
-    """Each shows the numbers of the runs."""
     out = tmp_path / "report"
     written = writing.report(runs, out)
     names = [*(f"{name}.png" for name in FIGURES), "table.md", "table.json"]

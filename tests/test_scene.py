@@ -14,7 +14,6 @@ from mgs.colour import linear_from_srgb
 from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.seeds import generator
-from mgs.synth import arena
 from mgs.synth.arena import make_ground, make_stones
 from mgs.synth.rock import make_rock
 from mgs.synth.rock_layer import RockLayer, continued, lattice, render_layers, with_coverage
@@ -22,6 +21,8 @@ from mgs.synth.scene import MitsubaScene, sensor_dict, whole_grid
 from mgs.synth.scene_file import Arena, Rock, SceneFile, Sensor, load_scene_file, sensor_of
 
 K = np.array([[70.0, 0, 30.5], [0, 70.0, 27.25], [0, 0, 1]])
+
+pytestmark = pytest.mark.usefixtures("coarse_arena")
 
 
 def test_known_point_lands_on_its_pixel():
@@ -39,10 +40,8 @@ def test_known_point_lands_on_its_pixel():
     np.testing.assert_allclose(centroid, camera.project(point[None])[0][0], atol=0.05)
 
 
-def test_texture_lies_on_the_rock_as_in_the_mesh(monkeypatch):
+def test_texture_lies_on_the_rock_as_in_the_mesh():
     """Mitsuba's albedo is the colour of the exported mesh there; a flipped v would be noise."""
-    monkeypatch.setattr(arena, "ROWS", 60)  # the ground is not looked at
-    monkeypatch.setattr(arena, "TEXELS", 64)
     rock = make_rock(Rock(detail=0.04), generator(0, "rock"))
     camera = Camera(K * [[2], [2], [1]], 128, 96, look_at([3, 1, 1.5], [0, 0, 0.6]))
     scene = MitsubaScene(SceneFile(arena=Arena(stones=0)), rock, camera, seed=0)
@@ -56,7 +55,7 @@ def test_texture_lies_on_the_rock_as_in_the_mesh(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def ball():
+def ball(coarse_arena):
     """A red ball of radius 0.7 around (0.1, 0, 0.5) on grey ground, and a camera."""
     rock = trimesh.creation.icosphere(5, 0.7)
     rock.apply_translation([0.1, 0, 0.5])

@@ -222,7 +222,6 @@ def test_a_case_is_the_scene_with_some_keys_changed(tmp_path, monkeypatch):
 
 
 def test_a_prior_is_built_once_and_whole(tmp_path, monkeypatch):
-    """Killed while it was being saved, and asked for again."""
     dataset, out = tmp_path / "dataset", tmp_path / "cell"
     synthetic.write_dataset(dataset, synthetic.orbit_cameras(8, 48, 36))
 
@@ -299,7 +298,6 @@ def test_a_study_that_is_killed_leaves_no_process_behind(tmp_path):
 
 
 def test_table_1_has_equal_counts_and_the_papers_rows(tmp_path, capsys, monkeypatch):
-    """Interrupted, continued, and with batches."""
     asked = []
 
     def timed(root, out, dataset, prior, settings):

@@ -62,7 +62,6 @@ THREE = Gaussians(
 
 @pytest.mark.parametrize("coloured", [True, False])
 def test_a_file_of_playcanvas(tmp_path, coloured):
-    """Files without ranges of colours, too: their colours are from 0 to 1."""
     body, model = base64.b64decode(SPLAT_TRANSFORM), THREE.map(np.copy)
     table = np.hstack([THREE.means, THREE.log_scales, 0.5 + C0 * THREE.sh[:, 0]])
     low, ranges = table.min(0), np.ptp(table, 0)

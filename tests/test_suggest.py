@@ -144,17 +144,9 @@ def test_a_dataset_is_one_command_and_its_flight_plan_is_read_by_pymavlink(run, 
     out, data = tmp_path / "next", open_run(run).dataset.root
     plans = [tmp_path / f"next.{kind}" for kind in ("plan", "waypoints", "kml")]
     written = [word for path in plans for word in ("--plan", path)]
-    place = [
-        "--origin",
-        "47,8,400,90",
-        "--set",
-        "flight.no_fly=1.5",
-        "--set",
-        "flight.hover=2",
-        "--set",
-        "flight.speed=1.5",
-    ]
-    command("suggest", data, "--dome", 30, "--views", 3, "--out", out, *written, *place)
+    asked = "--dome 30 --views 3 --origin 47,8,400,90 --set flight.no_fly=1.5 --set flight.hover=2"
+    asked += " --set flight.speed=1.5"
+    command("suggest", data, "--out", out, *written, *asked.split())
     assert "ruled out by flight.no_fly or flight.clearance" in said(capsys)[0]
     assert len(json.loads((out / "suggestions.json").read_text())["plan"]) == 3
     poses = [camera for _, camera in load_cameras(out)]
@@ -216,7 +208,6 @@ def test_a_plan_in_a_world_that_is_not_upright(run, tmp_path):
 
 
 def test_a_plan_around_a_cylinder_does_not_cross_the_object(run, tmp_path, capsys):
-    """Two poses on opposite sides."""
     path = tmp_path / "poses.csv"
     path.write_text("name,x,y,z\na,-2.6,0.1,0.3\nb,2.6,0.3,0.3\n")
     plan = ["--plan", tmp_path / "a.plan", "--origin", "47,8,400"]
@@ -242,7 +233,6 @@ def test_poses_of_a_csv(site, tmp_path):
 
 
 def test_poses_leave_and_come_in_the_coordinates_of_the_data(run, site, tmp_path, monkeypatch):
-    """A world whose origin was moved."""
     opened, far = open_run(run), np.array([448262.0, 5411932, 412])
     world = World(unit_up([0.3, -0.8, 0.2]), "m", tuple(far))
     camera = site.camera([1.4, -1.8, 1.2])

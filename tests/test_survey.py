@@ -15,15 +15,8 @@ from mgs.files import read_json, write_json
 from mgs.images import write_png
 from mgs.prior.build import build_prior
 from mgs.prior.settings import PriorSettings
-from mgs.survey.depth_sensor import (
-    AXIAL_FLOOR,
-    AXIAL_GROWTH,
-    AXIAL_START,
-    QUANTUM,
-    depth_noise,
-    filter_depth,
-    noisy_depth,
-)
+from mgs.survey import depth_sensor
+from mgs.survey.depth_sensor import AXIAL_GROWTH, QUANTUM, depth_noise, filter_depth, noisy_depth
 from mgs.survey.flight import SurveySettings, fly, survey_numbers, trajectory_error
 from mgs.survey.folder import write_survey
 from mgs.survey.registration import Edge, chain, drifting_odometry, loop_candidates, optimise
@@ -65,7 +58,7 @@ def test_axial_noise_grows_as_published(z):
     measured = noisy_depth(depth, camera, np.random.default_rng(0))
     error = (measured - depth)[measured > 0]
     assert len(error) > 0.99 * (depth.size - 2 * (640 + 480))
-    axial = AXIAL_FLOOR + AXIAL_GROWTH * (z - AXIAL_START) ** 2
+    axial = depth_sensor.AXIAL_FLOOR + AXIAL_GROWTH * (z - depth_sensor.AXIAL_START) ** 2
     expected = np.hypot(axial, QUANTUM * z * z / np.sqrt(12))
     assert error.std() == pytest.approx(expected, rel=0.15)
     # A coarse step rounds z itself, so the mean may be off by a part of it, never by all.
@@ -260,7 +253,6 @@ def test_command_writes_a_dataset_with_its_figure(tmp_path, capsys):
 
 
 def test_duplicate_frames_are_no_trouble(tmp_path):
-    """A hovering drone: the same pose twice."""
     dataset = synthetic.write_dataset(tmp_path, synthetic.orbit_cameras(12, 96, 72), ROCKS)
     again = replace(dataset.frames[1], name="again", timestamp=0.7)
     twice = (*dataset.frames[:2], again, *dataset.frames[2:])

@@ -43,7 +43,6 @@ def silent(name, done, total):
 
 
 def test_cells_come_after_those_they_need_and_are_done_once(tmp_path):
-    """What failed is done again, and the rest is kept."""
     CALLS.clear()
     first = cell("a/1", x=1)
     with pytest.raises(ValueError, match="-1"):

@@ -314,8 +314,6 @@ def tick(tab, label, on):
 
 
 def test_the_viewer_in_a_browser(browser, run):
-    """The screen shows the kernel's image of each layer, a click on a camera shows its frame, and a
-    new step appears."""
     pytest.importorskip("viser", reason="viser is not installed")
     subject = read_subject(run)
     camera = start_camera(subject)

@@ -60,7 +60,6 @@ def needed_pairs(gaussians, camera) -> set[tuple[int, int]]:
     [(0, (-6.0, -1.0)), (4, (-9.0, 0.5)), (5, (-2.0, 1.0))],
 )
 def test_lists_hold_every_pair_and_little_more(seed, scales):
-    """For small splats, needles and splats as large as the image."""
     camera, g = make_camera(), make_gaussians(60, seed, log_scales=scales)
     needed = needed_pairs(g, camera)
     listed = pairs_of(build(projected(g, camera), camera))
@@ -212,7 +211,6 @@ def test_cache_keeps_what_it_has_room_for():
 
 
 def test_views_larger_than_the_budget_still_render(monkeypatch):
-    """Also when the cache forgets when it saw their cameras."""
     monkeypatch.setattr(rendering, "REMEMBERED", 2)
     g, cache = make_gaussians(60, 3), ListCache(budget=1)
     for i in (0, 1, 2, 3, 3, 3):

@@ -12,32 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mgs import splat
 from mgs.errors import InputError
 from mgs.gaussians import ARRAYS
-from mgs.splat import (
-    Image,
-    as_drjit,
-    fisher,
-    fisher_derivatives,
-    groups,
-    jvp,
-    moved,
-    reference,
-    render,
-)
+from mgs.splat import as_drjit, fisher, fisher_derivatives, groups, jvp, moved, reference, render
 
-from .scenes import (
-    calm,
-    changed,
-    difference,
-    gradients_of,
-    make_camera,
-    make_clamped,
-    make_gaussians,
-    margins,
-    relative_error,
-    with_gradients,
-)
+from . import scenes
+from .scenes import calm, make_camera, make_clamped, make_gaussians, relative_error, with_gradients
 
 BACKGROUND = (0.3, 0.6, 0.1)
 OUTPUTS = ("rgb", "alpha", "depth")
@@ -68,7 +49,7 @@ def gradients(gaussians, camera, weights, wanted=ARRAYS) -> dict[str, np.ndarray
     image = render(model, camera, BACKGROUND)
     weights = {name: mi.TensorXf(w.astype(np.float32)) for name, w in weights.items()}
     dr.backward(sum(dr.sum(getattr(image, name) * w, axis=None) for name, w in weights.items()))
-    return gradients_of(model, wanted)
+    return scenes.gradients_of(model, wanted)
 
 
 def random_tangents(gaussians, seed=0, names=ARRAYS) -> dict[str, np.ndarray]:
@@ -90,7 +71,7 @@ def gradient_differences(gaussians, camera, weights, wanted) -> dict[str, np.nda
         for index in np.ndindex(shape):
             unit = np.zeros(shape)
             unit[index] = 1
-            change = difference(gaussians, {name: unit}, camera, BACKGROUND)
+            change = scenes.difference(gaussians, {name: unit}, camera, BACKGROUND)
             sums = [(change[output] * weights[output]).sum() for output in OUTPUTS]
             result[name][(slice(None), *index)] = sums
     return result
@@ -113,7 +94,7 @@ def test_gradient_of_the_depth_of_faint_splats(seed):
     """Expected depth is a quotient by alpha, here a few 1/255."""
     camera = make_camera()
     gaussians = make_gaussians(5, seed, logits=(-3, -1))
-    assert margins(gaussians, camera).min() > 1e-3
+    assert scenes.margins(gaussians, camera).min() > 1e-3
     weights = image_weights(camera, seed)
     wanted = ARRAYS[:4]
     found = gradients(gaussians, camera, {"depth": weights["depth"]}, wanted)
@@ -131,24 +112,23 @@ LOSSES = {
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_gradient_of_any_loss(loss):
-    """Losses that slice, join and reduce images, against the same loss in two steps."""
     gaussians, camera = case(1)
     model = with_gradients(gaussians, ["log_scales"])
     image = render(model, camera, BACKGROUND)
-    leaf = Image(*(dr.copy(dr.detach(getattr(image, name))) for name in OUTPUTS))
+    leaf = splat.Image(*(dr.copy(dr.detach(getattr(image, name))) for name in OUTPUTS))
     dr.enable_grad(leaf)
     dr.backward(dr.sum(LOSSES[loss](leaf), axis=None))
     dr.backward(dr.sum(LOSSES[loss](image), axis=None))
     weights = {name: np.asarray(dr.grad(getattr(leaf, name))) for name in OUTPUTS}
     expected = gradients(gaussians, camera, weights, ("log_scales",))["log_scales"]
-    assert relative_error(gradients_of(model, ["log_scales"])["log_scales"], expected) < 1e-5
+    assert relative_error(scenes.gradients_of(model, ["log_scales"])["log_scales"], expected) < 1e-5
 
 
 def test_gradient_stops_where_a_scale_is_clamped():
     gaussians, camera = case(1)
     scales = gaussians.log_scales.copy()
     scales[2, 1], scales[4, 0] = -30, 30
-    found = gradients(changed(gaussians, log_scales=scales), camera, image_weights(camera))
+    found = gradients(scenes.changed(gaussians, log_scales=scales), camera, image_weights(camera))
     assert found["log_scales"][2, 1] == found["log_scales"][4, 0] == 0
     assert all(np.isfinite(g).all() for g in found.values())
 
@@ -182,7 +162,7 @@ def test_gradient_for_any_scene(seed, degree, scale, stretch, logit, focal, anti
 
 def assert_as_differences(gaussians, tangents, camera) -> None:
     found = images(jvp(gaussians, tangents, camera, BACKGROUND))
-    expected = difference(gaussians, tangents, camera, BACKGROUND)
+    expected = scenes.difference(gaussians, tangents, camera, BACKGROUND)
     for output in OUTPUTS:
         assert found[output].shape == expected[output].shape
         assert relative_error(found[output], expected[output]) < TANGENT, output
@@ -216,7 +196,6 @@ def test_tangents_and_gradients_are_of_one_jacobian(
 
 
 def test_forward_mode_of_drjit_through_render():
-    """`dr.forward` from a number t that moves parameters and background."""
     gaussians, camera = case(1)
     tangents = random_tangents(gaussians)
     t = mi.Float(0)
@@ -260,7 +239,6 @@ def test_what_is_not_named_does_not_change():
 
 @pytest.mark.parametrize("size", [(1, 1), (9, 5), (150, 70)])
 def test_any_image_size(size):
-    """Several tiles, too, and images whose last blocks reach beyond the edge."""
     camera = make_camera(size, focal=0.8 * max(size))
     gaussians = calm(lambda seed: make_gaussians(16, seed, log_scales=(-4.0, -1.5)), camera, 3)
     assert_as_differences(gaussians, random_tangents(gaussians), camera)
@@ -287,7 +265,6 @@ def test_bad_tangents_are_one_line(tangents, message):
 )
 @pytest.mark.parametrize("degree", [0, 3])
 def test_images_are_differentiated_by_the_pose_and_the_focal_length(degree, start):
-    """Forward and reverse, by six numbers of the pose and the logarithm of the focal length."""
     camera = make_camera()
     weights = image_weights(camera)
 

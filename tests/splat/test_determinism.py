@@ -13,14 +13,8 @@ from mgs import runtime
 from mgs.gaussians import ARRAYS
 from mgs.splat import ListCache, fisher, jvp, render
 
-from .scenes import (
-    gradients_of,
-    in_own_process,
-    make_camera,
-    make_gaussians,
-    thread_count,
-    with_gradients,
-)
+from . import scenes
+from .scenes import gradients_of, in_own_process, make_camera, make_gaussians, thread_count
 
 BACKGROUND = (0.1, 0.2, 0.7)
 
@@ -40,7 +34,7 @@ def results() -> dict[str, bytes]:
     """Bytes of images, gradients and tangents by all parameters, and Fisher information by every
     estimator."""
     gaussians, camera = scene()
-    model = with_gradients(gaussians)
+    model = scenes.with_gradients(gaussians)
     image = render(model, camera, BACKGROUND)
     out = {name: np.asarray(dr.detach(value)) for name, value in vars(image).items()}
     of_depth = dr.sum(image.alpha * image.depth, axis=None)
@@ -83,7 +77,7 @@ def test_faint_derivatives_are_deterministic_too(scale):
     derivatives = []
     for threads in (1, 2):
         with thread_count(threads):
-            model = with_gradients(gaussians)
+            model = scenes.with_gradients(gaussians)
             rgb = render(model, camera).rgb
             dr.backward(dr.sum(rgb * mi.TensorXf(np.float32(scale) * weight), axis=None))
             tangents = vars(jvp(gaussians, ones(gaussians, scale), camera))

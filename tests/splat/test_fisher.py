@@ -12,16 +12,8 @@ from hypothesis import strategies as st
 from mgs.errors import InputError
 from mgs.splat import MEANS, fisher, groups, information, reference, render
 
-from .scenes import (
-    calm,
-    changed,
-    gradients_of,
-    make_camera,
-    make_clamped,
-    make_gaussians,
-    relative_error,
-    with_gradients,
-)
+from . import scenes
+from .scenes import calm, changed, make_camera, make_clamped, make_gaussians, relative_error
 
 BACKGROUND = (0.3, 0.6, 0.1)
 TOLERANCE = 1e-3
@@ -97,9 +89,9 @@ def test_recorded_kernels_know_numbers_of_gaussians_from_other_numbers():
         assert_right(g, camera)
         expected = reference.jacobian(g, camera, BACKGROUND).sum((0, 1))[:, :3]
         for names in (["sh"], ["sh", "means"]):
-            model = with_gradients(g, names)
+            model = scenes.with_gradients(g, names)
             dr.backward(dr.sum(render(model, camera, BACKGROUND).rgb, axis=None))
-            found = gradients_of(model, ["sh"])["sh"][:, 0]
+            found = scenes.gradients_of(model, ["sh"])["sh"][:, 0]
             np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
@@ -126,7 +118,6 @@ def test_images_of_several_tiles(means):
 def test_exact_and_block_for_any_scene(
     seed, degree, scale, stretch, logit, background, eye, means, weight, antialiased
 ):
-    """eye: azimuth and height."""
     azimuth, height = eye
     camera = make_camera(eye=(2 * np.cos(azimuth), 2 * np.sin(azimuth), height))
     style = {"log_scales": (scale - stretch, scale), "logits": (logit - 4, logit)}

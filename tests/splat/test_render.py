@@ -44,7 +44,6 @@ def errors(gaussians, camera, background) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_errors_and_flipped_pixels():
-    """In scenes of five styles, four SH degrees and three seeds."""
     results, eyes = [], ((2.0, 0.4, 1.1), (-1.2, 1.5, 0.3), (0.1, -0.2, 2.5))
     for number, style in enumerate(STYLES.values()):
         for degree in range(4):

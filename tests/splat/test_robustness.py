@@ -18,17 +18,8 @@ from mgs.splat import ESTIMATORS, ListCache, fisher, jvp, reference, render
 from mgs.splat.constants import NEAR
 from mgs.splat.recording import frozen
 
-from .scenes import (
-    SIZE,
-    changed,
-    gradients_of,
-    make_camera,
-    make_gaussians,
-    margins,
-    place,
-    relative_error,
-    with_gradients,
-)
+from . import scenes
+from .scenes import SIZE, changed, gradients_of, make_camera, make_gaussians, place, with_gradients
 from .test_render import errors
 
 BACKGROUND = (0.2, 0.5, 0.7)
@@ -189,11 +180,10 @@ def test_gradient_of_the_background_is_what_shines_through(n):
 
 
 def test_gradient_of_extreme_scenes_is_right_too():
-    """1:1000 and opacity logits of 20 at once."""
     g = thin(1e3)
     g.logit_opacities[::2] = 20
     weights = np.random.default_rng(0).normal(size=(SIZE[1], SIZE[0], 3))
-    weights[margins(g, CAMERA) <= 1e-4] = 0
+    weights[scenes.margins(g, CAMERA) <= 1e-4] = 0
     model = with_gradients(g, ARRAYS[1:])
     rgb = render(model, CAMERA, BACKGROUND).rgb
     dr.backward(dr.sum(rgb * mi.TensorXf(weights.astype(np.float32)), axis=None))
@@ -201,7 +191,7 @@ def test_gradient_of_extreme_scenes_is_right_too():
     expected = np.tensordot(weights.reshape(-1, 3), J, axes=([0, 1], [0, 1]))
     found, parts = gradients_of(model, ARRAYS[1:]), np.split(expected, (3, 6, 10), axis=1)
     for name, part in zip(("sh", *ARRAYS[1:4]), parts, strict=True):
-        assert relative_error(found[name], part) < 1e-4, name
+        assert scenes.relative_error(found[name], part) < 1e-4, name
 
 
 @pytest.mark.parametrize("name", ARRAYS)
@@ -220,7 +210,6 @@ def test_not_a_number_names_the_parameter_and_the_first_gaussian(name):
 
 
 def test_opacities_of_extreme_logits():
-    """No warning of an overflow either."""
     logits = np.array([-3e38, -1000, -80, 0, 2, 1000], np.float32)
     g = changed(make_gaussians(len(logits), 0), logit_opacities=logits)
     expected = [0, 0, np.exp(-80.0), 0.5, 1 / (1 + np.exp(-2.0)), 1]
@@ -273,7 +262,6 @@ def test_shapes_that_do_not_fit_are_an_error(name, shape, message):
 
 
 def test_no_variant_is_named_in_the_code():
-    """Kernels and plugins run on any variant."""
     folders = [Path(mgs.splat.__file__).parent, Path(mgs.splat.__file__).parents[2] / "plugins"]
     files = [path for folder in folders for path in folder.rglob("*.py")]
     assert len(files) >= 6
