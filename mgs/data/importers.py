@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -91,15 +92,8 @@ def import_source(
         if source.sparse is not None:
             write_cloud(out / "sparse.ply", source.sparse)
         if tests is not None and not (out / TEST_FOLDER / "transforms.json").is_file():
-            import_source(
-                tests,
-                out / TEST_FOLDER,
-                masks=masks,
-                mesh=mesh,
-                downscale=downscale,
-                up=up,
-                on_frame=on_frame,
-            )
+            how: Any = {"masks": masks, "mesh": mesh, "downscale": downscale, "up": up}
+            import_source(tests, out / TEST_FOLDER, **how, on_frame=on_frame)
         world = World(up, source.unit or "unit", source.origin)
         upright = [replace(frame, camera=world.enter(frame.camera)) for frame in frames]
         place = {"place": source.place} if source.place and up == PLUS_Z else {}

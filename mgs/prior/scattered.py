@@ -89,12 +89,8 @@ def scattered(
     ball = trimesh.creation.icosphere(3, radius)
     mesh = Mesh(ball.vertices + middle, ball.faces, np.ones(len(ball.faces), bool))
     numbers: dict[str, Any] = {"n": count, "triangulated": len(cloud), "spacing": spacing}
-    numbers |= {
-        "radius": radius,
-        "depth_tolerance": 2 * radius,
-        "backed": 0,
-        "settings": asdict(settings),
-    }
+    numbers |= {"radius": radius, "depth_tolerance": 2 * radius, "backed": 0}
+    numbers |= {"settings": asdict(settings)}
     return mesh, points, normals, spacing, numbers
 
 

@@ -38,56 +38,38 @@ class Lobe(_Strict):
 class Rock(_Strict):
     """The rock: body, weathering, colour."""
 
-    size: Positive = 1.8
-    """Longest side of its bounding box, metres; a mesh given by `mesh` is scaled to it too."""
-    buried: Annotated[float, Field(ge=0, lt=1)] = 0.12
-    """Share of its height below the ground."""
+    size: Positive = 1.8  # longest side, metres; a mesh given by `mesh` is scaled to it too
+    buried: Annotated[float, Field(ge=0, lt=1)] = 0.12  # share of its height below the ground
     lobes: Annotated[tuple[Lobe, ...], Field(min_length=1)] = (Lobe(radii=(1.0, 0.8, 0.72)),)
-    facets: Annotated[int, Field(ge=0)] = 16
-    """Planes that cut each lobe."""
-    relief: Fraction = 0.06
-    """Amplitude of the coarsest displacement, as a share of the size."""
-    cracks: Fraction = 0.012
-    """Depth of cracks, as a share of the size."""
-    layers: Annotated[int, Field(ge=0)] = 0
-    """Number of strata over the height; 0 for none."""
-    plain_half: bool = False
-    """Leave the half at negative x without albedo texture."""
-    colours: tuple[Colour, Colour] = ((0.30, 0.24, 0.19), (0.14, 0.115, 0.10))
-    """Light and dark mineral."""
-    dust: Colour = (0.42, 0.30, 0.20)
-    """Dust on faces that look up."""
-    specular: Fraction = 0.3
-    """Strength of the mirror-like reflection (Mitsuba's `principled`): 0 for none, 0.5 as of glass.
-    """
-    roughness: Annotated[float, Field(gt=0, le=1)] = 0.8
-    """Width of that reflection: the smaller, the sharper the highlights."""
-    detail: Positive = 0.011
-    """Length of a mesh edge, metres."""
+    facets: Annotated[int, Field(ge=0)] = 16  # planes that cut each lobe
+    relief: Fraction = 0.06  # amplitude of the coarsest displacement, as a share of the size
+    cracks: Fraction = 0.012  # depth of cracks, as a share of the size
+    layers: Annotated[int, Field(ge=0)] = 0  # number of strata over the height; 0 for none
+    plain_half: bool = False  # leave the half at negative x without albedo texture
+    colours: tuple[Colour, Colour] = ((0.30, 0.24, 0.19), (0.14, 0.115, 0.10))  # light, dark
+    dust: Colour = (0.42, 0.30, 0.20)  # dust on faces that look up
+    specular: Fraction = 0.3  # of `principled` (Mitsuba): 0 for no reflection, 0.5 as of glass
+    roughness: Annotated[float, Field(gt=0, le=1)] = 0.8  # width of it: smaller is sharper
+    detail: Positive = 0.011  # length of a mesh edge, metres
 
 
 class Arena(_Strict):
     """The ground: regolith with grain, undulation and small stones."""
 
     colour: Colour = (0.36, 0.26, 0.18)
-    undulation: Annotated[float, Field(ge=0)] = 0.02
-    """Amplitude of the terrain near the rock, metres."""
+    undulation: Annotated[float, Field(ge=0)] = 0.02  # amplitude near the rock, metres
     stones: Annotated[int, Field(ge=0)] = 700
-    stone_size: Positive = 0.05
-    """Median diameter, metres; sizes follow a power law up to `largest_stone`."""
+    stone_size: Positive = 0.05  # median diameter, metres; a power law up to `largest_stone`
     largest_stone: Positive = 0.16
-    spread: Positive = 12.0
-    """Stones lie within this distance of the rock's axis, metres."""
-    clearance: Positive = 1.15
-    """Stones keep this far from the rock, as a multiple of its radius."""
+    spread: Positive = 12.0  # stones lie within this distance of the rock's axis, metres
+    clearance: Positive = 1.15  # stones keep this far from the rock, as a multiple of its radius
 
 
 class Sky(_Strict):
     """Sun and clear sky (Hosek-Wilkie, Mitsuba's `sunsky`)."""
 
     sun_elevation: Annotated[float, Field(gt=0, le=90)] = 42
-    sun_azimuth: float = 35
-    """Counter-clockwise from +x."""
+    sun_azimuth: float = 35  # counter-clockwise from +x
     turbidity: Annotated[float, Field(ge=1, le=10)] = 3.5
     sun_scale: Positive = 1.0
     sky_scale: Positive = 1.0
@@ -96,25 +78,19 @@ class Sky(_Strict):
 class Lens(_Strict):
     """The camera; the image size comes from the preset."""
 
-    fov: Annotated[float, Field(gt=1, lt=150)] = 44
-    """Horizontal field of view."""
+    fov: Annotated[float, Field(gt=1, lt=150)] = 44  # horizontal field of view
 
 
 class Orbit(_Strict):
     """Positions of the cameras, which all look at the middle of the rock."""
 
     kind: OrbitKind = "circle"
-    radius: Positive = 4.0
-    """Distance from the rock's axis (circle) or from its middle (the others)."""
-    altitude: Annotated[float, Field(ge=0)] = 2.3
-    """Height above the ground (circle)."""
-    elevations: tuple[Elevation, Elevation] = (12, 65)
-    """Lowest and highest elevation above the rock's middle (the others)."""
-    turns: Positive = 3
-    """Turns of the spiral, or number of rings."""
+    radius: Positive = 4.0  # from the rock's axis (circle) or its middle (the others)
+    altitude: Annotated[float, Field(ge=0)] = 2.3  # height above the ground (circle)
+    elevations: tuple[Elevation, Elevation] = (12, 65)  # above the rock's middle (the others)
+    turns: Positive = 3  # turns of the spiral, or number of rings
+    # Factors on the distance from the middle, in turn: (1, 2, 3) mixes near and far views.
     distances: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1,)
-    """Factors on the distance from the rock's middle, in turn: (1, 2, 3) mixes near and far views.
-    """
 
 
 MOST_ERROR = 100.0  # largest factor on sensor errors: odometry then errs by as much as it moves
@@ -123,10 +99,8 @@ MOST_ERROR = 100.0  # largest factor on sensor errors: odometry then errs by as 
 class Sensor(_Strict):
     """Errors of the sensors of `mgs survey`; `mgs synth-orbit` has none."""
 
-    noise: Annotated[float, Field(ge=0, le=MOST_ERROR)] = 1.0
-    """Factor on the depth camera's noise (`mgs.survey.depth_sensor`)."""
-    drift: Annotated[float, Field(ge=0, le=MOST_ERROR)] = 1.0
-    """Factor on the odometry's drift (`mgs.survey.registration`)."""
+    noise: Annotated[float, Field(ge=0, le=MOST_ERROR)] = 1.0  # factor on `survey.depth_sensor`
+    drift: Annotated[float, Field(ge=0, le=MOST_ERROR)] = 1.0  # factor on `survey.registration`
 
 
 class SceneFile(_Strict):
