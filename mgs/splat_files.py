@@ -219,17 +219,17 @@ def _read_spz(path: Path) -> Gaussians:
             copy.write(gzip.compress(data, 1))
             copy.flush()
         antialiased, axes = _spz_marks(data)
-        found = codec.read_spz(copy.name if version == 1 else str(path))
+        fields = codec.read_spz(copy.name if version == 1 else str(path))
         if version == 1:
-            found["means"] = halves
-        parts = [found["sh0"][:, None, :]]
-        if found["shN"] is not None and found["shN"].size:
-            parts.append(found["shN"])
+            fields["means"] = halves
+        parts = [fields["sh0"][:, None, :]]
+        if fields["shN"] is not None and fields["shN"].size:
+            parts.append(fields["shN"])
         g = Gaussians(
-            means=found["means"],
-            log_scales=found["scales"],
-            quats=found["quats"],
-            logit_opacities=found["opacities"],
+            means=fields["means"],
+            log_scales=fields["scales"],
+            quats=fields["quats"],
+            logit_opacities=fields["opacities"],
             sh=np.concatenate(parts, axis=1),
             antialiased=antialiased,
             linear=False,

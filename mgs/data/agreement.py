@@ -82,7 +82,7 @@ def agreement(frames: Sequence[Frame], matcher: Matcher, masked: bool = True) ->
         pairs.append((one, other))
         if len(a) >= max(LEAST_MATCHES, LEAST_SHARE * count):
             matched.append((one.camera, other.camera, a, b))
-    limit, found = WRONG * frames[0].camera.width, []
+    limit, verdicts = WRONG * frames[0].camera.width, []
     if len(matched) >= LEAST_PAIRS:
         count = sum(len(points) for _, _, points, _ in matched)
 
@@ -90,7 +90,7 @@ def agreement(frames: Sequence[Frame], matcher: Matcher, masked: bool = True) ->
             each = [np.median(_epipolar_error(*pair, convention, zoom)) for pair in matched]
             return float(np.quantile(each, SOUND, method="higher"))
 
-        found.append(
+        verdicts.append(
             _judged(by_matches, f"{count:,} points matched in neighbouring pictures", limit)
         )
     if all(frame.depth_path for pair in pairs for frame in pair) and pairs:
@@ -101,10 +101,10 @@ def agreement(frames: Sequence[Frame], matcher: Matcher, masked: bool = True) ->
             return float(np.quantile(each, 0.5, method="lower"))
 
         what = f"the depth of {len(pairs)} pairs of neighbouring pictures"
-        found.append(_judged(by_depth, what, limit, lengths=True))
-    if masked and not found and len(outlines := _outlines(frames)) >= LEAST_OUTLINES:
-        found.append(_by_outlines(outlines))
-    compared = [one for one in found if one]
+        verdicts.append(_judged(by_depth, what, limit, lengths=True))
+    if masked and not verdicts and len(outlines := _outlines(frames)) >= LEAST_OUTLINES:
+        verdicts.append(_by_outlines(outlines))
+    compared = [one for one in verdicts if one]
     wrong = [one for one in compared if one.problem]
     return [*wrong, *compared, _directions([frame.camera for frame in frames])][0]
 
@@ -114,14 +114,14 @@ def _outlines(frames: Sequence[Frame]) -> list[tuple[Camera, np.ndarray]]:
     empty or reach the edge of the picture."""
     import cv2
 
-    found = []
+    outlines = []
     for frame in frames[:: 1 + len(frames) // (2 * PAIRS)]:
         inner = frame.mask()[1:-1, 1:-1] if frame.mask_path else np.zeros((1, 1), bool)
         if inner.any() and inner.sum() == frame.mask().sum():
             y, x = np.nonzero(inner)
             corners = cv2.convexHull(np.column_stack([x, y]).astype(np.int32))[:, 0]
-            found.append((frame.camera, corners + 1.5))
-    return found
+            outlines.append((frame.camera, corners + 1.5))
+    return outlines
 
 
 def _by_outlines(seen: Sequence[tuple[Camera, np.ndarray]]) -> Agreement | None:
@@ -176,11 +176,11 @@ def observed(seen: Sequence[tuple[Camera, np.ndarray, np.ndarray]]) -> Agreement
         return None
 
     def error(convention: Convention, zoom: float) -> float:
-        found = []
+        distances = []
         for camera, points, pixels in seen:
             place, _, z = _projected(points, camera, convention(camera.world_to_camera), zoom)
-            found.append(np.where(z > 0, np.linalg.norm(place - pixels, axis=1), np.inf))
-        return float(np.median(np.concatenate(found)))
+            distances.append(np.where(z > 0, np.linalg.norm(place - pixels, axis=1), np.inf))
+        return float(np.median(np.concatenate(distances)))
 
     return _judged(
         error, f"{count:,} places where pictures show its points", WRONG * seen[0][0].width

@@ -117,15 +117,15 @@ def as_captured(frame: Frame, world: World = UPRIGHT) -> Frame:
         if record.get("given_up"):
             return replace(frame, given_up=True)
         depth = frame.image_path.parent.parent / "depth" / f"{frame.name}.exr"
-        found = replace(
+        picture = replace(
             frame, capture_path=path, depth_path=depth if record["depth"] else frame.depth_path
         )
         if record["camera"] is None:
-            return found
+            return picture
         camera = world.enter(Camera(**record["camera"]))
     except (AttributeError, TypeError, KeyError, ValueError, InputError):
         raise InputError(f"{path}: is damaged; delete it to capture the frame again") from None
-    return replace(found, asked=frame.camera, camera=camera)
+    return replace(picture, asked=frame.camera, camera=camera)
 
 
 def as_asked(frame: Frame) -> Frame:
@@ -136,11 +136,11 @@ def as_asked(frame: Frame) -> Frame:
 
 def moves(given: Sequence[Frame], frames: Sequence[Frame]) -> dict[str, dict[str, float]]:
     """Move of each frame's pose, by name: degrees, and length in the dataset's unit."""
-    found = {}
+    by_name = {}
     for old, new in zip(given, frames, strict=True):
         motion = old.camera.world_to_camera @ new.camera.camera_to_world
         chord = np.linalg.norm(motion[:3, :3] - np.eye(3)) / np.sqrt(8)
         turn = 2 * np.degrees(np.arcsin(min(chord, 1.0)))
         shift = float(np.linalg.norm(motion[:3, 3]))
-        found[old.name] = {"degrees": round(float(turn), 4), "length": shift}
-    return found
+        by_name[old.name] = {"degrees": round(float(turn), 4), "length": shift}
+    return by_name

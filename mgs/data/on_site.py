@@ -33,8 +33,8 @@ DOWNSCALE = 3  # width of the copies over that of the dataset's images, which ra
 def holds_photographs(folder: Path) -> bool:
     """Whether a folder holds photographs alone, and no dataset, run or other source."""
     names = ("transforms.json", "transforms_train.json", "config.json", "sparse")
-    known = any((folder / name).exists() for name in names)
-    return folder.is_dir() and not known and bool(photographs_in(folder))
+    other = any((folder / name).exists() for name in names)
+    return folder.is_dir() and not other and bool(photographs_in(folder))
 
 
 def dataset_at(folder: Path, site: Path) -> tuple[Dataset, Sequence[str]]:

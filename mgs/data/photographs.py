@@ -78,12 +78,12 @@ def read_photographs(
                 f"of which shows most of what the one before shows{_and_names(why | dropped)}"
             )
         georeferenced = _to_gps(models[0], database)
-    found = source_of(models[0], files, f"{source}: photograph", KIND)
-    shots = [_turned(shot) for shot in found.shots]
+    largest = source_of(models[0], files, f"{source}: photograph", KIND)
+    shots = [_turned(shot) for shot in largest.shots]
     why |= dropped
     lines = (f"left out {names}" for names in _by_reason(why))
     left_out = Counter(why.values())
-    result = replace(found, shots=shots, left_out=left_out, notes=tuple(lines))
+    result = replace(largest, shots=shots, left_out=left_out, notes=tuple(lines))
     if georeferenced is None:
         return result
     note = f"GPS gives scale and place: the world's 0 is at {georeferenced}"
@@ -225,10 +225,10 @@ def _to_gps(model: Any, database: Any) -> str | None:
     if extent == 0 or spread[1] < GPS_ERROR * spread[0]:  # on a line, which may turn about itself
         return None
     options = pycolmap.RANSACOptions(max_error=GPS_ERROR * extent, random_seed=0)
-    found = pycolmap.estimate_sim3d_robust(eyes, metres, options)
-    if found is None:
+    estimate = pycolmap.estimate_sim3d_robust(eyes, metres, options)
+    if estimate is None:
         return None
-    similarity = found["tgt_from_src"] if isinstance(found, dict) else found
+    similarity = estimate["tgt_from_src"] if isinstance(estimate, dict) else estimate
     moved = np.stack([similarity * eye for eye in eyes])
     if np.median(np.linalg.norm(moved - metres, axis=1)) > GPS_ERROR * extent:
         return None

@@ -171,7 +171,7 @@ def _named(folder: Path, images: Path | None, name: str) -> Path | None:
         return find_image(path.parent, path.name)
     parts = PureWindowsPath(name).parts
     ends = ("/".join(parts[k:]) for k in range(len(parts)))
-    return next((found for end in ends if (found := find_image(images, end))), None)
+    return next((image for end in ends if (image := find_image(images, end))), None)
 
 
 def _read_transforms(path: Path, images: Path | None) -> Source:

@@ -49,17 +49,17 @@ class Matcher:
         self.folder, self.database = folder, folder / "database.db"
         about = [[str(path.resolve()), path.stat().st_mtime_ns] for path in pictures]
         record = folder / "pictures.json"
-        known = read_json(record) if record.is_file() else []
-        if any(picture not in about for picture in known):
-            known = []
-        order = [*known, *(picture for picture in about if picture not in known)]
+        before = read_json(record) if record.is_file() else []
+        if any(picture not in about for picture in before):
+            before = []
+        order = [*before, *(picture for picture in about if picture not in before)]
         # Names of any characters become plain ones.
         places = [order.index(picture) for picture in about]
         self.names = [f"{k:06d}{path.suffix}" for k, path in zip(places, pictures, strict=True)]
-        if not known:
+        if not before:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
-        if order != known:
+        if order != before:
             for name, path in zip(self.names, pictures, strict=True):
                 if not (folder / name).exists():
                     _link_upright(path, folder / name)
@@ -106,13 +106,13 @@ class Matcher:
         groups = defaultdict[str, list[int]](list)
         numbers = dict[str, int]()
         with closing(pycolmap.Database.open(self.database)) as database:
-            known = {
+            with_features = {
                 image.name
                 for image in database.read_all_images()
                 if database.exists_keypoints(image.image_id)
             }
             for place in places:
-                if self.names[place] not in known:
+                if self.names[place] not in with_features:
                     groups[str(self.cameras[place].todict())].append(place)
             for key, members in groups.items():
                 numbers[key] = database.write_camera(self.cameras[members[0]])
@@ -269,8 +269,8 @@ def cloud_of(reconstruction: Any) -> SparseCloud | None:
         return None
     directions, error = np.stack(views), np.array(errors)
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
-    known = error if (error >= 0).all() else None
-    return SparseCloud(np.stack(points), directions, np.array(tracks), known)
+    errors_px = error if (error >= 0).all() else None
+    return SparseCloud(np.stack(points), directions, np.array(tracks), errors_px)
 
 
 def refined(
