@@ -15,6 +15,8 @@ from mgs.data.frames import Frame
 from mgs.data.meshes import to_glb
 from mgs.files import read_json
 from mgs.images import write_exr, write_png
+from mgs.prior.build import prior_from_mesh, save_prior
+from mgs.prior.settings import PriorSettings
 
 CENTRE = np.array([0.1, -0.05, 0.2])
 AXES = np.array([0.6, 0.5, 0.45])
@@ -95,6 +97,14 @@ def write_dataset(
         (root / "rock.glb").write_bytes(to_glb(rock_mesh(*rocks[0])))
     write_transforms(root, frames)
     return load_dataset(root)
+
+
+def write_rock(root: Path, cameras: list[Camera], gaussians: int) -> Dataset:
+    """As write_dataset, with the prior of its mesh in its folder `prior`."""
+    dataset = write_dataset(root, cameras)
+    prior = prior_from_mesh(root / "rock.glb", PriorSettings(gaussians=gaussians))
+    save_prior(root / "prior", prior)
+    return dataset
 
 
 def edit(

@@ -14,8 +14,6 @@ from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset, target_of, write_transforms
 from mgs.evaluation import evaluate_model, render_view
 from mgs.images import write_png
-from mgs.prior.build import prior_from_mesh, save_prior
-from mgs.prior.settings import PriorSettings
 from mgs.run import detectors
 from mgs.run.checks import predicted_psnr
 from mgs.run.detectors import DETECTORS, ViewIndicators, alarms, step_indicators, view_indicators
@@ -190,9 +188,7 @@ def test_drift_is_in_standard_deviations_of_the_prior():
 def rock(tmp_path_factory):
     """A dataset of an ellipsoid, with its prior."""
     root = tmp_path_factory.mktemp("rock") / "dataset"
-    synthetic.write_dataset(root, synthetic.orbit_cameras(10, 64, 48))
-    save_prior(root / "prior", prior_from_mesh(root / "rock.glb", PriorSettings(gaussians=600)))
-    return root
+    return synthetic.write_rock(root, synthetic.orbit_cameras(10, 64, 48), 600).root
 
 
 def warnings(state) -> list[str]:

@@ -16,9 +16,7 @@ from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.files import read_json
 from mgs.images import exif_exposure, write_png
 from mgs.metrics import colour_corrected
-from mgs.prior.build import prior_from_mesh, save_prior
 from mgs.prior.exposure import DARK, GAIN_STD, RATIO_STD, SATURATED, solve_gains
-from mgs.prior.settings import PriorSettings
 from mgs.reports.evaluation import evaluate_run
 from mgs.reports.tables import markdown_table
 from mgs.run.folder import Checkpoint, read_checkpoint
@@ -108,9 +106,7 @@ def rock(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "albedo", albedo)
-        synthetic.write_dataset(root, synthetic.orbit_cameras(16, 64, 48))
-    save_prior(root / "prior", prior_from_mesh(root / "rock.glb", PriorSettings(gaussians=600)))
-    return root
+        return synthetic.write_rock(root, synthetic.orbit_cameras(16, 64, 48), 600).root
 
 
 def gain_of(dataset: Dataset) -> np.ndarray:

@@ -22,7 +22,7 @@ from mgs.data.meshes import read_mesh
 from mgs.data.sources import read_source
 from mgs.fit import objective
 from mgs.memory import PADDING, adopted, kept_within, padded
-from mgs.prior.build import build_prior, prior_from_mesh, save_prior
+from mgs.prior.build import build_prior
 from mgs.prior.settings import PriorSettings
 from mgs.run.nbv import run_nbv
 
@@ -69,9 +69,7 @@ class Live:
 @pytest.fixture(scope="module")
 def rock(tmp_path_factory):
     root = tmp_path_factory.mktemp("rock") / "dataset"
-    dataset = synthetic.write_dataset(root, synthetic.orbit_cameras(9, 48, 36))
-    save_prior(root / "prior", prior_from_mesh(root / "rock.glb", PriorSettings(gaussians=300)))
-    return dataset
+    return synthetic.write_rock(root, synthetic.orbit_cameras(9, 48, 36), 300)
 
 
 def test_a_run_holds_few_images_at_once_and_finds_the_same(rock, tmp_path, monkeypatch):

@@ -10,15 +10,13 @@ import synthetic
 from program import study
 
 from mgs.data.dataset import load_dataset
-from mgs.prior.build import prior_from_mesh, save_prior
-from mgs.prior.settings import PriorSettings
 from studies import faults, stress
 from studies.frame.claim import Claim
 from studies.frame.output import Panel
 from studies.frame.sweep import Cell
 from studies.stress import Experiment, open_lab
 
-FOLDERS = {"dataset": "dataset", "prior": "prior"}
+FOLDERS = {"dataset": "dataset", "prior": "dataset/prior"}
 
 
 def test_detectors_are_judged_by_false_and_missed_alarms():
@@ -37,17 +35,15 @@ def test_detectors_are_judged_by_false_and_missed_alarms():
 def root(tmp_path_factory):
     """Folder with the dataset and the prior of a small rock."""
     folder = tmp_path_factory.mktemp("study")
-    synthetic.write_dataset(folder / "dataset", synthetic.orbit_cameras(10, 48, 36))
+    synthetic.write_rock(folder / "dataset", synthetic.orbit_cameras(10, 48, 36), 300)
     cameras = synthetic.orbit_cameras(3, 48, 36, altitude=2.0)
     synthetic.write_dataset(folder / "dataset/test", cameras)
-    mesh = folder / "dataset/rock.glb"
-    save_prior(folder / "prior", prior_from_mesh(mesh, PriorSettings(gaussians=300)))
     return folder
 
 
 @pytest.fixture
 def lab(root):
-    return open_lab(root / "dataset", root / "prior")
+    return open_lab(root / "dataset", root / "dataset/prior")
 
 
 @pytest.mark.parametrize("name", faults.IMAGE_FAULTS)

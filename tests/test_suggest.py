@@ -30,9 +30,7 @@ from mgs.run.suggest import coarse_prior, suggest
 def run(tmp_path_factory):
     """A run of three seeds on one side of an ellipsoid, of 14 poses on a circle of 2.6 m."""
     folder = tmp_path_factory.mktemp("suggest")
-    data = synthetic.write_dataset(folder / "data", synthetic.orbit_cameras(14, 48, 36)[:8])
-    prior = mgs.prior_from_mesh(data.root / "rock.glb", mgs.PriorSettings(gaussians=300))
-    mgs.save_prior(data.root / "prior", prior)
+    data = synthetic.write_rock(folder / "data", synthetic.orbit_cameras(14, 48, 36)[:8], 300)
     mgs.run_nbv(data.root, folder / "run", seeds=8, budget=0)
     return folder / "run"
 
