@@ -27,7 +27,7 @@ from mgs.images import read_mask
 from mgs.reports.evaluation import compare_models, evaluate
 from mgs.reports.exporting import in_srgb, to_y_up
 from mgs.rotation import rotmat_from_quat
-from mgs.run.folder import open_run
+from mgs.run.folder import Run, open_run, write_checkpoint
 from mgs.splat import reference, render
 from mgs.splat.reference import sh_basis
 from mgs.splat_files import FORMATS, load_gaussians, upward, write_gaussians
@@ -363,6 +363,30 @@ def test_the_export_of_a_run_fits_its_colours_again(dataset, prior, tmp_path, ca
     command("export", tmp_path / "fitted.ply", "--to", "ply", "--out", tmp_path / "same.ply")
     assert "one by one" not in capsys.readouterr().out
     assert read_ply(tmp_path / "same.ply") == fitted
+
+
+def test_a_scene_is_exported_without_what_no_view_shows(
+    dataset, prior, tmp_path, capsys, monkeypatch
+):
+    """A Gaussian behind all cameras goes, and the views taken stay; of an object all stay."""
+    settings = {"prior": prior, "seeds": 4, "budget": 0, "train": {"passes": 1}}
+    run = mgs.run_nbv(dataset, tmp_path / "run", **settings)
+    cameras, model = (
+        [frame.camera for frame in run.taken],
+        run.gaussians[[*range(len(run.gaussians)), 0]],
+    )
+    model.means[-1, 2] = 1e3
+    H = sum(mgs.fisher(model, camera) for camera in cameras)
+    write_checkpoint(run.folder, replace(run.state, gaussians=model, H=H))
+    for of_scene in (False, True):
+        monkeypatch.setattr(Run, "of_scene", of_scene)
+        command("export", run.folder, "--to", "ply", "--out", tmp_path / "x.ply", "--force")
+        said, left = capsys.readouterr().out, read_ply(tmp_path / "x.ply")
+        assert ("no view taken shows" in said) is of_scene
+        assert (left.means[:, 2].max() > 100) is not of_scene
+        for camera in cameras:
+            rgb = [np.asarray(render(one, camera).rgb) for one in (model, left)]
+            np.testing.assert_allclose(*rgb, atol=0.02)
 
 
 def test_a_damaged_glb_is_refused_or_read(tmp_path):

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 import typer
 
 from mgs.cli.progress import progress_bar
@@ -83,7 +84,16 @@ def export(
         splats = splats.with_degree(max(sh or 0, splats.sh_degree))
         write_gaussians(path, splats, to, to_y_up(up))
         megabytes = path.stat().st_size / 1e6
-        echo(f"wrote {len(splats):,} Gaussians to {path} ({megabytes:.1f} MB)")
+        echo(f"wrote {len(splats):,} Gaussians to {path} ({megabytes:.1f} MB){_hidden(model)}")
+
+
+def _hidden(model: Path) -> str:
+    """How many Gaussians of a run are not written (`Run.shown`), to follow a line."""
+    from mgs.run.folder import open_run
+
+    count = np.count_nonzero(~open_run(model).shown) if model.is_dir() else 0
+    whole = f"{model / 'gaussians.ply'} has them"
+    return f"; left out {count:,} that no view taken shows; {whole}" if count else ""
 
 
 def _export_compact(

@@ -34,16 +34,16 @@ PART = 1 << 16
 
 
 def read_model(source: str | Path, prior: str | Path | None = None) -> tuple[Gaussians, Vector]:
-    """Read the model of a run folder, in the coordinates that its dataset was made of, or of a file
-    with the up that it has (`upward`). prior: as in `load_gaussians`. Raises InputError as
-    `open_run`, `Run.state` and `load_gaussians`."""
+    """Read the model that a run shows (`Run.shown`), in the coordinates that its dataset was made
+    of, or that of a file with the up that it has (`upward`). prior: as in `load_gaussians`. Raises
+    InputError as `open_run`, `Run.state` and `load_gaussians`."""
     source = Path(source)
     if not source.is_dir():
         return load_gaussians(source, prior), upward(source)
     if prior is not None:
         raise InputError(f"{source}: is a run, and needs no prior; leave out `prior`")
     run = open_run(source)
-    return as_imported(run, run.gaussians), run.dataset.world.up
+    return as_imported(run, run.gaussians[run.shown]), run.dataset.world.up
 
 
 def as_imported(run: Run, g: Gaussians) -> Gaussians:
@@ -86,7 +86,7 @@ def refit_in_srgb(run: Run, progress: Callable[[int, int], None]) -> Gaussians:
     frames = run.taken
     gains = exposure_of(run.prior)(frames) if run.settings.exposure else np.ones((len(frames), 3))
     targets = Deferred(range(len(frames)), lambda i: without_gain(target_of(frames[i]), gains[i]))
-    cameras, model = [frame.camera for frame in frames], in_srgb(run.state.gaussians)
+    cameras, model = [frame.camera for frame in frames], in_srgb(run.gaussians[run.shown])
     on_pass = lambda done, most, _: progress(done, most)  # noqa: E731
     return fit_gaussians(model, cameras, targets, REFIT, on_pass).gaussians
 

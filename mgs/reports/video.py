@@ -75,8 +75,8 @@ def path_among(cameras: Sequence[Camera], count: int, width: int) -> list[Camera
 def path_frames(run: Run, beside: str | None, count: int, width: int) -> Film:
     """Frames of a turntable, or of a whole scene among its cameras; with beside="uncertainty", the
     map of what is unknown to the right."""
-    model = run.state.gaussians
-    scalars = {"uncertainty": run_scalars(run)["uncertainty"]} if beside else {}
+    model = run.gaussians[run.shown]
+    scalars = {"uncertainty": run_scalars(run)["uncertainty"][run.shown]} if beside else {}
     path = camera_path(run.dataset, model.means, count, width)
     if run.of_scene:
         path = path_among([frame.camera for frame in run.taken], count, width)

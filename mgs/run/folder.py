@@ -25,6 +25,7 @@ from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, parsing, read_json, reading, write_json, write_text
 from mgs.gaussians import ARRAYS, Gaussians
 from mgs.notebook import cloud, html, thumbnails
+from mgs.policy.criteria import observed, regularisation
 from mgs.prior.build import Prior, load_prior
 from mgs.provenance import versions
 from mgs.run.ending import RunEnd
@@ -112,6 +113,15 @@ class Run:
     def of_scene(self) -> bool:
         """Whether its model is of a whole scene, not of one object: no surface and no masks."""
         return not self.dataset.outlined and self.prior.kind == "random"
+
+    @property
+    def shown(self) -> np.ndarray:
+        """Mask [N] of the Gaussians to show and to export: in a whole scene those about which the
+        views taken say more than a colour's prior (`mgs.policy.criteria.observed`). The surface of
+        an object is the prior's where no view saw it, and all of it is shown."""
+        if not self.of_scene:
+            return np.ones(len(self.gaussians), bool)
+        return observed(self.state.H, regularisation({"colour": slice(3)}))
 
     @property
     def planned(self) -> int:

@@ -137,8 +137,8 @@ def _read_run(run: Run, follow: bool) -> Subject:
     return replace(
         waiting,
         title=f"{name}: {run.label}, {count}",
-        gaussians=run.gaussians,
-        scalars={scalar: scalars[scalar] for scalar in SCALARS},
+        gaussians=run.gaussians[run.shown],
+        scalars={scalar: scalars[scalar][run.shown] for scalar in SCALARS},
         views=_views(run),
         of_scene=run.of_scene,
     )
