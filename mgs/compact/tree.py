@@ -63,19 +63,14 @@ def code_descendants(
 
 @dataclass(frozen=True)
 class Tree:
-    """Tree of N cells, and how their values are transformed.
-
-    merges: for each level, from cells to the root, the places of the left ones of its pairs of
-    children, and the weights of both. cut: level at which a node's sum becomes its mean: a node
-    stands for its cells where these are unknown. counts: cells of each node there. band, tile: [N]
-    of each coefficient: 0 to BANDS - 1; 0 above the cut, else the tile of the node there, from 1.
-    """
+    """Tree of N cells, and how their values are transformed. merges: for each level, from cells to
+    the root, the places of the left ones of its pairs of children, and the weights of both."""
 
     merges: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
-    cut: int
-    counts: np.ndarray
-    band: np.ndarray
-    tile: np.ndarray
+    cut: int  # level at which a node's sum becomes its mean, where its cells are unknown
+    counts: np.ndarray  # cells of each node there
+    band: np.ndarray  # [N] of each coefficient, 0 to BANDS - 1
+    tile: np.ndarray  # [N] 0 above the cut, else the tile of the node there, from 1
 
     def forward(self, values: np.ndarray, adjoint: bool = False) -> np.ndarray:
         """Coefficients [N,C] of values [N,C]. adjoint: those of a gradient by the values, which is

@@ -36,15 +36,11 @@ FURTHEST = 1e15  # largest coordinate of a mesh, metres: the squares of areas mu
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh: vertices [V,3] world, metres; faces [F,3] vertex indices; seen [F] bool.
+    """A triangle mesh."""
 
-    seen: faces that a survey saw. Only these are sampled; the others close holes of the
-    reconstruction.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    seen: np.ndarray
+    vertices: np.ndarray  # [V,3] world, metres
+    faces: np.ndarray  # [F,3] vertex indices
+    seen: np.ndarray  # [F] bool, by a survey: these alone are sampled, others close holes
 
     @property
     def crosses(self) -> np.ndarray:

@@ -27,15 +27,11 @@ ONE_WAY, CANCELLED = 0.9, 0.5  # least mean viewing direction, largest mean upwa
 
 @dataclass(frozen=True)
 class World:
-    """World of the files of a dataset.
+    """World of the files of a dataset."""
 
-    up: unit vector that points upwards in it. unit: name of its unit of length, "m", or "unit" if
-    unknown. origin: position of its origin in the data that was imported.
-    """
-
-    up: Vector = PLUS_Z
-    unit: str = "m"
-    origin: Vector = (0.0, 0.0, 0.0)
+    up: Vector = PLUS_Z  # unit vector that points upwards in it
+    unit: str = "m"  # name of its unit of length, "m", or "unit" if unknown
+    origin: Vector = (0.0, 0.0, 0.0)  # position of its origin in the data that was imported
 
     @cached_property
     def turn(self) -> np.ndarray:

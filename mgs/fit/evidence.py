@@ -38,17 +38,12 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Images:
-    """Input of a fit to V views.
-
-    targets: of each view, [H,W,4] with the weights of the pixels, or [H,W,5] with alpha after them
-    (`mgs.fit_gaussians`). start(views): the Gaussians before training, of degree 0, in the
-    colours of these views (indices). order: [V] indices of the views by azimuth.
-    """
+    """Input of a fit to V views."""
 
     cameras: Sequence[Camera]
-    targets: Sequence[np.ndarray]
-    start: Callable[[Sequence[int]], Gaussians]
-    order: Sequence[int]
+    targets: Sequence[np.ndarray]  # [H,W,4], with the weights of the pixels, or [H,W,5], and alpha
+    start: Callable[[Sequence[int]], Gaussians]  # of degree 0, coloured by these views (indices)
+    order: Sequence[int]  # [V] indices of the views by azimuth
 
     def __len__(self) -> int:
         return len(self.cameras)

@@ -146,17 +146,13 @@ class ParameterPrior:
 
 @dataclass(frozen=True)
 class Objective:
-    """Phi for some images (see the module). Models are Gaussians with TensorXf fields.
+    """Phi for some images (see the module). Models are Gaussians with TensorXf fields."""
 
-    photos: beyond IMAGE_BYTES, they are made from their targets at every use.
-    error: a name in LOSSES.
-    """
-
-    photos: Sequence[Photo]
+    photos: Sequence[Photo]  # beyond IMAGE_BYTES, made from their targets at every use
     prior: ParameterPrior
     cache: ListCache
     alpha_weight: float = 0.0
-    error: str = "squared"
+    error: str = "squared"  # a name in LOSSES
 
     def loss(self, model: Gaussians) -> float:
         """2 Phi over the number of pixel values: mean loss plus the prior's part."""

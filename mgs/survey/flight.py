@@ -38,17 +38,12 @@ STAGES = {  # estimated trajectories of a `Survey`, as they are made: field -> l
 
 @dataclass(frozen=True)
 class SurveySettings:
-    """Settings of a survey.
+    """Settings of a survey. Raises InputError if a factor is not from 0 to MOST_ERROR."""
 
-    sensor: factor on the depth camera's noise, 0 is exact; drift: factor on the errors of odometry;
-    exact_poses: use the true poses; seed: root seed. Raises InputError if a factor is not from 0
-    to MOST_ERROR.
-    """
-
-    sensor: float = 1.0
-    drift: float = 1.0
-    exact_poses: bool = False
-    seed: int = 0
+    sensor: float = 1.0  # factor on the depth camera's noise; 0 is exact
+    drift: float = 1.0  # factor on the errors of odometry
+    exact_poses: bool = False  # use the true poses
+    seed: int = 0  # root seed
 
     def __post_init__(self) -> None:
         if not (0 <= self.sensor <= MOST_ERROR and 0 <= self.drift <= MOST_ERROR):
