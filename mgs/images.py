@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
-from io import BytesIO
+from contextlib import contextmanager, redirect_stdout
+from io import BytesIO, StringIO
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -351,13 +351,13 @@ def _reading_exr(path: Path) -> Iterator[None]:
 
 
 _redirecting = Lock()
-"""Held while the standard error is redirected: two threads would not restore it."""
+"""Held while output is redirected: two threads would not restore it."""
 
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Context manager: drops what libraries print to the standard error."""
-    with _redirecting, open(os.devnull, "wb") as nowhere:
+    """Context manager: drops what libraries print to the standard error, and from Python."""
+    with _redirecting, open(os.devnull, "wb") as nowhere, redirect_stdout(StringIO()):
         stderr = os.dup(2)
         try:
             os.dup2(nowhere.fileno(), 2)

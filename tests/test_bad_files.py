@@ -66,8 +66,20 @@ def two_parts(path: Path) -> None:
     OpenEXR.File(parts).write(str(path))
 
 
+def deep_exr(path: Path) -> None:
+    pixels = np.empty((4, 4), object)
+    pixels[:] = [[np.ones(row, np.float32) for row in range(4)] for _ in range(4)]
+    header = {"type": OpenEXR.deepscanline, "compression": OpenEXR.ZIPS_COMPRESSION}
+    OpenEXR.File(header, {"Z": pixels}).write(str(path))
+
+
 def flat_exr(path: Path) -> None:
     write_exr(path, {"Z": np.zeros((4, 4))})
+
+
+def sampled(every: int) -> bytes:
+    """The channel of `flat_exr` in the file's list of channels."""
+    return b"Z\0" + struct.pack("<i4x2i", 2, every, every)
 
 
 def window(*corners: int) -> bytes:
@@ -207,6 +219,8 @@ FILES: dict[tuple[Callable[[Path], object], str], list[tuple[str, Write]]] = {
     (read_exr, "a.exr"): [
         ("not a readable EXR", halved(exr)),
         ("has 2 parts, which mgs does not read", two_parts),
+        ("several samples in a pixel", deep_exr),
+        ("has subsampled channels", replaced(flat_exr, sampled(1), sampled(2))),
         ("2097152x4 pixels", replaced(flat_exr, window(0, 0, 3, 3), window(0, 0, 2**21 - 1, 3))),
     ],
     (read_json, "a.json"): [
@@ -323,7 +337,7 @@ def test_a_file_that_cannot_be_read_is_one_line(tmp_path, capfd, read, name, wor
     (line,) = str(error.value).splitlines()
     assert words in line
     assert str(tmp_path) in line
-    assert capfd.readouterr().err == ""
+    assert capfd.readouterr() == ("", "")
 
 
 def test_samples_finer_than_single_precision_are_refused(tmp_path):
