@@ -26,6 +26,7 @@ STAGES = {
     "fits": ("fits", "--rocks", "8"),
     "certificate": ("certificate", "--rocks", "12"),
     "setups": ("setups", "--rocks", "8"),
+    "paper": ("paper", "--rocks", "8"),
     "table1": ("table1",),
     "flights": ("flights", "--rocks", "12"),
     "survey": ("survey", "--rocks", "8"),

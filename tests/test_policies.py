@@ -19,6 +19,7 @@ from mgs.splat import groups, reference
 from mgs.synth.orbit import orbit_positions
 from mgs.synth.scene_file import Orbit
 from studies import policies as studied
+from studies.paper import Letter
 
 LAM = criteria.regularisation(groups(0))
 N = 5
@@ -180,6 +181,29 @@ def test_fisherrf_code_squares_the_gradient_of_each_pixel():
     scores = [(F(camera) / (F(cameras[0]) + 1e-6)).sum() for camera in cameras[1:]]
     found = studied.fisherrf_code(SimpleNamespace(cache=None), state, [1, 2])
     assert found == pytest.approx(scores, rel=1e-3)
+
+
+def test_the_papers_h_squares_the_gradient_of_the_training_loss():
+    """Against central differences of the float64 renderer's mean squared error."""
+    model, camera = make_gaussians(6, 3), make_camera()
+    image = np.random.default_rng(0).random((camera.height, camera.width, 3)).astype(np.float32)
+    scene = SimpleNamespace(image=lambda frame: image)
+    state = SimpleNamespace(frames=[SimpleNamespace(camera=camera)], gaussians=model)
+    found = Letter.squares(scene, state, 0)
+
+    def loss(array, row, column, step):
+        values = getattr(model, array).astype(np.float64)
+        values.reshape(6, -1)[row, column] += step
+        moved = replace(model, **{array: values})
+        return np.square(reference.render(moved, camera)["rgb"] - image).mean()
+
+    for column, (array, k) in enumerate((("sh", 0), ("sh", 1), ("sh", 2), ("log_scales", 0))):
+        for row in range(6):
+            up, down = (loss(array, row, k, step) for step in (1e-4, -1e-4))
+            slope = ((up - down) / 2e-4) ** 2
+            assert found[row, column] == pytest.approx(slope, rel=2e-3, abs=1e-9)
+    assert found.shape == (6, 11)
+    assert (found > 1e-8).any()
 
 
 def test_visibility_baselines_prefer_the_other_side():
