@@ -14,17 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from mgs.errors import InputError
 
-MAX_PIXELS = 2**27
-"""Most pixels of an image. More are probably a typing error and would not fit into memory."""
-
-MAX_SIDE = 2**20
-"""Largest width and height of an image, pixels: float32 resolves no more pixel centres."""
-
-FURTHEST = 1e8
-"""Largest distance of a camera from the origin, and largest entry of K; float32 ends there."""
-
-_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""OpenGL's camera axes are x right, y up, z backward: two are the negatives of OpenCV's."""
+MAX_PIXELS = 2**27  # of an image: more are probably a typing error and would not fit into memory
+MAX_SIDE = 2**20  # width and height of an image, pixels: float32 resolves no more pixel centres
+FURTHEST = 1e8  # largest coordinate of a camera, and entry of K; float32 ends there
+_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL: x right, y up, z backward
 
 
 @dataclass(frozen=True, eq=False)

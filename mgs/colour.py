@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-SH_C0 = 0.28209479177387814
-"""Spherical harmonic of degree 0, 1 / (2 sqrt(pi)). As in 3DGS, a colour is 0.5 + SH_C0 sh0."""
+SH_C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)). As in 3DGS, a colour is 0.5 + SH_C0 sh0
 
 
 def srgb_from_linear(linear: ArrayLike) -> NDArray[np.float32]:

@@ -36,14 +36,9 @@ Renderer = Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray, np.ndarra
 Progress = Callable[[int, int], None]
 """Called as progress(views done, all)."""
 
-MEASURED_AT_ONCE = 4
-"""Most views that are measured at the same time, each in a thread."""
-
-PIXELS_AT_ONCE = 4_000_000
-"""Most pixels of all of these, which bounds the memory; a larger view is measured alone."""
-
-DIFFERENCE_GAIN = 4
-"""Factor by which differences are brightened in the pictures."""
+MEASURED_AT_ONCE = 4  # most views that are measured at the same time, each in a thread
+PIXELS_AT_ONCE = 4_000_000  # of all of these; a larger view is measured alone
+DIFFERENCE_GAIN = 4  # factor by which differences are brightened in the pictures
 
 
 def no_progress(done: int, total: int) -> None:

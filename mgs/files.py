@@ -48,11 +48,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-TOKEN = secrets.token_hex(4)
-"""Part of the names of this process's temporary files, so that nobody can put a link there."""
-
-LEFTOVER = re.compile(r"\..*\.(\d+)-[0-9a-f]{8}\.part(\..*)?")
-"""Names of temporary files, with the number of the process."""
+TOKEN = secrets.token_hex(4)  # in names of temporary files: nobody can put a link there
+LEFTOVER = re.compile(r"\..*\.(\d+)-[0-9a-f]{8}\.part(\..*)?")  # with the number of its process
 
 
 def check_place(path: Path) -> None:
@@ -203,12 +200,8 @@ def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     return Path(path)
 
 
-LARGEST = 1 << 25
-"""Most bytes of a text file that is read whole: 30,000 frames of transforms.json."""
-
-
-LARGEST_TOML, LONGEST_LINE = 1 << 16, 1 << 12
-"""Most bytes of a TOML file and of a line: Python's parser is cubic in keys a.a.a.a."""
+LARGEST = 1 << 25  # most bytes of a text file that is read whole: 30,000 frames of transforms.json
+LARGEST_TOML, LONGEST_LINE = 1 << 16, 1 << 12  # bytes of a file, a line: a.a.a = 1 takes cubic time
 
 
 def read_bytes(path: str | Path, what: str = "file", most: int = LARGEST) -> bytes:
@@ -477,14 +470,10 @@ def folder_locked(folder: str | Path) -> Iterator[None]:
                 each.rmdir()
 
 
-LOCK = ".lock"
-"""File in a folder that the process that works in it has locked."""
+LOCK = ".lock"  # file in a folder that the process that works in it has locked
+MARK = "mgs "  # start of a lock file, before the process: mgs made the folder's leftovers
 
-MARK = "mgs "
-"""Start of a lock file, before the number of the process: mgs made the folder's leftovers."""
-
-_held: set[Path] = set()
-"""Folders that this process has locked."""
+_held: set[Path] = set()  # folders that this process has locked
 
 
 @contextmanager

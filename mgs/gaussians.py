@@ -14,11 +14,8 @@ from mgs.colour import SH_C0, linear_from_srgb, srgb_from_linear
 from mgs.errors import InputError
 from mgs.notebook import cloud, html
 
-MAX_SH_DEGREE = 3
-"""Highest degree of spherical harmonics, as in 3DGS."""
-
-MAX_GAUSSIANS = 2**25
-"""Most Gaussians of a model: 32 bits index their 48 colour coefficients."""
+MAX_SH_DEGREE = 3  # highest degree of spherical harmonics, as in 3DGS
+MAX_GAUSSIANS = 2**25  # 32 bits index their 48 colour coefficients
 
 SH_MAX = 1e6
 """Largest colour coefficient, linear RGB: sums of its squares over pixels stay within float32. The
@@ -28,14 +25,9 @@ LEARNED = ("sh", "log_scales", "quats", "logit_opacities")
 """Parameters that are always learned, in the order of their columns in the Fisher information: 3K
 (K coefficients for each of r, g, b), 3, 4 and 1. Means are learned on request (`learned`)."""
 
-ARRAYS = ("means", "log_scales", "quats", "logit_opacities", "sh")
-"""Parameters of `Gaussians`: its fields that are arrays."""
-
-MARKS = ("antialiased", "linear", "origin")
-"""Fields of `Gaussians` that are no arrays."""
-
-KINDS = ("colour", "scale", "rotation", "opacity")
-"""Names of the LEARNED parameters in settings and columns, in the same order."""
+ARRAYS = ("means", "log_scales", "quats", "logit_opacities", "sh")  # its array fields
+MARKS = ("antialiased", "linear", "origin")  # fields of `Gaussians` that are no arrays
+KINDS = ("colour", "scale", "rotation", "opacity")  # names of LEARNED in settings and columns
 
 
 def learned(means: str = "frozen") -> dict[str, str]:

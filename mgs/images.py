@@ -20,26 +20,13 @@ from mgs.errors import InputError
 from mgs.files import atomic_path, not_writable, parsing, reading
 from mgs.memory import check_room
 
-PNG_BIT_DEPTH = 24
-"""Index of the byte of a PNG file that holds the bits of a sample (PNG specification, 11.2.1)."""
-
-EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")
-"""Pillow's pixel modes that convert to 8-bit RGBA without loss."""
-
-LUMA = np.array([0.299, 0.587, 0.114])
-"""Weights of R, G and B in grey (ITU-R BT.601)."""
-
-EXR_MAGIC = b"v/1\1"
-"""First bytes of every OpenEXR file."""
-
-DECODED_BYTES = 16
-"""Most bytes that a pixel takes while an image is decoded: RGBA of 16 bits, and its file."""
-
-UNKNOWN_DEPTH = 0xFFFF
-"""Value of 16 bits with which depth cameras, as the Kinect, mark that they measured nothing."""
-
-PNG_LEVEL = 1
-"""zlib level, 1 to 9: files as large as by Pillow's 6, or 7 % larger, in a quarter of the time."""
+PNG_BIT_DEPTH = 24  # byte of a PNG file with the bits of a sample (PNG specification, 11.2.1)
+EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")  # Pillow's, become RGBA exactly
+LUMA = np.array([0.299, 0.587, 0.114])  # weights of R, G and B in grey (ITU-R BT.601)
+EXR_MAGIC = b"v/1\1"  # first bytes of every OpenEXR file
+DECODED_BYTES = 16  # a pixel takes at most while an image is decoded: RGBA of 16 bits, and its file
+UNKNOWN_DEPTH = 0xFFFF  # by which depth cameras, as the Kinect, mark that they measured nothing
+PNG_LEVEL = 1  # of zlib, 1 to 9: files as large as by Pillow's 6, in a quarter of the time
 
 
 def around(mask: np.ndarray, margin: int) -> tuple[slice, ...]:
@@ -157,8 +144,7 @@ def exif_exposure(path: str | Path) -> float | None:
         return None
 
 
-NO_RETURN = 1e6
-"""Metres beyond which a depth stands for none: renderers write 1e10 where nothing is hit."""
+NO_RETURN = 1e6  # metres of depth that stand for none: renderers write 1e10
 
 
 def read_values(path: str | Path) -> np.ndarray:
@@ -350,8 +336,7 @@ def _reading_exr(path: Path) -> Iterator[None]:
         yield
 
 
-_redirecting = Lock()
-"""Held while output is redirected: two threads would not restore it."""
+_redirecting = Lock()  # held while output is redirected: two threads would not restore it
 
 
 @contextmanager

@@ -16,20 +16,11 @@ from mgs.errors import InputError
 
 Value = TypeVar("Value")
 
-IMAGE_BYTES = 1 << 30
-"""Most memory of arrays of one kind that are kept for reuse, bytes: 218 images of 640x480."""
-
-VIEW_BYTES = 1 << 29
-"""Most memory of views' information about one model, bytes: 122 views of 100,000 Gaussians."""
-
-KEPT_BYTES = 1 << 29
-"""Memory of a process, bytes, up to which what is freed is kept for reuse, which is faster."""
-
-LITTLE = 1 << 30
-"""Bytes up to which `check_room` checks nothing, to be quick for small images."""
-
-MEMORY_FILE = Path("/proc/meminfo")
-"""Linux's report of the memory that is free without swapping."""
+IMAGE_BYTES = 1 << 30  # of arrays of one kind that are kept for reuse: 218 images of 640x480
+VIEW_BYTES = 1 << 29  # of views' information about one model: 122 views of 100,000 Gaussians
+KEPT_BYTES = 1 << 29  # of a process, up to which what is freed is kept for reuse, which is faster
+LITTLE = 1 << 30  # bytes up to which `check_room` checks nothing, to be quick for small images
+MEMORY_FILE = Path("/proc/meminfo")  # Linux's report of the memory that is free without swapping
 
 
 def check_room(size: float, what: str, instead: str) -> None:
@@ -104,12 +95,8 @@ def _spare() -> float:
     return 1024.0 * int(line[1]) if line else float("inf")
 
 
-PADDING = 64
-"""Numbers that a kernel may read beyond the end of an array: whole registers, at most 16."""
-
-
-ALIGNMENT = 64
-"""Bytes. Dr.Jit compiles another kernel for arrays that are not aligned so."""
+PADDING = 64  # numbers that a kernel may read beyond an array's end: registers of at most 16
+ALIGNMENT = 64  # bytes. Dr.Jit compiles another kernel for arrays that are not aligned so
 
 
 def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:

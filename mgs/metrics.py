@@ -10,14 +10,9 @@ from mgs.colour import srgb_from_linear
 from mgs.errors import InputError
 from mgs.images import around
 
-PSNR_LIMIT = 100.0
-"""Largest PSNR reported, dB, also for equal images. Rounding to 8 bits is an error of 59 dB."""
-
-SSIM_SIGMA = 1.5
-"""Standard deviation of the Gaussian window of SSIM, pixels (Wang et al. 2004)."""
-
-SSIM_WINDOW = 11
-"""Width and height of that window, pixels (Wang et al. 2004)."""
+PSNR_LIMIT = 100.0  # dB, also for equal images; rounding to 8 bits is an error of 59 dB
+SSIM_SIGMA = 1.5  # standard deviation of the Gaussian window of SSIM, pixels (Wang et al. 2004)
+SSIM_WINDOW = 11  # width and height of that window, pixels (Wang et al. 2004)
 
 METRICS = (
     "psnr",
@@ -31,8 +26,7 @@ METRICS = (
 """Metrics of `compare`, as in metrics.json; PSNR in dB. `_mask`: over the rock's mask; `_inside`:
 over the pixels that the rock covers wholly; `_corrected`: after `colour_corrected`."""
 
-OPAQUE = 0.9
-"""A pixel wholly on the rock is see-through if the model's alpha is below this."""
+OPAQUE = 0.9  # a pixel wholly on the rock is see-through if the model's alpha is below this
 
 SURFACE_METRICS = ("alpha_mae", "depth_error", "see_through")
 """Metrics of `compare_surface`, as in metrics.json: `depth_error` in metres, the others shares."""

@@ -13,14 +13,9 @@ from PIL import Image
 
 from mgs.colour import srgb_from_linear
 
-HEIGHT = 120
-"""Height of a picture, pixels."""
-
-MOST_POINTS = 20_000
-"""Most points of a picture; of more, every n-th is drawn."""
-
-MOST_FILES = 6
-"""Most pictures of files."""
+HEIGHT = 120  # height of a picture, pixels
+MOST_POINTS = 20_000  # most points of a picture; of more, every n-th is drawn
+MOST_FILES = 6  # most pictures of files
 
 
 def html(text: str, pictures: Sequence[Image.Image]) -> str:

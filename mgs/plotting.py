@@ -33,15 +33,9 @@ STYLE: dict[str, Any] = {
 }
 """Settings for `matplotlib.rc_context`."""
 
-NO_GRID = STYLE | {"axes.grid": False}
-"""STYLE for images and maps."""
-
-DPI = 200
-"""Pixels per inch of a figure."""
-
-
-FORMATS = ("png", "pdf", "svg")
-"""File formats of figures."""
+NO_GRID = STYLE | {"axes.grid": False}  # STYLE for images and maps
+DPI = 200  # pixels per inch of a figure
+FORMATS = ("png", "pdf", "svg")  # file formats of figures
 
 
 def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:

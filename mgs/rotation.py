@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-QUAT_MIN = 1e-12
-"""Quaternions no larger than this mean the identity."""
+QUAT_MIN = 1e-12  # quaternions no larger than this mean the identity
 
 WORLD_FROM_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """Rotation [4,4] from the axes of glTF (+Y up) to the world's (+Z up)."""

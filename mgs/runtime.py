@@ -16,17 +16,10 @@ from pathlib import Path
 
 from mgs.errors import InputError
 
-VARIANT = "llvm_ad_rgb"
-"""Default variant: compiled by LLVM, differentiable, RGB, single precision."""
-
-VARIANT_VARIABLE = "MGS_VARIANT"
-"""Environment variable that names another variant, such as cuda_ad_rgb for an NVIDIA GPU."""
-
-MIN_LLVM = 19
-"""Least major version of libLLVM. 14 and 15 cannot compile the minimum and maximum of floats."""
-
-LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
-"""Environment variable from which Dr.Jit takes the path of libLLVM."""
+VARIANT = "llvm_ad_rgb"  # default variant: compiled by LLVM, differentiable, RGB, single precision
+VARIANT_VARIABLE = "MGS_VARIANT"  # names another variant, as cuda_ad_rgb for an NVIDIA GPU
+MIN_LLVM = 19  # 14 and 15 cannot compile the minimum and maximum of floats
+LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"  # from which Dr.Jit takes the path of libLLVM
 
 _DRJIT_FOLDERS = ("/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib/wsl/lib")
 _OTHER_FOLDERS = ("/usr/lib/llvm-*/lib", "/usr/lib64", "/usr/lib", "/usr/local/lib")
@@ -141,8 +134,7 @@ def start() -> None:
     _checked.add(mi.variant())
 
 
-_checked: set[str] = set()
-"""Variants that `start` has accepted in this process."""
+_checked: set[str] = set()  # variants that `start` has accepted in this process
 
 
 def _set_variant(name: str) -> None:
@@ -172,8 +164,7 @@ def _choose_libllvm() -> None:
         os.environ[LIBRARY_VARIABLE] = library.path
 
 
-ORDER_OPTION = b"-enable-misched=false"
-"""LLVM's option that keeps the order of a kernel's instructions."""
+ORDER_OPTION = b"-enable-misched=false"  # of LLVM: keeps the order of a kernel's instructions
 
 
 def _keep_order() -> None:

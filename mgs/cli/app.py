@@ -23,11 +23,8 @@ from mgs.cli.options import Row, describe
 from mgs.cli.renamed import renewed
 from mgs.errors import InputError, Notice, from_interrupt, missing, printable
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C: by convention 128 plus the number of the signal, SIGINT."""
-
-LONGEST_NAME = 200
-"""Characters of a file name that an error message shows."""
+INTERRUPTED = 130  # exit code after Ctrl-C: by convention 128 plus the number of the signal, SIGINT
+LONGEST_NAME = 200  # characters of a file name that an error message shows
 
 CURES = {
     errno.ENAMETOOLONG: "give a shorter name",
@@ -60,8 +57,7 @@ COMMANDS = {
 }
 """Commands in about the order in which they are used: file and function, and a line of help."""
 
-RESUMABLE = ("synth-orbit", "import", "demo")
-"""Commands that continue where they stopped when they are given again."""
+RESUMABLE = ("synth-orbit", "import", "demo")  # commands that continue when they are given again
 
 
 class _Command(TyperCommand):

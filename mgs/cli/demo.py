@@ -22,11 +22,8 @@ TEST_VIEWS = 12
 ORBIT = f"--size 160x120 --orbit hemisphere --distances 1,1.5,2 --test-views {TEST_VIEWS}"
 """Options of `mgs synth-orbit`. On a ring at one distance even spacing is as good as any choice."""
 
-GAUSSIANS = "auto"
-"""Number of Gaussians. With fewer than the images resolve, policies differ less."""
-
-BUDGET = 8
-"""Views beyond the four seeds, the same for every policy."""
+GAUSSIANS = "auto"  # number of Gaussians. With fewer than the images resolve, policies differ less
+BUDGET = 8  # views beyond the four seeds, the same for every policy
 
 
 def demo(out: Annotated[Path, typer.Argument()] = Path("demo"), seed: Seed = 0) -> None:

@@ -23,14 +23,9 @@ if TYPE_CHECKING:
     from mgs.data.dataset import Dataset
     from mgs.data.shots import Source
 
-MANY_PIXELS = 2_000_000
-"""Pixels of an image beyond which --downscale is recommended."""
-
-EXPOSURE_DIFFERS = 0.1
-"""Difference of exposure by EXIF, stops, beyond which --exposure is recommended."""
-
-MOSTLY = 0.3
-"""Share of empty masks beyond which a line says so."""
+MANY_PIXELS = 2_000_000  # pixels of an image beyond which --downscale is recommended
+EXPOSURE_DIFFERS = 0.1  # stops by EXIF beyond which --exposure is recommended
+MOSTLY = 0.3  # share of empty masks beyond which a line says so
 
 FILES = ("import.json", "transforms.json", "images", "depth", "masks", "rock", "sparse.ply", "test")
 """Names in a folder of this command."""

@@ -121,8 +121,7 @@ def nbv(
     resume_and_print(run, console, run.settings.policy, live=live)
 
 
-PASSES_BETWEEN = 5
-"""Passes of a fit to all images between two pictures of a test view."""
+PASSES_BETWEEN = 5  # passes of a fit to all images between two pictures of a test view
 
 
 def live_capture(command: str | None, folder: Path | None, values: dict[str, Any]) -> Live | None:

@@ -30,8 +30,7 @@ SHARED = """Options of several commands.
 """
 """Help of options that several commands share."""
 
-PLACES = ("dataset", "prior")
-"""Settings that are folders, which commands take as arguments."""
+PLACES = ("dataset", "prior")  # settings that are folders, which commands take as arguments
 
 Row = tuple[str, str, str]
 """Key, default and description of a setting."""

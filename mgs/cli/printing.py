@@ -14,8 +14,7 @@ from mgs.cli.terminal import Terminal
 if TYPE_CHECKING:
     from mgs.run.folder import Checkpoint
 
-GROUPS = {"test": "test", "all": "all", "held_out": "held out"}
-"""Sets of views -> their names in the headings of `print_quality`."""
+GROUPS = {"test": "test", "all": "all", "held_out": "held out"}  # in headings of `print_quality`
 
 SHOWN = {
     True: ("test.psnr", "test.ssim", "test.psnr_mask", "held_out.psnr", "held_out.psnr_mask"),
@@ -30,8 +29,7 @@ SHOWN = {
 }
 """Columns of `print_quality` with and without test views: as many as fit into 80 characters."""
 
-MOST_NAMES = 8
-"""Most seed views that are named in a line, not counted."""
+MOST_NAMES = 8  # most seed views that are named in a line, not counted
 
 MEASURED = {
     f"{prefix}{key}": f"{name} of {views} views"

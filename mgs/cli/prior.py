@@ -22,11 +22,8 @@ if TYPE_CHECKING:
     from mgs.prior.segmentation import SegmentedCloud
     from mgs.prior.settings import PriorSettings
 
-FILES = ("prior.json", "mesh.ply", "points.ply", "prior.png")
-"""Names in a folder of this command."""
-
-OUTLINE = 0.05
-"""Disagreement of the outlines of mesh and masks, share of pixels, beyond which a line says so."""
+FILES = ("prior.json", "mesh.ply", "points.ply", "prior.png")  # names in a folder of this command
+OUTLINE = 0.05  # share of pixels where mesh and masks disagree, beyond which a line says so
 
 WHY = {
     "depth": ": the dataset has depth images",

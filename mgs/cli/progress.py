@@ -19,8 +19,7 @@ from rich.progress import (
 from mgs.cli.terminal import Terminal
 from mgs.errors import printable_lines
 
-SECONDS_BETWEEN = 10.0
-"""Least time between two lines of progress where there is no terminal."""
+SECONDS_BETWEEN = 10.0  # least time between two lines of progress where there is no terminal
 
 
 class ProgressBar:

@@ -27,20 +27,11 @@ if TYPE_CHECKING:
 
 Degrees = Annotated[float, Field(ge=-90, le=90)]
 
-DOME = 100
-"""Candidates where none are given."""
-
-SHOWN = 10
-"""Rows of the table of one view to take; suggestions.json has all."""
-
-SITE, NEXT = ".site", "next"
-"""End of the name of a folder beside photographs alone, and the default --out in it."""
-
-PASSES = 2
-"""Passes of the fit to photographs alone: enough to choose a view by, too few to show."""
-
-FILES = ("suggestions.json", "suggestions.png", "transforms.json")
-"""Names in the folder --out."""
+DOME = 100  # candidates where none are given
+SHOWN = 10  # rows of the table of one view to take; suggestions.json has all
+SITE, NEXT = ".site", "next"  # beside photographs alone: end of a folder's name, and --out in it
+PASSES = 2  # passes of the fit to photographs alone: enough to choose a view by, too few to show
+FILES = ("suggestions.json", "suggestions.png", "transforms.json")  # names in the folder --out
 
 
 class Candidates(BaseModel):

@@ -21,17 +21,11 @@ from scipy.optimize import brentq
 from mgs.errors import InputError
 from mgs.policy.relaxation import TOLERANCE, Bound, Criterion, Floats
 
-CLOSE = 1e-2
-"""Gap at which `best_set` stops, as a share of the bound."""
+CLOSE = 1e-2  # gap at which `best_set` stops, as a share of the bound
+CURVE = (1, 2, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)  # numbers of views of `curve`
+NODES = 1000  # most nodes of `best_set`; chosen
 
-CURVE = (1, 2, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96)
-"""Numbers of views of `curve`."""
-
-NODES = 1000
-"""Most nodes of `best_set`. A chosen constant."""
-
-Free = slice | NDArray[np.intp]
-"""Indices of candidates."""
+Free = slice | NDArray[np.intp]  # indices of candidates
 
 
 class Best(NamedTuple):

@@ -13,27 +13,17 @@ Array = NDArray[np.floating]
 Score = Callable[[Array, Array, Array], float]
 """(F [N,P], H [N,P], lam [P]) -> score of one candidate."""
 
-PIXEL_NOISE = 0.02
-"""sigma_e, standard deviation of a pixel's residual, linear RGB (34 dB). A chosen constant."""
-
-PRUNE_NOISE = PIXEL_NOISE / 5
-"""Change of pixel values that `mgs simplify` may make, rms, linear RGB: about 0.1 dB. Chosen."""
-
-DIRECTIONAL_STD = 0.03
-"""tau of colours of degrees above 0: rocks look alike from all sides. A chosen constant."""
-
-LEARN_LOSS = 0.05
-"""Increase of the objective, dB, that a refit may cause (docs/parsimony.md). A chosen constant."""
+PIXEL_NOISE = 0.02  # sigma_e, std of a pixel's residual, linear RGB (34 dB); chosen
+PRUNE_NOISE = PIXEL_NOISE / 5  # rms change by `mgs simplify`, linear RGB: about 0.1 dB; chosen
+DIRECTIONAL_STD = 0.03  # tau of colours of degrees above 0: rocks look alike from all sides
+LEARN_LOSS = 0.05  # rise of the objective, dB, that a refit may cause (docs/parsimony.md)
 
 PRIOR_STD = {"colour": 1.0, "scale": 0.125, "rotation": 0.0625, "opacity": 2.0}
 """tau: standard deviation of each parameter around its start, in its own unit. Those of scale and
 rotation (7 degrees) are small: with larger ones, Gaussians grow into needles (docs/fit.md)."""
 
-MEAN_STD = 0.5
-"""tau of learned means over the spacing of the samples, metres in `prior_std`. Chosen."""
-
-GAIN_UNIT = "½ nat per parameter"
-"""Unit of `d_optimal` with the lambda of `regularisation`: 2/l times mutual information in nats."""
+MEAN_STD = 0.5  # tau of learned means over the spacing of the samples; chosen
+GAIN_UNIT = "½ nat per parameter"  # of `d_optimal`: 2/l times mutual information in nats
 
 
 def regularisation(

@@ -27,14 +27,9 @@ from mgs.synth.scene_file import Orbit
 
 Result = TypeVar("Result")
 
-DOME = 48
-"""Number of poses of the dome for I-optimality. A chosen constant."""
-
-DOME_ELEVATIONS = (0.0, 85.0)
-"""Lowest and highest elevation of the dome, degrees."""
-
-CHUNK = 1024
-"""Gaussians per task of a thread, which bounds the memory."""
+DOME = 48  # number of poses of the dome for I-optimality; chosen
+DOME_ELEVATIONS = (0.0, 85.0)  # lowest and highest elevation of the dome, degrees
+CHUNK = 1024  # Gaussians per task of a thread, which bounds the memory
 
 
 class Views(NamedTuple):

@@ -8,11 +8,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mgs.policy.pool_gains import PoolGains
 
-BETTER = 1 + 1e-6
-"""Least ratio of gains for which views are exchanged: above rounding errors. A chosen constant."""
-
-WIDTH = 16
-"""Paths that `planned_path` keeps at each step. A chosen constant."""
+BETTER = 1 + 1e-6  # least ratio of gains for an exchange: above rounding errors; chosen
+WIDTH = 16  # paths that `planned_path` keeps at each step; chosen
 
 
 def planned_views(gains: PoolGains, candidates: Sequence[int], count: int) -> list[int]:

@@ -27,8 +27,7 @@ from mgs.policy.criteria import Array
 from mgs.policy.directional import Views, in_parts, information, of_points, precision
 from mgs.splat.recording import one_at_a_time
 
-BYTES_OF_ENTRY, BYTES_OF_PAIR = 16, 40
-"""Bytes of an entry of both matrices, and of a pair of pose and Gaussian."""
+BYTES_OF_ENTRY, BYTES_OF_PAIR = 16, 40  # of both matrices; of a pair of pose and Gaussian
 
 
 def fits(points: Array, pool: Views, degree: int) -> bool:

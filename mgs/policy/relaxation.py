@@ -28,17 +28,10 @@ from mgs.policy.directional import Views, in_parts, information, of_points, prec
 
 Floats = NDArray[np.float64]
 
-COARSE = 1024
-"""About the number of Gaussians of `Relaxation.coarse`. A chosen constant."""
-
-TOLERANCE = 1e-3
-"""Gap at which `upper_bound` stops, as a share of the bound."""
-
-STEPS, EXCHANGES, CUTS = 30, 3000, 300
-"""Most Newton steps of a bound, exchanges of weight in each, and cutting planes. Chosen."""
-
-SUFFICIENT = 1e-3
-"""Least share of the predicted ascent that a step of the line search must reach."""
+COARSE = 1024  # about the number of Gaussians of `Relaxation.coarse`; chosen
+TOLERANCE = 1e-3  # gap at which `upper_bound` stops, as a share of the bound
+STEPS, EXCHANGES, CUTS = 30, 3000, 300  # Newton steps, exchanges in each, cuts at most; chosen
+SUFFICIENT = 1e-3  # least share of the predicted ascent that a step of the line search must reach
 
 
 class Bound(NamedTuple):

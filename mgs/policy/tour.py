@@ -22,17 +22,10 @@ Share = Callable[[Array, int], NDArray[np.float64]]
 Pick = Callable[[list[int], NDArray[np.float64]], tuple[int, float]]
 """(stops, their costs) -> the next stop and its gain. It counts as taken from then on."""
 
-ROUNDING = 1e-9
-"""Share of the limits: a stop in reach fits, though its metres are summed in another order."""
-
-BETTER = 1 + 1e-6
-"""Least ratio of gains for which stops are replaced: above rounding errors. A chosen constant."""
-
-WIDTHS = (1, 2, 3)
-"""Numbers of neighbouring stops that are replaced together. A chosen constant."""
-
-ARC_STEP = np.radians(15)
-"""Largest angle between two corners of a leg around a cylinder. A chosen constant."""
+ROUNDING = 1e-9  # share of the limits, for metres that are summed in another order
+BETTER = 1 + 1e-6  # least ratio of gains for a replacement: above rounding errors; chosen
+WIDTHS = (1, 2, 3)  # numbers of neighbouring stops that are replaced together; chosen
+ARC_STEP = np.radians(15)  # largest angle between two corners of a leg around a cylinder; chosen
 
 
 def legs(positions: Array, axis: Array, radius: float = 0.0) -> NDArray[np.float64]:

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 Model = tuple[int, float, bool]
 """SH degree, tau, and whether gains are those of I-optimality over the dome, else D-optimality."""
 
-FEW = 500
-"""About the number of Gaussians by which a flight is planned. A chosen constant."""
+FEW = 500  # about the number of Gaussians by which a flight is planned; chosen
 
 
 class Visibility:

@@ -20,11 +20,8 @@ from mgs.images import write_png
 from mgs.reports.exporting import as_imported
 from mgs.run.folder import Run
 
-OPAQUE = 0.5
-"""Least opacity of the Gaussians whose centres become points."""
-
-STEP = 1e-3
-"""Least step of depth images of 16 bits, in the world's unit; nerfstudio's default."""
+OPAQUE = 0.5  # least opacity of the Gaussians whose centres become points
+STEP = 1e-3  # least step of depth images of 16 bits, in the world's unit; nerfstudio's default
 
 NAMES = {
     "nerfstudio": ("transforms.json", "images", "masks", "depth", "points.ply"),

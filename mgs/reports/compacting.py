@@ -17,17 +17,10 @@ from mgs.policy.criteria import PRUNE_NOISE
 from mgs.run.folder import Run
 from mgs.seeds import generator
 
-SCALES = (1e-3, 1.0)
-"""Range of the steps' scale: rms error of an image, (pixel value) per coefficient."""
-
-HALVINGS = 9
-"""Halvings of that range, in its logarithm: steps are found to 1.4 %."""
-
-VIEWS = 16
-"""Most views, evenly spread over those taken, in which errors are weighed."""
-
-NOISES = (PRUNE_NOISE, 4 * PRUNE_NOISE)
-"""Changes by pruning where positions are sent, of which the best is taken."""
+SCALES = (1e-3, 1.0)  # of steps: rms error of an image, (pixel value) per coefficient
+HALVINGS = 9  # halvings of that range, in its logarithm: steps are found to 1.4 %
+VIEWS = 16  # most views, evenly spread over those taken, in which errors are weighed
+NOISES = (PRUNE_NOISE, 4 * PRUNE_NOISE)  # by pruning, if positions are sent: the better
 
 
 @dataclass(frozen=True)

@@ -22,14 +22,9 @@ from mgs.images import write_exr
 from mgs.policy import criteria
 from mgs.run.folder import Run, open_run
 
-VIEWS = 3
-"""Number of views that are drawn if none are named."""
-
-VISIBLE = 0.5
-"""Least opacity at which a pixel of a preview is drawn; with less it counts as background."""
-
-DECADES = 4
-"""Largest range of the logarithmic colour scales, in powers of ten."""
+VIEWS = 3  # number of views that are drawn if none are named
+VISIBLE = 0.5  # least opacity at which a pixel is drawn, else background
+DECADES = 4  # largest range of the logarithmic colour scales, in powers of ten
 
 
 def run_scalars(run: Run) -> dict[str, np.ndarray]:

@@ -21,16 +21,14 @@ from mgs.splat.reference import sh_basis
 from mgs.splat_files import load_gaussians, upward
 from mgs.splat_places import to_source
 
-DIRECTIONS = 64
-"""Directions to which the coefficients of a converted colour are fitted."""
+DIRECTIONS = 64  # directions to which the coefficients of a converted colour are fitted
 
 REFIT = TrainSettings(
     optimiser="adam", tolerance=0, rates=dict.fromkeys(RATES, 0.0) | {"colour": RATES["colour"]}
 )
 """Fit of colours alone, after which a linear model blends well in sRGB."""
 
-PART = 1 << 16
-"""Gaussians whose colours are converted at a time."""
+PART = 1 << 16  # Gaussians that are converted at a time
 
 
 def read_model(source: str | Path, prior: str | Path | None = None) -> tuple[Gaussians, Vector]:

@@ -27,8 +27,7 @@ STYLES: tuple[tuple[str, str | tuple[int, int, int]], ...] = (
 )  # fmt: skip
 """Colours and markers of lines, all of which colour-blind readers can tell apart."""
 
-POLICY_STYLE = dict(zip(POLICIES, STYLES, strict=False))
-"""Style of each policy, the same in every figure."""
+POLICY_STYLE = dict(zip(POLICIES, STYLES, strict=False))  # the same in every figure
 
 Curves = Mapping[str, tuple[Sequence[float], Sequence[float]]]
 """Label of a run -> x and y of its line."""
@@ -53,8 +52,7 @@ def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
     return styles
 
 
-ACROSS = 3
-"""Most panels side by side in `orbit_figure`."""
+ACROSS = 3  # most panels side by side in `orbit_figure`
 
 SEED, CHOSEN, NEWEST = "#8a8a8a", "#0072B2", "#D55E00"
 """Colours of seeds, of chosen views, and of the one that was chosen last."""

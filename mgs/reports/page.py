@@ -46,8 +46,7 @@ from mgs.reports.runs import compare_runs, least_trained, step_curves
 from mgs.reports.writing import shown_view
 from mgs.run.folder import Run
 
-COMPARED = 6
-"""Most views of the dataset, and most test views, on which truth and renders are compared."""
+COMPARED = 6  # views of the dataset, and test views, on which truth and renders are compared
 
 
 def write_page(

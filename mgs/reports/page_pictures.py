@@ -16,20 +16,11 @@ from mgs.policy.criteria import uncertainty
 from mgs.reports.diagnostics import VISIBLE, view_maps
 from mgs.run.folder import Run
 
-PIXELS = 40e6
-"""Most pixels of all pictures of a page: 4 to 8 MB of WebP."""
-
-WIDEST = 640
-"""Most pixels across a picture."""
-
-QUALITY = 85
-"""Quality of WebP, 0 to 100."""
-
-ERROR_COLOURS, UNCERTAINTY_COLOURS = "magma", "cividis"
-"""Colour maps (matplotlib's names), both perceptually uniform."""
-
-GREY = (232, 232, 232)
-"""Colour of pixels that show no model, in maps of uncertainty."""
+PIXELS = 40e6  # most pixels of all pictures of a page: 4 to 8 MB of WebP
+WIDEST = 640  # most pixels across a picture
+QUALITY = 85  # quality of WebP, 0 to 100
+ERROR_COLOURS, UNCERTAINTY_COLOURS = "magma", "cividis"  # perceptually uniform
+GREY = (232, 232, 232)  # colour of pixels that show no model, in maps of uncertainty
 
 
 @dataclass

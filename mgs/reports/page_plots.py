@@ -22,11 +22,8 @@ SYMBOLS: dict[str | tuple[int, int, int], str] = {
 }  # fmt: skip
 """Matplotlib's markers in `mgs.reports.figures.POLICY_STYLE` -> Plotly's."""
 
-POINTS = 4000
-"""Most Gaussians in the plot of the orbit: every n-th of the model."""
-
-FRUSTUM = 0.12
-"""Length of a drawn camera, as a share of the mean distance of the cameras from the model."""
+POINTS = 4000  # most Gaussians in the plot of the orbit: every n-th of the model
+FRUSTUM = 0.12  # length of a drawn camera over the mean distance of cameras from the model
 
 GREY = "#7a7a7a"
 

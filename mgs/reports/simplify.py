@@ -23,11 +23,8 @@ if TYPE_CHECKING:
 PRUNED = "gaussians_pruned.ply"
 REFITTED = "gaussians_refitted.ply"
 
-CHOICES = {"learn": ("all", "auto"), "sh": ("0", "auto")}
-"""Arguments of `refit_run` -> their known values."""
-
-LARGEST_LOSS = 10.0
-"""Largest `loss` of `refit_run`, dB: with that next to nothing is learned but colours."""
+CHOICES = {"learn": ("all", "auto"), "sh": ("0", "auto")}  # arguments of `refit_run`
+LARGEST_LOSS = 10.0  # of `refit_run`, dB: with that next to nothing is learned but colours
 
 
 @dataclass(frozen=True)

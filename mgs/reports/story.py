@@ -20,8 +20,7 @@ from mgs.run.folder import Run
 from mgs.run.nbv import scene_of
 from mgs.scene import Scene, State
 
-SIZE = (8.4, 3.1)
-"""Width and height of a frame, inches."""
+SIZE = (8.4, 3.1)  # width and height of a frame, inches
 
 DPI = 110
 

@@ -26,8 +26,7 @@ CONVENTION = (
     "nerfstudio"
 )
 
-MOST_PICTURES, PICTURE_WIDTH = 6, 200
-"""Views in the figure, and pixels of the width of their pictures."""
+MOST_PICTURES, PICTURE_WIDTH = 6, 200  # views in the figure, and pixels of the width of a picture
 
 
 def write_suggestion(out: Path, run: Run, suggestion: Suggestion) -> None:

@@ -20,17 +20,11 @@ from mgs.policy.tour import flying_order, legs
 from mgs.reports.diagnostics import VISIBLE, picture, run_scalars, view_maps
 from mgs.run.folder import Run
 
-Film = Iterator[np.ndarray]
-"""Frames, sRGB uint8 [H,W,3], all of one size."""
+Film = Iterator[np.ndarray]  # frames, sRGB uint8 [H,W,3], all of one size
 
-FORMATS = (".mp4", ".gif", ".png")
-"""Endings of films; .png is an animated PNG."""
-
-GAP = 4
-"""Pixels between two pictures of a frame."""
-
-UNKNOWN = "cividis"
-"""Colour map of what is unknown: blue is known, yellow unknown."""
+FORMATS = (".mp4", ".gif", ".png")  # endings of films; .png is an animated PNG
+GAP = 4  # pixels between two pictures of a frame
+UNKNOWN = "cividis"  # colour map of what is unknown: blue is known, yellow unknown
 
 
 def camera_path(dataset: Dataset, means: np.ndarray, count: int, width: int) -> list[Camera]:

@@ -24,8 +24,7 @@ from mgs.reports.runs import (
 from mgs.reports.tables import comparison_rows, markdown_table, table_cell
 from mgs.run.folder import Run
 
-CHOICES = ("orbit", "gain", "coverage")
-"""Figures of the chosen views."""
+CHOICES = ("orbit", "gain", "coverage")  # figures of the chosen views
 
 FIGURES = (*CHOICES, "comparison", "psnr")
 

@@ -29,14 +29,9 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 COLUMNS = ("name", *POSITION, *TARGET, *QUATERNION)
 """Columns of a CSV of poses. The quaternion is that of camera to world, with OpenCV axes."""
 
-MOST_POSES = 5000
-"""Most candidates of one suggestion: each is drawn, and the legs between all are compared."""
-
-SAME_PLACE, SAME_VIEW = 1e-3, 1.0
-"""Distance over that from the object, and angle in degrees, below which a pose counts as taken."""
-
-FELT = 0.05
-"""Least move that is named, over the distance from the object; as an angle, radians."""
+MOST_POSES = 5000  # candidates: each is drawn, and the legs between all are compared
+SAME_PLACE, SAME_VIEW = 1e-3, 1.0  # share of the distance, and degrees: counts as taken
+FELT = 0.05  # least move that is named, over the distance from the object; as an angle, radians
 
 Named = tuple[str, Camera]
 

@@ -19,11 +19,8 @@ from mgs.run.policies import Policy
 from mgs.run.settings import NbvSettings
 from mgs.scene import Scene, State
 
-WINDOW = 3
-"""Number of last fits that give the mean excess of `predicted_psnr`. Chosen on two rocks."""
-
-LEAST_ERROR = 1e-8
-"""Least mean squared error that is predicted, 80 dB."""
+WINDOW = 3  # number of last fits that give the mean excess of `predicted_psnr`. Chosen on two rocks
+LEAST_ERROR = 1e-8  # least mean squared error that is predicted, 80 dB
 
 
 class Checks:

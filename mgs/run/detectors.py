@@ -14,29 +14,14 @@ from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.gaussians import Gaussians
 
-DARK = 1e-3
-"""Linear RGB, added to brightnesses before their ratio is taken."""
-
-RATIO_QUANTILES = (0.25, 0.5, 0.75)
-"""Quantiles of a view's log ratios."""
-
-LEAST_SPREAD = 0.1
-"""Added to the range of these quantiles: a fit without any residual has no exposure to report."""
-
-NEIGHBOURS = 3
-"""Number of nearest views with which a view's error is compared."""
-
-CLOSER = 2.0
-"""Ratio of pixels from which on views count as taken from different distances."""
-
-OFFSET = 0.03
-"""Largest offset of a view that is right, unless the farthest views have larger pixels."""
-
-COVERING_VIEWS = 4
-"""Fewest views of which a good coverage can be expected."""
-
-MANY_VIEWS = 8
-"""Views from which on indicators of a good run are expected even if more are to come. Chosen."""
+DARK = 1e-3  # linear RGB, added to brightnesses before their ratio is taken
+RATIO_QUANTILES = (0.25, 0.5, 0.75)  # quantiles of a view's log ratios
+LEAST_SPREAD = 0.1  # added to their range: a fit without residual has no exposure to report
+NEIGHBOURS = 3  # number of nearest views with which a view's error is compared
+CLOSER = 2.0  # ratio of pixels from which on views count as taken from different distances
+OFFSET = 0.03  # largest of a view that is right, unless the farthest views have larger pixels
+COVERING_VIEWS = 4  # fewest views of which a good coverage can be expected
+MANY_VIEWS = 8  # views that a good run must fit even if more are to come; chosen
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,7 @@ FILES = [
 ]
 """Names in the folder of a run, with what commands add to it."""
 
-DATASET = "dataset"
-"""Folder of a run that holds its dataset, where its pictures are taken (`mgs.run.live`)."""
+DATASET = "dataset"  # of a run whose pictures are taken meanwhile (`mgs.run.live`)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +63,7 @@ class Checkpoint:
     upright: bool = True
 
 
-POSES = "poses.json"
-"""File in that folder where poses were refined: how far each moved (`mgs.run.nbv`)."""
+POSES = "poses.json"  # in the dataset of a run that refined poses: how far each moved
 
 
 class Run:

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from mgs.prior.build import Prior
     from mgs.run.settings import NbvSettings
 
-DECIMALS = 9
-"""Decimals of poses and intrinsics: their last bits differ between machines."""
+DECIMALS = 9  # decimals of poses and intrinsics: their last bits differ between machines
 
 
 def array_digest(arrays: Iterable[np.ndarray]) -> str:

@@ -33,23 +33,12 @@ CONVENTION = (
     "is steep), pitch above the horizon, seen with `up` upwards; pixels from the image's corner"
 )
 
-SAME = 1e-9
-"""Largest difference of an entry of a pose that came back unchanged through JSON."""
-
-REACH = 0.25
-"""Default of the largest distance from the pose asked for, as a share of that to the object."""
-
-DEPTH_UNIT = 1e-3
-"""Metres in a step of a PNG depth image."""
-
-WHITE, MOST_WHITE = 254 / 255, 0.5
-"""A pixel is white from this sRGB value on; largest share of the object that may be."""
-
-BLACK, MOST_BLACK = 2 / 255, 0.95
-"""The same of black. Shadows on the Moon are black."""
-
-MOST_BLUR = 0.6
-"""Largest blur, 0 to 1, by Crete et al. (2007). Sharp pictures have 0.12 to 0.37."""
+SAME = 1e-9  # largest difference of an entry of a pose that came back unchanged through JSON
+REACH = 0.25  # default of `Live.distance`, as a share of the distance to the object
+DEPTH_UNIT = 1e-3  # metres in a step of a PNG depth image
+WHITE, MOST_WHITE = 254 / 255, 0.5  # least white sRGB value, most of the object that may be
+BLACK, MOST_BLACK = 2 / 255, 0.95  # the same of black. Shadows on the Moon are black
+MOST_BLUR = 0.6  # largest blur, 0 to 1, by Crete et al. (2007). Sharp pictures have 0.12 to 0.37
 
 
 @dataclass(frozen=True)

@@ -60,20 +60,14 @@ from mgs.scene import Scene, State
 from mgs.splat.constants import NEAR
 from mgs.survey.fusion import focus
 
-FREE_PASSES = 30
-"""Passes of a fit of free means to all images. A chosen constant."""
+FREE_PASSES = 30  # passes of a fit of free means to all images; chosen
 
 FREE_TRAIN = {"passes": FREE_PASSES, "decay": 0.02, "tolerance": 0.0}
 """`TrainSettings` of such a fit: all passes, the last at low rates (docs/fit.md). Chosen."""
 
-FREE_SH = {"points": 1, "hull": 1, "random": 0}
-"""`NbvSettings.sh` of such a fit by the source of its prior. Chosen constants (docs/fit.md)."""
-
-LOOSE = {"points": 4.0, "hull": 4.0, "random": 40.0}
-"""Sources less sure than images -> factor on prior standard deviations in such a fit. Chosen."""
-
-WITHOUT_SURFACE = "farthest"
-"""Default policy from random points (docs/results.md, The published protocol)."""
+FREE_SH = {"points": 1, "hull": 1, "random": 0}  # `NbvSettings.sh` of such a fit (docs/fit.md)
+LOOSE = {"points": 4.0, "hull": 4.0, "random": 40.0}  # factor on the prior stds of such a fit
+WITHOUT_SURFACE = "farthest"  # default policy from random points (docs/results.md)
 
 OnPass = Callable[[int, int, Gaussians], None]
 """on_pass(done, most, model), called after each pass of a fit."""

@@ -51,15 +51,9 @@ OF_ONE: dict[str, Callable[[Scene, State, int], Any]] = {
 }
 """Arguments of one candidate: information about model and surface, and its place [3]."""
 
-OF_THE_FIT = {"scene", "state", "F", "H"}
-"""Arguments that depend on the fitted model."""
-
-OPTIONAL = ("plan", "tour_gains", "geometric")
-"""Attributes that a policy may have (`mgs.run.policies`)."""
-
-
-FUNCTION = "python:"
-"""Start of the name of a policy that is a Python function: python:MODULE.NAME."""
+OF_THE_FIT = {"scene", "state", "F", "H"}  # arguments that depend on the fitted model
+OPTIONAL = ("plan", "tour_gains", "geometric")  # attributes that a policy may have
+FUNCTION = "python:"  # start of the name of a policy that is a Python function: python:MODULE.NAME
 
 
 def name_of(policy: str | Callable[..., Any]) -> str:

@@ -93,8 +93,7 @@ class _Line(_Strict, extra="allow"):
     certificate: _Certificate = Field(None)  # type: ignore[assignment]
 
 
-_FIT = {"iterations", "loss", "stop_reason"}
-"""Keys of a line with a fit, which has all of them."""
+_FIT = {"iterations", "loss", "stop_reason"}  # keys of a line with a fit, which has all of them
 
 
 class _Inputs(_Strict):

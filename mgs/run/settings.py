@@ -23,8 +23,7 @@ from mgs.fit.settings import (
 from mgs.policy.criteria import MEAN_STD, PRIOR_STD
 from mgs.run.policy_file import check_policy
 
-ENOUGH = 0.95
-"""Share of the gain that is enough by default (docs/certificate.md)."""
+ENOUGH = 0.95  # share of the gain that is enough by default (docs/certificate.md)
 
 
 class FlightLimits(BaseModel):
@@ -207,8 +206,7 @@ def settings_in(file: Path) -> dict[str, Any]:
     return {**found, **paths}
 
 
-BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
-"""Words for the limits of pydantic's numbers."""
+BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}  # pydantic's
 
 
 def check_settings(settings: NbvSettings, frames: int) -> None:

@@ -40,11 +40,8 @@ from mgs.run.worth import certificate, enough_views
 from mgs.scene import Choice, Scene, State
 from mgs.splat import fisher_derivatives
 
-COARSE = 8000
-"""About the most Gaussians on the surface by which candidates are rated. A chosen constant."""
-
-FINE = 320
-"""Most pixels of an image's width of a model that is not thinned. A chosen constant."""
+COARSE = 8000  # Gaussians on the surface by which candidates are rated, about; chosen
+FINE = 320  # most pixels of an image's width of a model that is not thinned; chosen
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,8 @@ PICTURES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 COMPANIONS = (".flown.json", ".depth.exr", ".depth.png", ".mask.png")
 """Ends of the names of a picture, and of what may come with it."""
 
-POLL = 0.5
-"""Seconds between two looks into a watched folder."""
-
-LOG_TAIL = 2000
-"""Last bytes of a command's output that are searched for its last line."""
+POLL = 0.5  # seconds between two looks into a watched folder
+LOG_TAIL = 2000  # last bytes of a command's output that are searched for its last line
 
 
 def answers(out: Path) -> dict[str, Path]:

@@ -19,11 +19,8 @@ from mgs.run.policies import Policy
 from mgs.run.settings import ENOUGH, Mission
 from mgs.scene import Scene, State
 
-SEARCH_NODES, SEARCH_PAIRS = 40, 2_000_000
-"""Most nodes of a search, and nodes times pairs of candidate and Gaussian: about a second."""
-
-CURVE_PAIRS = 3_000_000
-"""Most pairs of a candidate and a Gaussian with which the curve of a certificate is computed."""
+SEARCH_NODES, SEARCH_PAIRS = 40, 2_000_000  # most nodes, and nodes times pairs: about a second
+CURVE_PAIRS = 3_000_000  # most pairs of a candidate and a Gaussian for the curve of a certificate
 
 
 def certificate(

@@ -16,8 +16,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from mgs.errors import InputError
 
-LOCAL = ("127.0.0.1", "localhost", "::1")
-"""Hosts that only this machine reaches."""
+LOCAL = ("127.0.0.1", "localhost", "::1")  # hosts that only this machine reaches
 
 COOKIE = "mgs_token"
 

@@ -13,8 +13,7 @@ from mgs.rotation import rotmat_from_quat
 from mgs.view.access import plain
 from mgs.view.subject import Subject
 
-FAR = 160.0
-"""Depth of pixels that show no model, metres: viser's images of depth end at 167 m."""
+FAR = 160.0  # depth of pixels that show no model, metres: viser's images of depth end at 167 m
 
 LEGENDS = {
     "colour": "The colours of the model.",

@@ -22,35 +22,19 @@ from mgs.view import layers
 from mgs.view.access import Access, bound_socket, plain
 from mgs.view.subject import View, read_subject
 
-REST = 0.2
-"""Seconds without movement after which a camera counts as resting."""
-
-FOLLOW = 1.0
-"""Seconds between two checks of the run folder."""
-
-PIXELS = 1e6
-"""Most pixels of an image of the kernel; a larger window shows it enlarged."""
-
-LARGEST_NUMBER = 1e6
-"""Bound of every number that a browser window sends: pixels, and lengths of the shown world."""
-
-PREVIEW = 480
-"""Width of the image that a click on a camera shows, pixels."""
+REST = 0.2  # seconds without movement after which a camera counts as resting
+FOLLOW = 1.0  # seconds between two checks of the run folder
+PIXELS = 1e6  # most pixels of an image of the kernel; a larger window shows it enlarged
+LARGEST_NUMBER = 1e6  # bound of every number that a browser window sends
+PREVIEW = 480  # width of the image that a click on a camera shows, pixels
 
 COLOURS = {"seed": (213, 94, 0), "chosen": (0, 158, 115), "candidate": (130, 130, 130)}
 """Colours of cameras by role, sRGB."""
 
-SELECTED = (255, 220, 60)
-"""Colour of the camera that was clicked."""
-
-THIN: dict[str, Any] = {"thickness": 1.5, "thickness_units": "screen"}
-"""Thickness of lines, pixels of the screen."""
-
-FILLED = 0.35
-"""Share of the window's height that the object fills at first."""
-
-BLACK = np.zeros((2, 2, 3), np.uint8)
-"""Background without an image of the kernel."""
+SELECTED = (255, 220, 60)  # colour of the camera that was clicked
+THIN: dict[str, Any] = {"thickness": 1.5, "thickness_units": "screen"}  # pixels
+FILLED = 0.35  # share of the window's height that the object fills at first
+BLACK = np.zeros((2, 2, 3), np.uint8)  # background without an image of the kernel
 
 
 @dataclass

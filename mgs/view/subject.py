@@ -19,11 +19,8 @@ from mgs.run.folder import Run, open_run
 from mgs.splat_files import load_gaussians, upward
 from mgs.splat_places import from_source
 
-SCALARS = ("information", "uncertainty", "unobserved")
-"""Scalars of `mgs.reports.diagnostics` that the viewer shows."""
-
-LARGEST = 40.0
-"""Largest distance from the middle; depth in a browser ends at about four times this."""
+SCALARS = ("information", "uncertainty", "unobserved")  # that the viewer shows
+LARGEST = 40.0  # largest distance from the middle; depth in a browser ends at about four times this
 
 
 @dataclass(frozen=True)
