@@ -163,9 +163,7 @@ class Camera:
         if not origin.any():
             return self
         if self.traced:
-            raise InputError(
-                "camera: Dr.Jit values need Gaussians whose origin is 0; move the means there"
-            )
+            raise InputError("camera: Dr.Jit values need Gaussians of origin 0; move the means")
         R, t = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return self._posed(R, t + R @ origin, self.film and self.film.seen_from(origin))
 
@@ -191,10 +189,9 @@ class Camera:
         """
         right, bottom = left + width, top + height
         if not (0 <= left < right <= self.width and 0 <= top < bottom <= self.height):
-            raise InputError(
-                f"camera: the window of {width}x{height} pixels at ({left}, {top}) is empty or "
-                f"leaves the image, {self.width}x{self.height}"
-            )
+            place = f"the window of {width}x{height} pixels at ({left}, {top})"
+            image = f"the image, {self.width}x{self.height}"
+            raise InputError(f"camera: {place} is empty or leaves {image}")
         K = self.K - [[0, 0, left], [0, 0, top], [0, 0, 0]]
         corner = self.corner[0] + left, self.corner[1] + top
         return Camera(K, width, height, self.world_to_camera, self.film or self, corner)

@@ -209,9 +209,7 @@ def read_bytes(path: str | Path, what: str = "file", most: int = LARGEST) -> byt
     path = Path(path)
     with reading(path, what):
         if (size := path.stat().st_size) > most:
-            raise InputError(
-                f"{path}: has {size:,} bytes, and such a file has at most {most:,}; give another"
-            )
+            raise InputError(f"{path}: has {size:,} bytes, more than {most:,}; give another file")
         return path.read_bytes()
 
 
@@ -266,9 +264,7 @@ def _parsed(path: str | Path, kind: str, parse: Callable[[bytes], Any], most: in
     except (ValueError, RecursionError, SyntaxError, LookupError, csv.Error) as error:
         # RecursionError: nested too deeply; SyntaxError: of XML; LookupError: of its encoding
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:200]
-        raise InputError(
-            f"{path}: not valid {kind} ({reason}); the file is damaged, write it again"
-        ) from None
+        raise InputError(f"{path}: not valid {kind} ({reason}); write it again") from None
 
 
 THERE = "is there already; choose another place, or replace it with `force`"
@@ -535,9 +531,8 @@ def _flock(path: Path, file: TextIO) -> None:
     except BlockingIOError:
         file.seek(0)
         process = file.read().removeprefix(MARK)
-        raise InputError(
-            f"{path.parent}: process {process} works on it; wait until it has ended"
-        ) from None
+        by = f"process {process} works on it"
+        raise InputError(f"{path.parent}: {by}; wait until it has ended") from None
 
 
 def _check_unlocked(path: Path) -> None:

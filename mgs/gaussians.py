@@ -159,9 +159,7 @@ class Gaussians:
                 first = tuple(np.argwhere(bad)[0])
                 finite = np.isfinite(values[first])
                 what = f"is beyond {SH_MAX:,.0f}" if finite else "is NaN or infinite"
-                raise InputError(
-                    f"{where}: {name} {what}, first at Gaussian {first[0]}; remove or repair it"
-                )
+                raise InputError(f"{where}: {name} {what}, first at Gaussian {first[0]}; repair it")
         return self
 
     def check_shapes(self, where: object = "gaussians") -> None:
@@ -169,17 +167,13 @@ class Gaussians:
         exceeds MAX_GAUSSIANS."""
         n = len(self)
         if n > MAX_GAUSSIANS:
-            raise InputError(
-                f"{where}: {n:,} Gaussians are more than {MAX_GAUSSIANS:,}, the most that kernels "
-                "index; take fewer"
-            )
+            many = f"{n:,} Gaussians are more than kernels index, {MAX_GAUSSIANS:,}"
+            raise InputError(f"{where}: {many}; take fewer")
         coefficients = {(d + 1) ** 2 for d in range(MAX_SH_DEGREE + 1)}
         shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,)}
         for name, shape in shapes.items():
-            if tuple(getattr(self, name).shape) != shape:
-                raise InputError(
-                    f"{where}: {name} has shape {getattr(self, name).shape}, expected {shape}"
-                )
+            if (actual := tuple(getattr(self, name).shape)) != shape:
+                raise InputError(f"{where}: {name} has shape {actual}, expected {shape}")
         sh = tuple(self.sh.shape)
         if len(sh) != 3 or sh != (n, sh[1], 3) or sh[1] not in coefficients:
             raise InputError(f"{where}: sh has shape {sh}, expected ({n}, 1|4|9|16, 3)")

@@ -107,9 +107,7 @@ def _open_image(path: Path, decode: bool = True) -> tuple[Any, bytes]:
             f"{path}: not a readable image; give a PNG or JPEG, or write it again if it is damaged"
         ) from None
     except (OSError, SyntaxError, ValueError) as error:
-        raise InputError(
-            f"{path}: not a readable image ({error}); the file is damaged, write it again"
-        ) from None
+        raise InputError(f"{path}: not a readable image ({error}); write it again") from None
     return image, data
 
 
@@ -156,10 +154,7 @@ def read_values(path: str | Path) -> np.ndarray:
     path = Path(path)
     image, _ = _open_image(path)
     if image.mode not in ("L", "I;16", "I", "F"):
-        raise InputError(
-            f"{path}: not a depth image, its pixels are of kind {image.mode}; "
-            "give one channel of 16 bits, or EXR"
-        )
+        raise InputError(f"{path}: not a depth image ({image.mode}); give one channel of 16 bits")
     return np.asarray(image)
 
 
@@ -178,9 +173,7 @@ def read_depth(path: str | Path, unit: float = 1e-3, float_unit: float = 1.0) ->
     else:
         values = read_values(path)
         if values.dtype == np.uint8:
-            raise InputError(
-                f"{path}: a picture of 8 bits is no depth; give 16 bits, TIFF of float32, or EXR"
-            )
+            raise InputError(f"{path}: a picture of 8 bits is no depth; give 16 bits, TIFF or EXR")
         depth = values.astype(np.float32) * (unit if values.dtype.kind in "ui" else float_unit)
         if values.dtype == np.uint16:
             depth[values == UNKNOWN_DEPTH] = 0
@@ -202,10 +195,8 @@ def _depth_channel(path: Path) -> np.ndarray:
         if name != "A"
     ):
         return channels["R"]
-    raise InputError(
-        f"{path}: which of its channels is the depth is not plain ({', '.join(channels)}); "
-        "write one channel, Z"
-    )
+    names = ", ".join(channels)
+    raise InputError(f"{path}: which of {names} is the depth is not plain; write one channel, Z")
 
 
 def read_rgba(path: str | Path) -> np.ndarray:
@@ -219,16 +210,10 @@ def read_rgba(path: str | Path) -> np.ndarray:
     image, data = _open_image(path)
     bits = data[PNG_BIT_DEPTH] if image.format == "PNG" else 8
     if image.mode not in EIGHT_BIT_MODES and bits < 16:
-        raise InputError(
-            f"{path}: pixels of kind {image.mode} are not supported; "
-            "convert it to grey or RGB of 8 or 16 bits"
-        )
+        raise InputError(f"{path}: pixels of kind {image.mode} are not supported; make it RGB")
     if bits in (2, 4, 16) and image.mode in ("L", "I", "I;16") and "transparency" in image.info:
         # A PNG may declare one grey value transparent. Pillow and OpenCV read it wrongly here.
-        raise InputError(
-            f"{path}: a grey of {bits} bits that stands for transparent is not supported; "
-            "convert it to RGBA"
-        )
+        raise InputError(f"{path}: transparent grey of {bits} bits is not read; make it RGBA")
     if bits < 16:
         return np.asarray(image.convert("RGBA"))
     import cv2  # Pillow keeps only the upper 8 bits of 16-bit colour

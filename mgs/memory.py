@@ -33,10 +33,8 @@ def check_room(size: float, what: str, instead: str) -> None:
         return
     release()
     if size > (spare := _spare()):
-        raise InputError(
-            f"{what} may take {size / 2**30:,.1f} GiB, "
-            f"and {spare / 2**30:,.1f} GiB are free; {instead}"
-        )
+        need, free = size / 2**30, spare / 2**30
+        raise InputError(f"{what} may take {need:,.1f} GiB, {free:,.1f} GiB are free; {instead}")
 
 
 def release(beyond: int = 0) -> None:
@@ -68,10 +66,8 @@ def decoding(path: Path) -> Iterator[None]:
     try:
         yield
     except MemoryError:
-        raise InputError(
-            f"{path}: decoding it takes more than the {spare / 2**30:,.1f} GiB that are free; "
-            "give a smaller file, or repair it"
-        ) from None
+        room = f"more than the {spare / 2**30:,.1f} GiB that are free"
+        raise InputError(f"{path}: decoding it takes {room}; give a smaller file") from None
     finally:
         if bounded:
             resource.setrlimit(resource.RLIMIT_AS, limits)

@@ -105,10 +105,8 @@ def colour_corrected(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray) 
 
 def _check_same_shape(a: np.ndarray, b: np.ndarray) -> None:
     if a.shape != b.shape:
-        raise InputError(
-            f"images of {a.shape} and {b.shape} cannot be compared; "
-            "render at the size of the dataset"
-        )
+        both = f"images of {a.shape} and {b.shape} cannot be compared"
+        raise InputError(f"{both}; render at the size of the dataset")
 
 
 def compare_psnr(

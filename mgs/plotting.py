@@ -57,9 +57,7 @@ def save_figure(figure: Figure, path: str | Path) -> None:
     """
     kind = Path(path).suffix.lower()[1:]
     if kind not in FORMATS:
-        raise InputError(
-            f"{path}: figures are written as {', '.join(FORMATS)}; choose another ending"
-        )
+        raise InputError(f"{path}: figures are {', '.join(FORMATS)}; choose another ending")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format=kind)
 

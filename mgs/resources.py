@@ -14,9 +14,7 @@ def resource_folder(name: str) -> Path:
     for root in (_PACKAGE, _PACKAGE.parent):
         if (root / name).is_dir():
             return root / name
-    raise InputError(
-        f"mgs: the folder {name!r} is missing from the installation; install mgs again"
-    )
+    raise InputError(f"mgs: the folder {name!r} is missing; install mgs again")
 
 
 def scene_path(scene: str | Path) -> Path:
@@ -32,8 +30,5 @@ def scene_path(scene: str | Path) -> Path:
     path = folder / f"{scene}.toml"
     if not path.is_file():
         names = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
-        raise InputError(
-            f"scene {str(scene)!r}: unknown; choose one of {names}, "
-            "or give the path of a .toml file"
-        )
+        raise InputError(f"scene {str(scene)!r}: unknown; choose one of {names}, or a .toml file")
     return path

@@ -141,19 +141,14 @@ def _set_variant(name: str) -> None:
     import drjit as dr
     import mitsuba as mi
 
+    where = f"{VARIANT_VARIABLE}={name}"
     if name not in mi.variants():
-        raise InputError(
-            f"{VARIANT_VARIABLE}={name}: Mitsuba has no such variant; "
-            f"choose {VARIANT} or cuda_ad_rgb"
-        )
+        raise InputError(f"{where}: no such variant; choose {VARIANT} or cuda_ad_rgb")
     if name.startswith("llvm"):
         _choose_libllvm()
         _check_libllvm()
     elif name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
-        raise InputError(
-            f"{VARIANT_VARIABLE}={name}: Dr.Jit finds no NVIDIA GPU and driver; "
-            f"unset {VARIANT_VARIABLE} to compute on the processor"
-        )
+        raise InputError(f"{where}: Dr.Jit finds no NVIDIA GPU; unset it to use the processor")
     mi.set_variant(name)
 
 
@@ -181,10 +176,8 @@ def _check_libllvm() -> None:
 
     version = dr.detail.llvm_version()
     if version[0] < 0:
-        raise InputError(
-            f"Dr.Jit cannot use libLLVM {find_libllvm()} on this processor; "
-            "it needs x86-64 with AVX and FMA, or ARM64"
-        )
+        needs = "it needs x86-64 with AVX and FMA, or ARM64"
+        raise InputError(f"Dr.Jit cannot use libLLVM {find_libllvm()} on this processor; {needs}")
     if version[0] < MIN_LLVM:
         raise InputError(
             f"Dr.Jit was started with libLLVM {version[0]} before mgs could choose; "

@@ -83,7 +83,4 @@ def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
         recorded[dataset] = config.get("seed", seed) if isinstance(config, dict) else seed
     for folder, other in recorded.items():
         if other != seed:
-            raise InputError(
-                f"{folder}: was made with `seed` {other}, not {seed}; "
-                "give that seed, or another folder"
-            )
+            raise InputError(f"{folder}: has `seed` {other}; give that seed, or another folder")

@@ -88,9 +88,7 @@ def import_data(
 
     console, notes = Terminal(), Terminal(stderr=True)
     if masks is not None and mesh is not None:
-        raise InputError(
-            "import: --masks and --mesh both say where masks come from; give one of them"
-        )
+        raise InputError("import: --masks and --mesh both give masks; give one of them")
     if unit is not None and distance is not None:
         raise InputError("import: --unit and --distance both give the scale; give one of them")
     if test_split is not None and test_every is not None:

@@ -61,9 +61,7 @@ def evaluate(
             files = [subject]
             if subject.is_dir():
                 if dataset is not None:
-                    raise InputError(
-                        f"--dataset: is for a file, and {subject} has its own dataset; leave it out"
-                    )
+                    raise InputError(f"--dataset: is for a file, not for {subject}; leave it out")
                 run = open_run(subject)
                 evaluate_run(run, pictures=pictures, progress=progress, say=lines.append)
                 folder = f" ({subject.resolve().name})" if len(subjects) > 1 else ""
@@ -108,9 +106,7 @@ def diagnose(
 
     names = None if views is None else [name.strip() for name in views.split(",") if name.strip()]
     if names == []:
-        raise InputError(
-            f"--views {views!r}: names no frame; give some, as in kf_0003,kf_0010, or leave it out"
-        )
+        raise InputError(f"--views {views!r}: names no frame; give some, as in kf_0003,kf_0010")
     folders = [below(open_run(run).folder, "diagnostics") for run in runs]
     for folder in folders:
         check_new_file(folder / "information.ply", force)

@@ -164,9 +164,7 @@ def parse_up(text: str) -> tuple[float, float, float] | None:
     try:
         return unit_up([float(part) for part in text.split(",")])
     except (ValueError, InputError):
-        raise InputError(
-            f"up {text!r}: expected auto, or three numbers X,Y,Z that are not all zero, as in 0,0,1"
-        ) from None
+        raise InputError(f"up {text!r}: expected auto, or three numbers, as in 0,0,1") from None
 
 
 def parse_gaussians(text: str | None, key: str = "gaussians") -> int | Literal["auto"] | None:

@@ -129,9 +129,7 @@ def prior(
     console = Terminal()
     axis = None if up is None else parse_up(up)
     if mesh is not None and (source not in (None, "mesh") or points is not None):
-        raise InputError(
-            "prior: --mesh gives the surface, and --source or --points build one; give one of them"
-        )
+        raise InputError("prior: --mesh, --source, --points each give a surface; give one of them")
     data = load_dataset(dataset, up=axis)
     folder = out if out is not None else below(dataset, "prior")
     number = parse_gaussians(gaussians)

@@ -57,9 +57,7 @@ def export(
 
     if to == "mgs" or most is not None or psnr is not None:
         if to not in ("glb", "mgs") or (most is None) == (psnr is None):
-            raise InputError(
-                "--to mgs: is written with one of --bytes and --psnr, which are for it"
-            )
+            raise InputError("--to mgs: needs one of --bytes and --psnr, which are for it")
         _export_compact(models, out, most, psnr, shared_prior, force)
         return
     if shared_prior:
@@ -75,9 +73,7 @@ def export(
     for model, path in _targets(models, defaults, out, force):
         gaussians, up = read_model(model, prior)
         if not gaussians.linear and colour_space == "linear":
-            raise InputError(
-                f"{model}: its colours are sRGB already; leave out --colour-space linear"
-            )
+            raise InputError(f"{model}: its colours are sRGB; leave out --colour-space linear")
         srgb = gaussians.linear and colour_space == "srgb"
         splats = _in_srgb(model, gaussians) if srgb else gaussians
         splats = replace(splats, origin=gaussians.origin)

@@ -137,10 +137,7 @@ def suggest(
     with TemporaryDirectory() as scratch, progress_bar("reading", console) as progress:
         run = _run(source, Path(scratch) / "run", fit, progress)
         if plan and run.dataset.unit != "m":
-            raise InputError(
-                f"{source}: its lengths have no unit, and a flight plan has metres; import the "
-                "data with `unit`"
-            )
+            raise InputError(f"{source}: a flight plan needs metres; import the data with `unit`")
         candidates, safe, band = _candidates(run, poses, dome, asked)
         from mgs.run.suggest import suggest as suggested
 
@@ -156,9 +153,7 @@ def suggest(
         )
         crossed = _crossed(run, result)
         if crossed and plan:
-            raise InputError(
-                f"suggest: {crossed}, so no flight plan is written; give flight.no_fly"
-            )
+            raise InputError(f"suggest: {crossed}: no flight plan is written; give flight.no_fly")
         if out is not None:
             from mgs.reports.suggestion import write_suggestion
 

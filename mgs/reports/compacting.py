@@ -55,10 +55,8 @@ def compact_run(
 
     before, results = measured(whole), list[tuple[Compact, float]]()
     if psnr is not None and not psnr < before:
-        raise InputError(
-            f"psnr {psnr:g}: {run.folder} itself has {before:.2f} dB in the views it took; ask for "
-            "less"
-        )
+        own = f"{run.folder} itself has {before:.2f} dB in the views it took"
+        raise InputError(f"psnr {psnr:g}: {own}; ask for less")
     for encoder in encoders(run, shared, say):
         say("choosing steps")
         file = _fitted(encoder, size, None if psnr is None else lambda m: measured(m) >= psnr)
@@ -82,10 +80,8 @@ def encoders(
     start = _start(run, g) if shared or run.settings.prior.is_dir() else None
     if shared:
         if start is None:
-            raise InputError(
-                f"{run.folder}: its fit moved the Gaussians of its prior or has others; leave out "
-                "`shared_prior`"
-            )
+            moved = "its fit moved the Gaussians of its prior or has others"
+            raise InputError(f"{run.folder}: {moved}; leave out `shared_prior`")
         say("weighing errors")
         yield Encoder(g, lambda model: _gradients(run, model), start, None, world.up, world.origin)
         return

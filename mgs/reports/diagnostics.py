@@ -193,10 +193,8 @@ def choose_views(
         by_name = {frame.name: frame for frame in frames}
         for name in names:
             if name not in by_name:
-                raise InputError(
-                    f"views {name}: no such frame; "
-                    f"the dataset has {frames[0].name} to {frames[-1].name}"
-                )
+                span = f"{frames[0].name} to {frames[-1].name}"
+                raise InputError(f"views {name}: no such frame; the dataset has {span}")
         return [by_name[name] for name in names]
     pool = [frame for frame in frames if frame.name not in trained] or list(frames)
     spread = np.linspace(0, len(pool), min(VIEWS, len(pool)), endpoint=False).astype(int)

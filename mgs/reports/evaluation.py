@@ -163,9 +163,8 @@ def evaluate(
     """
     if isinstance(subject, Run) or (not isinstance(subject, Gaussians) and Path(subject).is_dir()):
         if dataset is not None or trained:
-            raise InputError(
-                f"{subject}: is a run, with its own dataset; leave out dataset and trained"
-            )
+            own = "is a run, with its own dataset; leave out dataset and trained"
+            raise InputError(f"{subject}: {own}")
         return evaluate_run(subject, progress=progress, **options)
     path = None
     if not isinstance(subject, Gaussians):

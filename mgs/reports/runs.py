@@ -30,17 +30,13 @@ def compare_runs(runs: Sequence[str | PathLike[str]]) -> dict[str, Run]:
         for run in opened
     }
     if len(labelled) < len(opened):
-        raise InputError(
-            "report: two of the runs have the same policy and folder name; "
-            "give each run once, or rename a folder"
-        )
+        same = "two of the runs have the same policy and folder name"
+        raise InputError(f"report: {same}; give each run once, or rename a folder")
     first = opened[0]
     for run in opened:
         if run.settings.dataset != first.settings.dataset:
-            raise InputError(
-                f"{run.folder}: is a run on another dataset than {first.folder}; "
-                "compare runs on one dataset"
-            )
+            other = f"is a run on another dataset than {first.folder}"
+            raise InputError(f"{run.folder}: {other}; compare runs on one dataset")
         run.check_frames(first.dataset)
         run.dataset = first.dataset
         _check_lines(run)
@@ -79,10 +75,8 @@ def check_finished(run: Run) -> None:
 def check_measured(run: Run) -> None:
     """Raises InputError if a run was not evaluated since its last step."""
     if run.measured is None:
-        raise InputError(
-            f"{run.folder}: was not evaluated since its last step; "
-            f"measure it with `mgs eval {run.folder}`"
-        )
+        say = f"was not evaluated since its last step; measure it with `mgs eval {run.folder}`"
+        raise InputError(f"{run.folder}: {say}")
 
 
 def step_curves(

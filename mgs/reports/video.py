@@ -132,10 +132,8 @@ def _ffmpeg() -> Any:
     try:
         import imageio_ffmpeg
     except ImportError:
-        raise InputError(
-            "mgs video: MP4 needs imageio-ffmpeg, which is not installed; "
-            "`pip install imageio-ffmpeg`, or write a .gif"
-        ) from None
+        cure = "`pip install imageio-ffmpeg`, or write a .gif"
+        raise InputError(f"mgs video: MP4 needs imageio-ffmpeg; {cure}") from None
     return imageio_ffmpeg
 
 

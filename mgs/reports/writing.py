@@ -111,9 +111,7 @@ def shown_view(runs: Sequence[Run]) -> tuple[Frame, str]:
     psnr = [{view["name"]: view["psnr"] for view in (run.metrics or {})[key]} for run in runs]
     frames = [frame for frame in frames if all(of.get(frame.name) is not None for of in psnr)]
     if not frames:
-        raise InputError(
-            f"{dataset.root}: has no view on which all runs were measured; report them one by one"
-        )
+        raise InputError(f"{dataset.root}: has no view on which all runs were measured; drop some")
     values = np.array([[of[frame.name] for frame in frames] for of in psnr])
     return frames[int(np.argmin(((values - values.mean(1, keepdims=True)) ** 2).sum(0)))], key
 

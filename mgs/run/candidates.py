@@ -146,9 +146,8 @@ def place_poses(
     if shape == "grid":
         offsets = _lattice(count, radius, elevations)
         if not len(offsets):
-            raise InputError(
-                f"grid {count}: has no pose within `elevations`; raise it, or widen them"
-            )
+            cure = "raise it, or widen them"
+            raise InputError(f"grid {count}: has no pose within `elevations`; {cure}")
     else:
         band = elevations if shape == "dome" else ((low + high) / 2,) * 2
         kind = "hemisphere" if shape == "dome" else "rings"

@@ -146,10 +146,8 @@ class Run:
     def check_frames(self, dataset: Dataset) -> None:
         """Raises InputError if a dataset has other frames than the run was started on."""
         if self.config["frames"] != [frame.name for frame in dataset.frames]:
-            raise InputError(
-                f"{dataset.root}: its frames differ from those {self.folder} was started on; "
-                "restore them or start a new run"
-            )
+            differ = f"its frames differ from those {self.folder} was started on"
+            raise InputError(f"{dataset.root}: {differ}; restore them or start a new run")
 
     @cached_property
     def prior(self) -> Prior:
@@ -173,10 +171,8 @@ class Run:
         """The state after the last finished step."""
         state = self._existing(read_checkpoint(self.folder))
         if not state.upright and self.dataset.world.up != PLUS_Z:
-            raise InputError(
-                f"{self.folder}: an older mgs made it in a world that is not upright, which this "
-                "one does not read; start the run anew"
-            )
+            old = "an older mgs made it in a world that is not upright; start the run anew"
+            raise InputError(f"{self.folder}: {old}")
         if "ended" in state.steps[-1]:
             self._repair(state)
         return state
@@ -292,9 +288,7 @@ def read_config(out: Path) -> dict[str, Any]:
     if (out / "transforms.json").is_file():
         raise InputError(f"{out}: is a dataset; make a run of it: `mgs nbv {out} --out RUN`")
     if not path.is_file():
-        raise InputError(
-            f"{out}: holds no run (no config.json); start one with `mgs nbv DATASET --out {out}`"
-        )
+        raise InputError(f"{out}: holds no run; start one with `mgs nbv DATASET --out {out}`")
     return read_checked(Config, path, "start the run anew")
 
 
@@ -371,10 +365,7 @@ def read_record(out: Path) -> dict[str, Any] | None:
         record = checked(Record, str(_member(file, "json", "U")[()]))
     frames = read_config(out)["frames"]
     if not all(0 <= frame < len(frames) for frame in record["taken"]):
-        raise InputError(
-            f"{out / CHECKPOINT}: takes frames beyond the {len(frames)} of the run; "
-            "start the run anew"
-        )
+        raise InputError(f"{out / CHECKPOINT}: takes frames that the run lacks; start the run anew")
     return record
 
 

@@ -94,10 +94,8 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
         if current.capture_path or current.given_up:
             return current
         if live is None:
-            raise InputError(
-                f"{dataset.root}: frame {frame.name} has no image; "
-                "give `capture_command` or `capture_folder`"
-            )
+            where = f"{dataset.root}: frame {frame.name} has no image"
+            raise InputError(f"{where}; give `capture_command` or `capture_folder`")
         folder, reason = live.folder or below(dataset.root, "flight"), ""
         for attempt in range(1, live.tries + 1):
             pose, out = ask(folder, frame, dataset, attempt, token)
@@ -115,10 +113,8 @@ def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[
         if live.failure == "skip":
             write_json(capture_record(frame), {"given_up": reason})
             return as_captured(frame, dataset.world)
-        raise InputError(
-            f"{frame.name}: no picture after {live.tries} tries ({reason}); "
-            "mend it and resume the run"
-        )
+        tries = f"{frame.name}: no picture after {live.tries} tries ({reason})"
+        raise InputError(f"{tries}; mend it and resume the run")
 
     return capture
 

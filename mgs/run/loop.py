@@ -56,11 +56,9 @@ def first_views(scene: Scene, mission: Mission) -> tuple[list[int], tuple[Frame,
         others = [i for i in may if i not in seeds and not frames[i].given_up]
         if not others:
             count = sum(frame.given_up for frame in frames)
-            raise InputError(
-                f"{scene.dataset.root}: too few poses are left for the seeds, {count} gave no "
-                "picture; mend the capture and resume the run, or start again with "
-                "fewer `seeds`"
-            )
+            few = f"too few poses are left for the seeds, {count} gave no picture"
+            cure = "mend the capture and resume the run, or start again with fewer `seeds`"
+            raise InputError(f"{scene.dataset.root}: {few}; {cure}")
         nearest = poses.nearest_poses(positions[others], positions[failed], 1)[0]
         seeds = [others[nearest] if i == failed else i for i in seeds]
     return seeds, frames

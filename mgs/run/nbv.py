@@ -323,19 +323,15 @@ def _check_surface(prior: Prior, dataset: Dataset, settings: NbvSettings, where:
     positions = np.stack([frame.camera.position for frame in dataset.frames])
     nearest = float(np.median(cKDTree(prior.points).query(positions)[0]))
     if nearest < NEAR:
-        raise InputError(
-            f"{where}: the cameras are {nearest:.2g} from it, and nothing nearer "
-            f"than {NEAR} is drawn; import the data with `unit`, the metres in a length of 1, "
-            "and build the prior again"
-        )
+        near = f"the cameras are {nearest:.2g} from it, and nothing nearer than {NEAR} is drawn"
+        unit = "import the data with `unit`, the metres in a length of 1, and build the prior again"
+        raise InputError(f"{where}: {near}; {unit}")
     if prior.kind == "random" and settings.train.means != "free":
         free = "let means be free (`train.means`), or give depth, points or masks"
         raise InputError(f"{where}: starts at random points, not on a surface; {free}")
     if settings.exposure and prior.numbers.get("triangulated") == 0:
-        raise InputError(
-            f"exposure: {where} has no surface on which to compare photographs; leave it "
-            "out, or give points or masks"
-        )
+        lacks = "has no surface on which to compare photographs"
+        raise InputError(f"exposure: {where} {lacks}; leave it out, or give points or masks")
 
 
 def resume_nbv(
@@ -392,9 +388,7 @@ def check_named(run: Run, policy: str | Callable[..., Any] | None) -> None:
         with reading(kept):
             same = kept.read_text(encoding="utf-8") == code_of(policy)
         if not same:
-            raise InputError(
-                f"policy {label(own)}: is not as {kept} has it; restore it, or start a new run"
-            )
+            raise InputError(f"policy {label(own)}: is not as in {kept}; restore it, or start anew")
     if in_file(own) and policy is None:
         resume = f"`mgs nbv --resume {run.folder} --policy {own}`"
         raise InputError(f"{run.folder}: its policy is a program, {own}; to run it: {resume}")

@@ -238,8 +238,6 @@ POLICIES: dict[str, Policy] = {
 def policy_named(name: str) -> Policy:
     """A row of POLICIES. Raises InputError for another name."""
     if name not in POLICIES:
-        raise InputError(
-            f"policy {name}: unknown; choose one of {', '.join(POLICIES)}, "
-            "or add your own (docs/howto/policy.md)"
-        )
+        names = ", ".join(POLICIES)
+        raise InputError(f"policy {name}: unknown; choose one of {names}, or FILE.py:NAME")
     return POLICIES[name]

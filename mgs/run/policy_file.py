@@ -115,18 +115,14 @@ def load(name: str) -> Policy:
     """
     path = file_of(name)
     if not path.is_file():
-        raise InputError(
-            f"policy {name}: no such file {path}; correct the path "
-            "(for a run, `policy` in its config.json)"
-        )
+        where = f"no such file {path}; correct the path (for a run, in its config.json)"
+        raise InputError(f"policy {name}: {where}")
     with _users_code(name, path):
         module = _executed(path, path.read_bytes())
         target = name.rpartition(":")[2]
         function = getattr(module, target, None)
         if not callable(function):
-            raise InputError(
-                f"policy {name}: {path} has no function {target}; give the name of one that it has"
-            )
+            raise InputError(f"policy {name}: {path} has no function {target}; name one it has")
         return Own(name, function() if isinstance(function, type) else function, path)
 
 
@@ -168,10 +164,9 @@ class Own:
             for parameter in inspect.signature(function).parameters.values()
             if parameter.default is parameter.empty or parameter.name in names
         ]
-        if unknown := [parameter for parameter in parameters if parameter not in names]:
-            raise InputError(
-                f"policy {name}: unknown parameter {unknown[0]}; choose from {', '.join(names)}"
-            )
+        if unknown := next((one for one in parameters if one not in names), None):
+            choice = f"choose from {', '.join(names)}"
+            raise InputError(f"policy {name}: unknown parameter {unknown}; {choice}")
         self.parameters = parameters
         by_arguments = bool(OF_THE_FIT & set(parameters))
         self.needs_fit = bool(getattr(function, "needs_fit", by_arguments))

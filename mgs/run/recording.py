@@ -154,9 +154,7 @@ def check_model(out: Path, scene: Scene, settings: NbvSettings, state: State) ->
     """
     if state.H.shape[1] != len(scene.lam):
         where = f"{out / 'config.json'}: settings.train.means"
-        raise InputError(
-            f"{where} has changed since {out} was started; restore it, or start a new run"
-        )
+        raise InputError(f"{where} has changed since {out} was started; restore it")
     frozen = settings.train.means == "frozen"
     if frozen and not np.array_equal(state.gaussians.means, scene.untrained(state).means):
         raise InputError(inputs.changed_prior(out, settings.prior))

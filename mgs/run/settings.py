@@ -115,21 +115,15 @@ class NbvSettings(ModelSettings, Mission):
         fixed = [f"estimator {self.estimator}"] if self.estimator != "exact" else []
         fixed += ["policy paper"] if self.policy == "paper" else []
         if means != "frozen" and fixed:
-            raise ValueError(
-                f"train.means {means}: {fixed[0]} has no information about means; leave out either"
-            )
+            raise ValueError(f"train.means {means}: {fixed[0]} knows no means; leave out either")
         if density != "fixed" and (means != "free" or self.budget > 0):
-            raise ValueError(
-                f"train.density {density}: needs free means and all images at once; "
-                "give `mgs fit --means free`"
-            )
+            needs = "needs free means and all images at once; give `mgs fit --means free`"
+            raise ValueError(f"train.density {density}: {needs}")
         if self.refine_poses and self.budget > 0:
             raise ValueError("refine_poses: needs all images at once; give it to `mgs fit`")
         if self.flies and self.travel is not None:
-            raise ValueError(
-                f"travel {self.travel:g}: a flight with a limit has its own travel cost; "
-                "leave out `travel`"
-            )
+            own = "a flight with a limit has its own travel cost; leave out `travel`"
+            raise ValueError(f"travel {self.travel:g}: {own}")
         return self
 
     def with_spacing(self, spacing: float, loose: float = 1.0) -> NbvSettings:

@@ -194,13 +194,9 @@ def _settings(run: Run, taken: int, views: int, given: dict[str, Any]) -> NbvSet
 def _check_left(count: int, left: int, dropped: dict[str, int], views: int, flies: bool) -> None:
     reasons = "; ".join(f"{number} {why}" for why, number in dropped.items()) or "none was dropped"
     if not left:
-        raise InputError(
-            f"suggest: none of the {count} candidates can be flown ({reasons}); give others"
-        )
+        raise InputError(f"suggest: none of {count} candidates can fly ({reasons}); give others")
     if left < views and not flies:
-        raise InputError(
-            f"suggest: views {views} of {left} candidates ({reasons}); lower it, or give more"
-        )
+        raise InputError(f"suggest: views {views} of {left} candidates ({reasons}); lower it")
 
 
 def _weights(scene: Scene, state: State, taken: int) -> dict[int, NDArray[np.float32]]:
