@@ -1,7 +1,6 @@
-"""Pinhole cameras with OpenCV axes (x right, y down, z forward) in a world in metres, +Z up.
-
-Pixels (u, v) count from the image's corner: the first centre is (0.5, 0.5). Depth is z-depth along
-the camera's z axis, metres; 0 is "no return"."""
+"""Pinhole cameras with OpenCV axes (x right, y down, z forward) in a world in metres, +Z up. Pixels
+(u, v) count from the image's corner: the first centre is (0.5, 0.5). Depth is z-depth along the
+camera's z axis, metres; 0 is "no return"."""
 
 from __future__ import annotations
 
@@ -37,8 +36,7 @@ class Camera:
 
     Raises InputError if K or the pose is not finite, K has skew or a focal length that is not
     positive, an entry exceeds FURTHEST, the width or height is not a whole number of at least 1,
-    the image exceeds MAX_PIXELS or MAX_SIDE, or the pose is not rigid.
-    """
+    the image exceeds MAX_PIXELS or MAX_SIDE, or the pose is not rigid."""
 
     K: NDArray[np.float64]
     width: int
@@ -122,10 +120,8 @@ class Camera:
         )
 
     def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Project world points [N,3], metres, to pixels [N,2] and z-depths [N], metres.
-
-        Pixels are meaningless where the z-depth is not positive.
-        """
+        """Project world points [N,3], metres, to pixels [N,2] and z-depths [N], metres. Pixels are
+        meaningless where the z-depth is not positive."""
         R, t = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         p = np.asarray(points, np.float64) @ R.T + t
         z = p[:, 2]
@@ -135,10 +131,8 @@ class Camera:
         return np.stack([u, v], 1), z
 
     def unproject(self, depth: ArrayLike) -> NDArray[np.float64]:
-        """World points [H,W,3] at the pixel centres of a depth image [H,W], both in metres.
-
-        Points are meaningless where the depth is 0.
-        """
+        """World points [H,W,3] at the pixel centres of a depth image [H,W], both in metres. Points
+        are meaningless where the depth is 0."""
         depth = np.asarray(depth, np.float64)
         v, u = np.mgrid[: self.height, : self.width] + 0.5
         x = (u - self.K[0, 2]) / self.K[0, 0] * depth
@@ -148,9 +142,7 @@ class Camera:
 
     def resized(self, width: int) -> Camera:
         """Same view in an image of this width, pixels. The height follows, rounded, at least 1.
-
-        Raises InputError if the image becomes too large, or is a crop window.
-        """
+        Raises InputError if the image becomes too large, or is a crop window."""
         if self.film is not None:
             raise InputError("camera: a crop window keeps its scale; resize the film, then crop it")
         height = max(1, round(self.height * width / self.width))
@@ -183,10 +175,8 @@ class Camera:
         return Camera(self.K, self.width, self.height, pose, film, self.corner)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
-        """Camera of a window of the image, all four in pixels.
-
-        Raises InputError if the window is empty or leaves the image.
-        """
+        """Camera of a window of the image, all four in pixels. Raises InputError if the window is
+        empty or leaves the image."""
         right, bottom = left + width, top + height
         if not (0 <= left < right <= self.width and 0 <= top < bottom <= self.height):
             place = f"the window of {width}x{height} pixels at ({left}, {top})"
@@ -204,8 +194,7 @@ def look_at(
 
     up: direction [3] that points upwards in the image. If the camera looks along it, +Y replaces
     it, or +Z where the camera looks along +Y. Raises InputError if eye and target are the same
-    point.
-    """
+    point."""
     eye = np.asarray(eye, np.float64)
     forward: NDArray[np.float64] = np.asarray(target, np.float64) - eye
     norm = np.linalg.norm(forward)
@@ -225,10 +214,8 @@ def look_at(
 
 def heading_and_pitch(camera: Camera) -> tuple[float, float]:
     """Direction of view, degrees: heading clockwise from +Y (0 to 360), pitch above the horizon.
-
     Where the camera looks straight down, the heading is that of the image's top; straight up, that
-    of its bottom.
-    """
+    of its bottom."""
     _, (down_x, down_y, _), (x, y, z) = camera.world_to_camera[:3, :3]
     if np.hypot(x, y) < 1e-6:
         x, y = np.sign(z) * down_x, np.sign(z) * down_y
@@ -238,9 +225,7 @@ def heading_and_pitch(camera: Camera) -> tuple[float, float]:
 
 def opencv_from_opengl(camera_to_world: ArrayLike) -> NDArray[np.float64]:
     """Invert nerfstudio's camera-to-world [4,4] (OpenGL axes) to world_to_camera [4,4] (OpenCV).
-
-    Raises numpy.linalg.LinAlgError if the matrix is singular.
-    """
+    Raises numpy.linalg.LinAlgError if the matrix is singular."""
     pose: NDArray[np.float64] = np.asarray(camera_to_world, np.float64) @ _OPENGL_FROM_OPENCV
     return np.asarray(np.linalg.inv(pose), np.float64)
 

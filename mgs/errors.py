@@ -49,11 +49,9 @@ def printable_lines(text: str) -> str:
 
 
 class InputError(ValueError):
-    """Bad input. The message is one line: what is wrong, where, and how to correct it.
-
-    It names settings as Python, config.json and the command line do, and escapes control
-    characters. The command line prints it without a traceback and exits with code 2.
-    """
+    """Bad input. The message is one line: what is wrong, where, and how to correct it. It names
+    settings as Python, config.json and the command line do, and escapes control characters. The
+    command line prints it without a traceback and exits with code 2."""
 
     def __str__(self) -> str:
         return printable(str(self.args[0]))
@@ -71,10 +69,8 @@ class Notice(UserWarning):
 
 
 def row_named(table: Mapping[str, Row], name: str, what: str) -> Row:
-    """Look a name up in a table. what: the setting, for the message.
-
-    Raises InputError, which lists the names of the table, if it has no such name.
-    """
+    """Look a name up in a table. what: the setting, for the message. Raises InputError, which lists
+    the names of the table, if it has no such name."""
     if name not in table:
         raise InputError(f"{what} {name!r}: unknown; choose one of {', '.join(table)}")
     return table[name]

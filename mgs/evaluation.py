@@ -1,7 +1,6 @@
-"""Quality of a model: its renders against images, as numbers (`mgs.metrics`) and pictures.
-
-The truth is `Frame.target`: the rock in front of black. Metrics of the full frame flatter, because
-any model gets the black right. Held-out views are those that the model was never trained on."""
+"""Quality of a model: its renders against images, as numbers (`mgs.metrics`) and pictures. The
+truth is `Frame.target`: the rock in front of black. Metrics of the full frame flatter, because any
+model gets the black right. Held-out views are those that the model was never trained on."""
 
 from __future__ import annotations
 
@@ -58,11 +57,8 @@ def render_view(
 
 def normals(gaussians: Gaussians, camera: Camera, cache: ListCache | None = None) -> np.ndarray:
     """Unit normals of a view in the world's axes, towards the camera, float32 [H,W,3]; 0 where
-    nothing is drawn.
-
-    The normal of a Gaussian is its shortest axis, and that of a pixel their mean by blending
-    weight. Raises InputError as `render`.
-    """
+    nothing is drawn. The normal of a Gaussian is its shortest axis, and that of a pixel their mean
+    by blending weight. Raises InputError as `render`."""
     from mgs.splat import render
 
     axes, shortest = rotmat_from_quat(gaussians.quats), np.argmin(gaussians.log_scales, 1)
@@ -83,8 +79,7 @@ def psnr_measure(
 
     `test_psnr...` over the test views. A dataset without test views: `psnr...` over all views that
     have an image, `held_out_psnr...` over those not taken. A mean over no view is left out. Raises
-    InputError as `Dataset.test_views`.
-    """
+    InputError as `Dataset.test_views`."""
     tests = dataset.test_views()
     frames = dataset.frames if tests is None else tests.frames
     of = psnr_over(frames, cache, exposure, dataset.world)
@@ -106,8 +101,7 @@ def psnr_over(
     """Returns a function (gaussians, indices of frames) -> PSNR of each of these views, dB.
 
     Keys: those of `mgs.metrics.compare_psnr`, `..._corrected` only with `exposure`. Images are kept
-    for the next call. world: of the frames' files.
-    """
+    for the next call. world: of the frames' files."""
     names = ("psnr", "psnr_mask", *(("psnr_corrected", "psnr_mask_corrected") if exposure else ()))
 
     def read(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -181,8 +175,7 @@ def evaluate_model(
     - views, test_views: for each view its "name", "trained" (bool) and its metrics, None if there
       is no pixel to measure, as in an empty mask.
 
-    Raises InputError if a file of a frame cannot be read or a picture cannot be written.
-    """
+    Raises InputError if a file of a frame cannot be read or a picture cannot be written."""
     trained = set(trained)
     work = [(frame, pictures) for frame in frames]
     work += [(frame, pictures and pictures / TEST_FOLDER) for frame in test_frames]
@@ -247,8 +240,7 @@ def write_comparison(
     brightened. A strip above holds their captions.
 
     truth, rendered: [H,W,3] linear RGB; decibels: the PSNR. Raises InputError if the file cannot be
-    written.
-    """
+    written."""
     from PIL import Image, ImageDraw, ImageFont
 
     a, b = srgb_from_linear(truth), srgb_from_linear(rendered)

@@ -32,8 +32,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
     If the block fails, the temporary file is deleted. Missing parent folders are made. Raises
     InputError if the path cannot be written: no permission, a file in place of a folder, a full
-    disk, a device, or a symbolic link on the way (`check_place`).
-    """
+    disk, a device, or a symbolic link on the way (`check_place`)."""
     path = Path(path)
     check_place(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}-{TOKEN}.part{path.suffix}")
@@ -103,10 +102,8 @@ def not_writable(path: Path, error: Exception) -> InputError:
 
 
 def check_writable(path: str | Path) -> Path:
-    """Check that a file or folder could be written at `path`, and return it as a Path.
-
-    Makes nothing; commands call it before long work. Raises InputError if it could not be written.
-    """
+    """Check that a file or folder could be written at `path`, and return it as a Path. Makes
+    nothing; commands call it before long work. Raises InputError if it could not be written."""
     path = Path(path)
     check_place(path)
     try:
@@ -119,11 +116,9 @@ def check_writable(path: str | Path) -> Path:
 
 @contextmanager
 def reading(path: Path, what: str = "file") -> Iterator[None]:
-    """Context manager: turns an OSError of its block into an InputError.
-
-    Its line says that there is no such `what`, or why it cannot be read. Pipes and devices are
-    refused, since reading one may never end, and files larger than the free memory.
-    """
+    """Context manager: turns an OSError of its block into an InputError. Its line says that there
+    is no such `what`, or why it cannot be read. Pipes and devices are refused, since reading one
+    may never end, and files larger than the free memory."""
     try:
         about = path.stat()
         if stat.S_IFMT(about.st_mode) not in (stat.S_IFREG, stat.S_IFDIR):
@@ -170,11 +165,8 @@ def fingerprint(path: str | Path) -> dict[str, str]:
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Write data as indented JSON; the file appears complete.
-
-    Raises ValueError for NaN and infinities, which JSON cannot express (write None instead), and
-    InputError as `atomic_path`.
-    """
+    """Write data as indented JSON; the file appears complete. Raises ValueError for NaN and
+    infinities, which JSON cannot express (write None instead), and InputError as `atomic_path`."""
     write_text(path, json.dumps(data, indent=2, allow_nan=False) + "\n")
 
 
@@ -186,11 +178,9 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """Write records as CSV in UTF-8 and return the path; the file appears complete.
-
-    Columns are all keys in order of appearance. None and missing keys give empty cells. Raises
-    InputError as `atomic_path`.
-    """
+    """Write records as CSV in UTF-8 and return the path; the file appears complete. Columns are all
+    keys in order of appearance. None and missing keys give empty cells. Raises InputError as
+    `atomic_path`."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
     file = io.StringIO(newline="")
     writer = csv.DictWriter(file, columns, lineterminator="\n")
@@ -272,11 +262,8 @@ THERE = "is there already; choose another place, or replace it with `force`"
 
 
 def check_new_file(path: str | Path, force: bool = False) -> Path:
-    """Check that a file may be written at `path`, and return it as a Path.
-
-    Raises InputError if it could not be written, or if it exists and is a folder or not to be
-    replaced (force).
-    """
+    """Check that a file may be written at `path`, and return it as a Path. Raises InputError if it
+    could not be written, or if it exists and is a folder or not to be replaced (force)."""
     path = check_writable(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file to write")
@@ -322,8 +309,7 @@ def check_new_folder(path: str | Path, ours: Ours | None = None) -> Path:
     """Check that an output folder can be made at `path`, and return it as a Path. Makes nothing.
 
     ours: kind of folder that may be there, to be replaced. Raises InputError if `path` is a file,
-    is a folder that is not empty or in which another process works, or could not be written.
-    """
+    is a folder that is not empty or in which another process works, or could not be written."""
     path = check_writable(path)
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file, not a folder; choose another output folder")
@@ -349,8 +335,7 @@ def atomic_folder(path: str | Path, ours: Ours | None = None) -> Iterator[Path]:
     So a folder named `path` is always complete. The temporary folder is locked. If the block fails,
     it and the parents made for it are removed; what a killed process left in it is removed first.
     ours: kind of folder that may be there, which the new one replaces. Raises InputError as
-    `check_new_folder`, and if another process makes the same folder.
-    """
+    `check_new_folder`, and if another process makes the same folder."""
     path = check_new_folder(path, ours).resolve()
     temporary, replaced = (path.with_name(f".{path.name}.{end}") for end in ("part", "old"))
     for each in (temporary, replaced):
@@ -410,8 +395,7 @@ def scratch_folder(path: str | Path, resumable: bool = False) -> Iterator[Path]:
 
     What a killed process left in it is removed first. resumable: it is not, and an interrupted
     block leaves it; one that refuses its input does not. Raises InputError if a folder of this name
-    is there that mgs did not make, or that another process uses.
-    """
+    is there that mgs did not make, or that another process uses."""
     path = Path(path)
     _check_leftover(path)
     ended = True
@@ -478,8 +462,7 @@ def locked(folder: str | Path) -> Iterator[None]:
 
     Raises InputError if another process holds it, naming that process, and if the folder cannot be
     written. The system keeps the lock on the file FOLDER/.lock and releases it when the process
-    ends, so a file .lock that is left over locks nothing.
-    """
+    ends, so a file .lock that is left over locks nothing."""
     path = Path(folder) / LOCK
     try:
         file = _lock(path)

@@ -34,8 +34,7 @@ def learned(means: str = "frozen") -> dict[str, str]:
     """Map each learned parameter to its kind, in the order of the columns.
 
     means: a name in `mgs.splat.MEANS`. Unless it is "frozen", means are learned too and come last,
-    as "mean".
-    """
+    as "mean"."""
     return dict(zip(LEARNED, KINDS, strict=True)) | ({} if means == "frozen" else {"means": "mean"})
 
 
@@ -58,8 +57,7 @@ class Gaussians:
       files whose coordinates float32 does not resolve, such as UTM.
 
     `gaussians[10:20]`, `gaussians[mask]` and `gaussians[indices]` are Gaussians again. Two are
-    equal if all numbers and marks are.
-    """
+    equal if all numbers and marks are."""
 
     means: Any
     log_scales: Any
@@ -145,12 +143,9 @@ class Gaussians:
         return expit(self.logit_opacities.astype(np.float64)).astype(np.float32)
 
     def check(self, where: object = "gaussians") -> Gaussians:
-        """Check shapes and values (NumPy fields only), and return self.
-
-        Raises InputError as `check_shapes`, and if a number is not finite or a colour coefficient
-        exceeds SH_MAX. The message begins with `where`, and names the parameter and the first such
-        Gaussian.
-        """
+        """Check shapes and values (NumPy fields only), and return self. Raises InputError as
+        `check_shapes`, and if a number is not finite or a colour coefficient exceeds SH_MAX. The
+        message begins with `where`, and names the parameter and the first such Gaussian."""
         self.check_shapes(where)
         for name in ARRAYS:
             values = np.asarray(getattr(self, name))

@@ -41,8 +41,7 @@ def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> No
     - uint8 [H,W,3]: sRGB, unchanged. uint16 [H,W]: other numbers, of 16 bits.
     - float [H,W,3]: linear RGB, converted to sRGB; with linear=False, sRGB in [0,1].
 
-    Raises InputError as `mgs.files.atomic_path`.
-    """
+    Raises InputError as `mgs.files.atomic_path`."""
     from PIL import Image
 
     if image.dtype == bool:
@@ -57,11 +56,9 @@ def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> No
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Width and height of an image or EXR file, pixels, read from its header alone.
-
-    Raises InputError if it is missing or unreadable, or has more pixels than MAX_PIXELS or the
-    free memory allows.
-    """
+    """Width and height of an image or EXR file, pixels, read from its header alone. Raises
+    InputError if it is missing or unreadable, or has more pixels than MAX_PIXELS or the free memory
+    allows."""
     path = Path(path)
     what = "EXR file" if path.suffix.lower() == ".exr" else "image"
     with reading(path, what), path.open("rb") as file:
@@ -147,10 +144,8 @@ NO_RETURN = 1e6  # metres of depth that stand for none: renderers write 1e10
 
 def read_values(path: str | Path) -> np.ndarray:
     """Numbers of an image of one channel, such as depth, unchanged: [H,W] uint8 or uint16, of a
-    TIFF also int32 or float32.
-
-    Raises InputError if it is missing, unreadable, damaged, or does not have one channel.
-    """
+    TIFF also int32 or float32. Raises InputError if it is missing, unreadable, damaged, or does not
+    have one channel."""
     path = Path(path)
     image, _ = _open_image(path)
     if image.mode not in ("L", "I;16", "I", "F"):
@@ -165,8 +160,7 @@ def read_depth(path: str | Path, unit: float = 1e-3, float_unit: float = 1.0) ->
 
     Raises InputError as `read_exr` and `read_values`, for 8 bits, if most numbers are negative, and
     where it is not plain which channel of an EXR is the depth: it is named Z or depth, in a layer
-    or not, is the only one, or all of R, G and B are equal.
-    """
+    or not, is the only one, or all of R, G and B are equal."""
     path = Path(path)
     if path.suffix.lower() == ".exr":
         depth = _depth_channel(path)
@@ -204,8 +198,7 @@ def read_rgba(path: str | Path) -> np.ndarray:
 
     uint16 (largest value 65535) for a PNG of 16 bits per sample, uint8 (255) for all others. An
     image without alpha is opaque. Raises InputError if the file is missing, unreadable, damaged, or
-    neither grey nor RGB. CMYK is refused: its colours depend on the file's colour profile.
-    """
+    neither grey nor RGB. CMYK is refused: its colours depend on the file's colour profile."""
     path = Path(path)
     image, data = _open_image(path)
     bits = data[PNG_BIT_DEPTH] if image.format == "PNG" else 8
@@ -233,12 +226,9 @@ def read_png(path: str | Path) -> np.ndarray:
 
 
 def read_mask(path: str | Path) -> np.ndarray:
-    """Read a mask image as bool [H,W], True where it is at least half white.
-
-    Of a picture of one colour the alpha counts. Of one with two values, the lower 0 and the other
-    under half white (labels 0 and 1, a palette), the other is True. Raises InputError as
-    `read_rgba`.
-    """
+    """Read a mask image as bool [H,W], True where it is at least half white. Of a picture of one
+    colour the alpha counts. Of one with two values, the lower 0 and the other under half white
+    (labels 0 and 1, a palette), the other is True. Raises InputError as `read_rgba`."""
     rgba = read_rgba(path)
     layer = rgba[..., :3] @ LUMA
     if np.ptp(layer) == 0 < np.ptp(rgba[..., 3]):
@@ -260,8 +250,7 @@ def write_exr(
 
     The header names the program, the unit of lengths, and the camera: `fx`, `fy`, `cx`, `cy`,
     pixels, and `worldToCamera` as OpenEXR defines it (a row vector times the matrix; x right, y up,
-    z backward). Raises InputError if it cannot be written.
-    """
+    z backward). Raises InputError if it cannot be written."""
     import OpenEXR
 
     data = {name: np.ascontiguousarray(array, np.float32) for name, array in channels.items()}

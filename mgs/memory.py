@@ -24,11 +24,9 @@ MEMORY_FILE = Path("/proc/meminfo")  # Linux's report of the memory that is free
 
 
 def check_room(size: float, what: str, instead: str) -> None:
-    """Raise InputError if `what` needs more bytes than are free, with what to do `instead`.
-
-    The system would kill the process without a message. Systems that do not report free memory are
-    trusted. Memory kept for reuse is released before anything is refused.
-    """
+    """Raise InputError if `what` needs more bytes than are free, with what to do `instead`. The
+    system would kill the process without a message. Systems that do not report free memory are
+    trusted. Memory kept for reuse is released before anything is refused."""
     if size <= LITTLE or size <= _spare():
         return
     release()
@@ -52,11 +50,8 @@ def release(beyond: int = 0) -> None:
 @contextmanager
 def decoding(path: Path) -> Iterator[None]:
     """Context manager in which this process gets no more memory than is free, so that a small file
-    that claims to be huge cannot exhaust it.
-
-    Raises InputError, which names the file, if that does not suffice. Systems that do not report
-    free memory are trusted.
-    """
+    that claims to be huge cannot exhaust it. Raises InputError, which names the file, if that does
+    not suffice. Systems that do not report free memory are trusted."""
     limits = resource.getrlimit(resource.RLIMIT_AS)
     spare = _spare()
     bounded = limits[0] == resource.RLIM_INFINITY and spare < float("inf")
@@ -102,8 +97,7 @@ def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:
     Every array that Dr.Jit takes over from NumPy must be one. Dr.Jit 1.5 does not copy it, and its
     kernels read a few numbers beyond the end, where the process would crash if the memory ends
     there. The alignment decides which kernel is compiled: without a fixed one, a call with a
-    hundred arrays would be compiled again nearly every time.
-    """
+    hundred arrays would be compiled again nearly every time."""
     values = np.asarray(values)
     memory = np.empty(values.size + PADDING + ALIGNMENT, dtype)
     first = -memory.ctypes.data % ALIGNMENT // memory.itemsize
@@ -131,11 +125,9 @@ def adopted(values: Any) -> np.ndarray:
 def kept_within(
     budget: int, make: Callable[[Any], Value], size: Callable[[Value], int]
 ) -> Callable[[Any], Value]:
-    """Cache the results of `make` until their sizes sum to `budget` bytes.
-
-    Later keys are made again at each call. A fit uses its images again and again in changing
-    orders, for which an LRU cache would mostly drop what is needed next.
-    """
+    """Cache the results of `make` until their sizes sum to `budget` bytes. Later keys are made
+    again at each call. A fit uses its images again and again in changing orders, for which an LRU
+    cache would mostly drop what is needed next."""
     values: dict[Any, Value] = {}
     held = 0
 

@@ -36,8 +36,7 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Peak signal-to-noise ratio of two images, dB: -10 log10 of the mean squared error.
 
     a, b: [H,W,3] sRGB in [0,1]. mask: [H,W] bool, the pixels that count; None: all. At most
-    PSNR_LIMIT; NaN if the mask is empty. Raises InputError if the shapes differ.
-    """
+    PSNR_LIMIT; NaN if the mask is empty. Raises InputError if the shapes differ."""
     _check_same_shape(a, b)
     squares = (np.asarray(a, np.float64) - b) ** 2
     if mask is not None:
@@ -53,8 +52,7 @@ def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
 
     a, b: [H,W,3] sRGB in [0,1]. mask: [H,W] bool, the pixels of the mean, NaN if empty; None: all
     but the border where the window does not fit. Raises InputError if the shapes differ or the
-    images are smaller than the window.
-    """
+    images are smaller than the window."""
     return _mean_ssim(*_similarity(a, b), mask)
 
 
@@ -95,8 +93,7 @@ def colour_corrected(truth: np.ndarray, rendered: np.ndarray, mask: np.ndarray) 
 
     truth, rendered: [H,W,3] linear RGB. mask: [H,W] bool. Removes errors of exposure and white
     balance. The gains are taken from the truth, so metrics of the result are named apart. A channel
-    that is black in the mask keeps its values.
-    """
+    that is black in the mask keeps its values."""
     a, b = truth[mask].astype(np.float64), rendered[mask].astype(np.float64)
     squares = (b * b).sum(axis=0)
     gains = np.where(squares > 0, (a * b).sum(axis=0) / np.where(squares > 0, squares, 1), 1.0)
@@ -120,8 +117,7 @@ def compare_psnr(
 
     image: [H,W,3], the truth, sRGB. rendered: [H,W,3] linear RGB. valid, rock: [H,W] bool. With
     linear, the truth as linear RGB, also `..._corrected` (`colour_corrected`). Raises InputError as
-    `psnr`.
-    """
+    `psnr`."""
     masks = {"psnr": None if valid.all() else valid, "psnr_mask": rock}
     picture = srgb_from_linear(rendered)
     values = {name: psnr(image, picture, mask) for name, mask in masks.items()}
@@ -138,8 +134,7 @@ def compare(
 
     truth: [H,W,4], linear RGB premultiplied by alpha, and alpha. rendered: [H,W,3] linear RGB.
     mask: [H,W] bool, the rock. weight: [H,W], 0 where the truth is unknown
-    (`mgs.data.frames.Frame.target`). Raises InputError as `psnr` and `ssim`.
-    """
+    (`mgs.data.frames.Frame.target`). Raises InputError as `psnr` and `ssim`."""
     a, b, valid = srgb_from_linear(truth[..., :3]), srgb_from_linear(rendered), weight > 0
     similarity = _similarity(a, b)
     values = compare_psnr(a, rendered, valid, mask & valid, truth[..., :3]) | {
@@ -169,8 +164,7 @@ def compare_surface(
     - alpha_mae: mean absolute error of alpha over the known pixels; only if `fractional`.
     - depth_error: median absolute error of depth inside the mask, metres; needs a true depth. A
       pixel where nothing is drawn is infinitely deep; NaN if the median is infinite.
-    - see_through: share of the pixels wholly on the rock whose alpha is below OPAQUE.
-    """
+    - see_through: share of the pixels wholly on the rock whose alpha is below OPAQUE."""
     valid = weight > 0
     inside = (truth[..., 3] >= 1) & valid
     metrics = {"see_through": _mean(alpha[inside] < OPAQUE)}

@@ -55,8 +55,7 @@ def picture(rgb: np.ndarray) -> Image.Image:
 def cloud(points: np.ndarray, colours: np.ndarray) -> Image.Image:
     """Picture of points [N,3], +Z up, seen from above one side; nearer points hide others.
 
-    colours: [N,3] linear RGB.
-    """
+    colours: [N,3] linear RGB."""
     every = max(1, len(points) // MOST_POINTS)
     points, colours = points[::every], np.clip(colours[::every], 0, 1)
     towards = np.array([0.6, -0.6, 0.53])

@@ -52,9 +52,7 @@ def literal(text: str) -> str:
 
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure in the format of its suffix: .png, .pdf or .svg; the file appears complete.
-
-    Raises InputError for another suffix, and as `mgs.files.atomic_path`.
-    """
+    Raises InputError for another suffix, and as `mgs.files.atomic_path`."""
     kind = Path(path).suffix.lower()[1:]
     if kind not in FORMATS:
         raise InputError(f"{path}: figures are {', '.join(FORMATS)}; choose another ending")
@@ -68,8 +66,7 @@ def drawing(
 ) -> Iterator[Figure]:
     """Context with an empty figure, which is written to `path` when the block ends without error.
 
-    width, height: inches. style: settings while it is drawn. Raises as `save_figure`.
-    """
+    width, height: inches. style: settings while it is drawn. Raises as `save_figure`."""
     import matplotlib
 
     with matplotlib.rc_context(style):
@@ -89,8 +86,7 @@ def painted(values: np.ndarray, colours: str, low: float = 0.0, high: float = 1.
 def crop(mask: np.ndarray, margin: float = 0.06) -> tuple[slice, slice]:
     """Rows and columns of an image that hold its mask [H,W] and a margin; all if the mask is empty.
 
-    margin: share of the image's height and width.
-    """
+    margin: share of the image's height and width."""
     rows, columns = np.nonzero(mask)
     if len(rows) == 0:
         return slice(None), slice(None)

@@ -13,9 +13,7 @@ from mgs import __version__
 
 def versions() -> dict[str, str]:
     """Versions of mgs, Python and the libraries that compute results; "unknown" if not installed.
-
-    If mgs runs from a checkout, also its "commit".
-    """
+    If mgs runs from a checkout, also its "commit"."""
     numbers = {"mgs": __version__, **_commit(), "python": platform.python_version()}
     for package in ("mitsuba", "drjit", "numpy"):
         try:

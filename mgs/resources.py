@@ -18,10 +18,8 @@ def resource_folder(name: str) -> Path:
 
 
 def scene_path(scene: str | Path) -> Path:
-    """Path of a scene's TOML file, from that path or from a name such as "boulder".
-
-    Raises InputError if there is no such file or name.
-    """
+    """Path of a scene's TOML file, from that path or from a name such as "boulder". Raises
+    InputError if there is no such file or name."""
     if Path(scene).suffix == ".toml":
         if not Path(scene).is_file():
             raise InputError(f"{scene}: no such scene file")

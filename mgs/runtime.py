@@ -1,5 +1,4 @@
 """Start of Dr.Jit and Mitsuba: find a usable libLLVM, then set Mitsuba's variant unless one is set.
-
 libLLVM older than 19 aborts the process inside a kernel without an exception, so it is checked
 before any kernel runs. tools/setup.sh uses this module before anything is installed."""
 
@@ -42,9 +41,7 @@ class Libllvm:
 
 def load_libllvm(path: str) -> Libllvm:
     """Load a library and read its version. Raises InputError if it does not load or is not libLLVM.
-
-    `find_libllvm` adds the correction to the message.
-    """
+    `find_libllvm` adds the correction to the message."""
     try:
         library = ctypes.CDLL(path)
     except OSError as error:
@@ -67,8 +64,7 @@ def find_libllvm() -> Libllvm:
 
     Dr.Jit tries the path in DRJIT_LIBLLVM_PATH, `libLLVM.so` by name, and the highest version in
     the system's library folder. If DRJIT_LIBLLVM_PATH is set, only that one is considered. Raises
-    InputError if there is no libLLVM of version 19 or newer.
-    """
+    InputError if there is no libLLVM of version 19 or newer."""
     explicit = os.environ.get(LIBRARY_VARIABLE)
     candidates = [explicit] if explicit else _candidates()
     problems = []
@@ -202,10 +198,7 @@ def _prepare_variant() -> None:
 
 def processor() -> dict[str, str | int]:
     """Processor as Dr.Jit sees it, after `start`: "variant", "cpu" (LLVM's name), "simd_width"
-    (float32 lanes) and "threads".
-
-    "cpu" and "simd_width" are "unknown" if Dr.Jit does not tell.
-    """
+    (float32 lanes) and "threads". "cpu" and "simd_width" are "unknown" if Dr.Jit does not tell."""
     import drjit as dr
     import mitsuba as mi
 

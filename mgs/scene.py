@@ -37,8 +37,7 @@ class Choice:
 
     view: its index. score: the policy's own number. information_gain: Eq. 7 of this view by the
     scene's estimator, whatever the policy. coverage: Eq. 9 of all views taken with this one, 0 to
-    1.
-    """
+    1."""
 
     view: int
     score: float
@@ -57,8 +56,7 @@ class State:
       were before training; without columns of means.
     - skipped: number of views taken before the flight began.
     - fit: how the model was found. exposure: [V,3] gains of the views taken, if estimated.
-      choices: the views chosen since the fit before.
-    """
+      choices: the views chosen since the fit before."""
 
     frames: tuple[Frame, ...]
     taken: tuple[int, ...]
@@ -101,8 +99,7 @@ class Scene:
       choices (`mgs.memory.VIEW_BYTES`).
 
     Values are computed at their first use and kept. Raises InputError as
-    `ModelSettings.regularisation`, and where the prior was built with another upward direction.
-    """
+    `ModelSettings.regularisation`, and where the prior was built with another upward direction."""
 
     dataset: Dataset
     prior: Prior
@@ -272,8 +269,7 @@ class Scene:
     def information(self, state: State, view: int, estimator: str | None = None) -> np.ndarray:
         """Information of a view about the model of a state [N,P].
 
-        estimator: a name in `mgs.splat.ESTIMATORS`, by default that of the scene.
-        """
+        estimator: a name in `mgs.splat.ESTIMATORS`, by default that of the scene."""
         key = state.frames[view].camera, estimator or self.settings.estimator
         if not self.keep:
             return self.fisher(state.gaussians, *key)
@@ -307,8 +303,7 @@ class Scene:
     def seeds(self, count: int, among: Sequence[int] | None = None) -> list[int]:
         """Views to begin with, spread over the directions of the poses (`poses.seed_views`).
 
-        among: indices to choose from, by default all.
-        """
+        among: indices to choose from, by default all."""
         views = range(len(self.frames)) if among is None else among
         positions = self.positions([self.frames[i] for i in views])
         return [int(views[k]) for k in poses.seed_views(positions, self.centre, count)]

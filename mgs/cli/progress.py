@@ -23,10 +23,8 @@ SECONDS_BETWEEN = 10.0  # least time between two lines of progress where there i
 
 
 class ProgressBar:
-    """Lines at the bottom of the terminal: the stage at work, and above it the whole.
-
-    Without a terminal, a line on the standard error every SECONDS_BETWEEN.
-    """
+    """Lines at the bottom of the terminal: the stage at work, and above it the whole. Without a
+    terminal, a line on the standard error every SECONDS_BETWEEN."""
 
     def __init__(self, bar: Progress, stage: str) -> None:
         self._bar = bar

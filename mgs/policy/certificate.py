@@ -32,8 +32,7 @@ class Best(NamedTuple):
     """A set of candidates, its gain, and the `bound` that no set of as many exceeds.
 
     nodes: number of relaxations solved after the first. prices: of the first one [C]. stopped:
-    "gap" if that is small enough, else "nodes" or "time".
-    """
+    "gap" if that is small enough, else "nodes" or "time"."""
 
     views: list[int]
     gain: float
@@ -46,11 +45,9 @@ class Best(NamedTuple):
 def upper_bound(
     criterion: Criterion, k: int, tolerance: float = TOLERANCE, seconds: float = np.inf
 ) -> Bound:
-    """Upper bound for the gain of every set of k candidates, by their criterion.
-
-    It stops at a gap of `tolerance` or after `seconds`. Raises InputError for k < 1 and for fewer
-    candidates than k.
-    """
+    """Upper bound for the gain of every set of k candidates, by their criterion. It stops at a gap
+    of `tolerance` or after `seconds`. Raises InputError for k < 1 and for fewer candidates than
+    k."""
     count = criterion.candidates
     if not 1 <= k <= count:
         raise InputError(f"certificate: {k} of {count} candidates; ask for 1 to {count}")
@@ -70,8 +67,7 @@ def added_bound(
     all. Infinite where the criterion is not submodular, unless `room` is 1.
 
     No set of `views` and so many of `free` has more (Nemhauser, Wolsey and Fisher 1978), nor has a
-    set of so many candidates without `views`.
-    """
+    set of so many candidates without `views`."""
     if room > 1 and not criterion.submodular:
         return np.inf
     gains = np.sort(criterion.added(views)[free])[::-1]
@@ -89,8 +85,7 @@ def best_set(
 
     Stops when the gain is within `gap` of the bound, after `most` nodes, or after `seconds`. Each
     node fixes some views as taken and some as left out. The node with the largest bound is next,
-    and branches on the view whose weight is nearest to 1/2. Raises InputError as `upper_bound`.
-    """
+    and branches on the view whose weight is nearest to 1/2. Raises InputError as `upper_bound`."""
     k, until, reason = len(plan), time.monotonic() + seconds, "gap"
     root = upper_bound(criterion, k, seconds=seconds)
     gains = {tuple(sorted(plan)): criterion.gain(plan)}
@@ -183,8 +178,7 @@ class Certificate:
     share, best: gain of the plan, and of the best set that the search met, over the bound of any k.
     fewer: bound of any k - 1 over the plan's gain; None for one view. of_all: gain of the plan over
     that of all candidates. nodes, stopped: of the search (`Best`). prices: of the bound of any k
-    [C] (`Bound`), over its value. curve: see `curve`.
-    """
+    [C] (`Bound`), over its value. curve: see `curve`."""
 
     criterion: str
     views: int
@@ -241,8 +235,7 @@ def curve(criterion: Criterion, plan: Sequence[int], even: Sequence[int]) -> lis
     "plan" (for other sizes greedy), "even" and "random".
 
     even: candidates in the order in which even spacing takes them. The last two shares are those of
-    `criterion.coarse`.
-    """
+    `criterion.coarse`."""
     count, coarse, rng = criterion.candidates, criterion.coarse, np.random.default_rng(0)
     every, about = (one.gain(range(count)) for one in (criterion, coarse))
     order, draws = greedy(coarse, 1.0), [rng.permutation(count) for _ in range(5)]
@@ -262,8 +255,7 @@ def curve(criterion: Criterion, plan: Sequence[int], even: Sequence[int]) -> lis
 def greedy(criterion: Criterion, share: float, most: int | None = None) -> list[int]:
     """Candidates by greedy choice, until they have `share` of the gain of all of them together.
 
-    most: number of views after which it stops anyway.
-    """
+    most: number of views after which it stops anyway."""
     views, enough = list[int](), share * criterion.gain(range(criterion.candidates))
     while len(views) < (most or criterion.candidates):
         gains = criterion.added(views)

@@ -39,8 +39,7 @@ def regularisation(
     parameters and the new image, in nats (diagonal, linearised).
 
     groups: columns of each kind of parameter (`mgs.splat.groups`). prior_std: tau of each kind;
-    that of colour is for degree 0. Higher degrees have DIRECTIONAL_STD.
-    """
+    that of colour is for degree 0. Higher degrees have DIRECTIONAL_STD."""
     lam = np.empty(max(columns.stop for columns in groups.values()))
     for name, columns in groups.items():
         lam[columns] = (pixel_noise / prior_std[name]) ** 2
@@ -60,17 +59,14 @@ def observed(H: Array, lam: Array) -> NDArray[np.bool_]:
     """Mask [N] of the Gaussians about which the images say more than the prior (Eq. 9 with epsilon
     = lam).
 
-    Only the colour columns count: colour information is the sum of squared blending weights.
-    """
+    Only the colour columns count: colour information is the sum of squared blending weights."""
     return np.asarray((H[:, :3] > lam[:3]).any(axis=1))
 
 
 def coverage(H: Array, lam: Array) -> float:
-    """Surface coverage C_0 of Eq. 9: the share of Gaussians that are `observed`, 0 to 1.
-
-    The loop passes H of the Gaussians before training. With the trained model, Gaussians that fade
-    behind their neighbours would count as unseen surface.
-    """
+    """Surface coverage C_0 of Eq. 9: the share of Gaussians that are `observed`, 0 to 1. The loop
+    passes H of the Gaussians before training. With the trained model, Gaussians that fade behind
+    their neighbours would count as unseen surface."""
     return float(observed(H, lam).mean())
 
 
@@ -87,10 +83,8 @@ def d_optimal(F: Array, H: Array, lam: Array) -> float:
 
 
 def a_optimal(F: Array, H: Array, lam: Array) -> float:
-    """1/l sum [1/(H+lam) - 1/(H+F+lam)], the decrease of the average variance.
-
-    A-optimality, as in the paper and in textbooks; POp-GS calls it T-optimal.
-    """
+    """1/l sum [1/(H+lam) - 1/(H+F+lam)], the decrease of the average variance. A-optimality, as in
+    the paper and in textbooks; POp-GS calls it T-optimal."""
     return float((F / ((H + lam) * (H + F + lam))).mean(dtype=np.float64))
 
 

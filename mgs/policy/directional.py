@@ -36,8 +36,7 @@ class Views(NamedTuple):
     """Poses, and what they see of the surface.
 
     positions: camera centres [V,3], metres.
-    seen: squared blending weights of each Gaussian in each view [V,N] (`squared_weights`).
-    """
+    seen: squared blending weights of each Gaussian in each view [V,N] (`squared_weights`)."""
 
     positions: Array
     seen: Array
@@ -52,17 +51,13 @@ def squared_weights(F: Array) -> NDArray[np.float32]:
 
     F: exact Fisher information of the view [N,P], for colours of SH degree 0. Its entry for a
     colour coefficient is this sum times SH_C0^2, or 0 for a channel that is clamped at 0, so the
-    largest of the three channels is used.
-    """
+    largest of the three channels is used."""
     return np.asarray(F[:, :3].max(axis=1) / SH_C0**2, np.float32)
 
 
 def dome_cameras(like: Camera, positions: Array, centre: Array) -> list[Camera]:
-    """DOME cameras spread evenly over a dome, looking at `centre` [3].
-
-    They have the intrinsics of `like` and the median distance of `positions` [V,3] from the centre,
-    metres.
-    """
+    """DOME cameras spread evenly over a dome, looking at `centre` [3]. They have the intrinsics of
+    `like` and the median distance of `positions` [V,3] from the centre, metres."""
     radius = float(np.median(np.linalg.norm(np.asarray(positions) - centre, axis=1)))
     settings = Orbit(kind="hemisphere", radius=radius, elevations=DOME_ELEVATIONS)
     return [
@@ -75,8 +70,7 @@ def basis(points: Array, views: Views, degree: int) -> NDArray[np.float64]:
     """Spherical harmonics of the directions from cameras to points [N,V,K].
 
     points: [N,3], metres. Zero where the view does not see the point: most pairs, and computing
-    them would take most of the time.
-    """
+    them would take most of the time."""
     from mgs.splat.reference import sh_basis  # imported here because mgs.splat loads Dr.Jit
 
     point, view = np.nonzero(views.seen.T)

@@ -16,8 +16,7 @@ def planned_views(gains: PoolGains, candidates: Sequence[int], count: int) -> li
     """Views to take next, as a set: greedily, then exchanged one by one until no exchange has a
     larger gain (V. V. Fedorov, Theory of Optimal Experiments, 1972).
 
-    gains: after the views taken; changed. candidates: poses, more than `count`.
-    """
+    gains: after the views taken; changed. candidates: poses, more than `count`."""
     views: list[int] = []
     for _ in range(count):
         free = [view for view in candidates if view not in views]
@@ -43,8 +42,7 @@ def planned_path(
     """Views to take next, in this order and each in reach: a beam search for the largest gain of
     all together. Fewer than `count` where nothing is left in reach.
 
-    gains: after the views taken. reach(views): poses in reach after these views.
-    """
+    gains: after the views taken. reach(views): poses in reach after these views."""
     paths = [(0.0, gains)]
     for _ in range(count):
         longer: dict[tuple[frozenset[int], int], tuple[float, int, PoolGains]] = {}

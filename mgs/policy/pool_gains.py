@@ -43,8 +43,7 @@ class PoolGains:
 
     S, M: matrices, one array [N] for each entry of `_upper`.
     g, q: one number for each pair of a pose and a Gaussian that it sees.
-    by, of: pose and Gaussian of each pair. M and q are None for D-optimality.
-    """
+    by, of: pose and Gaussian of each pair. M and q are None for D-optimality."""
 
     @one_at_a_time
     def __init__(

@@ -16,10 +16,8 @@ def azimuths(positions: Array, centre: Array) -> NDArray[np.float64]:
 
 def uniform_azimuth(candidates: Array, taken: Array, centre: Array) -> Array:
     """Azimuth gap to the next view taken on the left times that on the right, square radians.
-
     Splitting a gap a + b lowers the sum of squared gaps by 2ab, so this is greedy for the most even
-    spread.
-    """
+    spread."""
     gaps = (azimuths(taken, centre)[None, :] - azimuths(candidates, centre)[:, None]) % (2 * np.pi)
     return _rounded(gaps.min(axis=1) * (2 * np.pi - gaps.max(axis=1)))
 
@@ -60,11 +58,9 @@ def nearest_poses(positions: Array, here: Array, count: int) -> list[int]:
 
 
 def travel_cost(positions: Array, here: Array, travel: float) -> NDArray[np.float64]:
-    """Cost of an image at each position [C,3] for a camera that is at `here` [3], in images.
-
-    It is 1 + distance / travel, with the distance along a straight line. travel: metres that cost
-    as much as an image.
-    """
+    """Cost of an image at each position [C,3] for a camera that is at `here` [3], in images. It is
+    1 + distance / travel, with the distance along a straight line. travel: metres that cost as much
+    as an image."""
     return np.asarray(1 + _rounded(np.linalg.norm(positions - here, axis=1)) / travel)
 
 
@@ -80,8 +76,7 @@ def seed_views(positions: Array, centre: Array, count: int) -> list[int]:
     on an even ring, one frame at a time is exchanged as long as that lowers the sum over the pool
     of the squared angle to the nearest of them.
 
-    positions: camera centres [C,3]; centre: the rock [3]; metres. Needs count <= C.
-    """
+    positions: camera centres [C,3]; centre: the rock [3]; metres. Needs count <= C."""
     azimuth, squared = azimuths(positions, centre), angles(positions, positions, centre) ** 2
     seeds = list[int]()
     for target in 2 * np.pi * np.arange(count) / count:

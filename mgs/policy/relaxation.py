@@ -6,8 +6,7 @@ A `Relaxation` is a sum over Gaussians j of a concave function of their informat
 
 with the weight x_v = 1 for a candidate that is taken, and 0 otherwise. A(0) holds the prior and the
 views taken before. `Coverage` counts Gaussians instead. `mgs.policy.certificate` bounds both over
-all sets of k candidates.
-"""
+all sets of k candidates."""
 
 from __future__ import annotations
 
@@ -39,8 +38,7 @@ class Bound(NamedTuple):
 
     weights: [C], sum k. prices: derivative of the gain by each weight [C].
     gap: (value - gain of the best weights) / value. stopped: "gap" if that is small enough, else
-    "time" or "steps".
-    """
+    "time" or "steps"."""
 
     value: float
     weights: Floats
@@ -51,12 +49,9 @@ class Bound(NamedTuple):
 
 @dataclass(frozen=True)
 class Relaxation:
-    """A criterion as a concave function of the weights x [C] of the candidates.
-
-    phi is scale log det A, or -scale trace(A^-1 M) where `over` is given.
-    vectors(some): z [n,C,K] of a slice of the N Gaussians.
-    base: A(0) [N,K,K]. over: M [N,K,K].
-    """
+    """A criterion as a concave function of the weights x [C] of the candidates. phi is scale log
+    det A, or -scale trace(A^-1 M) where `over` is given. vectors(some): z [n,C,K] of a slice of the
+    N Gaussians. base: A(0) [N,K,K]. over: M [N,K,K]."""
 
     candidates: int
     vectors: Callable[[slice], Floats]
@@ -154,8 +149,7 @@ class Relaxation:
         """Least upper bound from tangents, for sets in the box of 0 and 1 whose size is sum x.
 
         First for the coarse relaxation, then from there: Newton steps with the coarse curvature.
-        Stops at a gap of `tolerance`, at the time `until`, or once it is at most `enough`.
-        """
+        Stops at a gap of `tolerance`, at the time `until`, or once it is at most `enough`."""
         if len(self.base) > 2 * len(self.coarse.base):
             x = self.coarse.bound(x, box, tolerance, until).weights
         return _least(self._ascent(x, box), tolerance, until, enough)
@@ -254,10 +248,8 @@ def directional(
     candidates: Views,
     dome: Views | None = None,
 ) -> Relaxation:
-    """Directional D-optimality of candidates, or I-optimality with a dome.
-
-    Arguments as `mgs.policy.directional.gains`. Raises InputError as `checked`.
-    """
+    """Directional D-optimality of candidates, or I-optimality with a dome. Arguments as
+    `mgs.policy.directional.gains`. Raises InputError as `checked`."""
     from mgs.splat.reference import sh_basis  # imported here because mgs.splat loads Dr.Jit
 
     checked(candidates.seen)
@@ -320,8 +312,7 @@ class Coverage:
     to 1. So the number is at most the sum of min(1, s^T x), which is concave in the weights.
 
     F: information of the candidates about colours [C,N,3]. H: of the views taken [N,3]. lam: [3].
-    Raises InputError where F has a number that is not finite.
-    """
+    Raises InputError where F has a number that is not finite."""
 
     F: Array
     H: Array
@@ -377,8 +368,7 @@ class Coverage:
         """Upper bound by the linear programme. Arguments: `Relaxation.bound`.
 
         Cutting planes: every x tried gives a tangent, and HiGHS finds the next x, where the least
-        tangent is largest. Any mean of tangents is a bound; the prices are its slope.
-        """
+        tangent is largest. Any mean of tangents is a bound; the prices are its slope."""
         return _least(self._cuts(x, box), tolerance, until, enough)
 
     def _cuts(self, x: Floats, box: tuple[Floats, Floats]) -> Iterator[tuple[float, Bound]]:

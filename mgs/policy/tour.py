@@ -1,6 +1,5 @@
-"""Tours of a flight: lengths of legs, 2-opt, and plans within a limit. Metres.
-
-A tour is a list of poses, indices of rows of a matrix of legs. Its two ends stay where they are."""
+"""Tours of a flight: lengths of legs, 2-opt, and plans within a limit. Metres. A tour is a list of
+poses, indices of rows of a matrix of legs. Its two ends stay where they are."""
 
 from __future__ import annotations
 
@@ -29,12 +28,9 @@ ARC_STEP = np.radians(15)  # largest angle between two corners of a leg around a
 
 
 def legs(positions: Array, axis: Array, radius: float = 0.0) -> NDArray[np.float64]:
-    """Lengths of the legs between all pairs of positions [V,3], metres [V,V].
-
-    A leg is straight. If it would cross the upright cylinder of this radius around `axis` [2], it
-    leads around it through the corners of `leg_corners`. For a pose inside the cylinder, the
-    cylinder shrinks to it.
-    """
+    """Lengths of the legs between all pairs of positions [V,3], metres [V,V]. A leg is straight. If
+    it would cross the upright cylinder of this radius around `axis` [2], it leads around it through
+    the corners of `leg_corners`. For a pose inside the cylinder, the cylinder shrinks to it."""
     offset = positions[:, None] - positions[None]
     level = np.linalg.norm(offset[..., :2], axis=2)
     if radius > 0:
@@ -64,10 +60,8 @@ def _steps(arc: Array) -> tuple[Array, Array]:
 
 
 def leg_corners(start: Array, end: Array, axis: Array, radius: float) -> NDArray[np.float64]:
-    """Corners [M,3] of the leg from `start` to `end` [3] (`legs`); none if it is straight.
-
-    They lie just outside the cylinder, and their heights change evenly along the leg.
-    """
+    """Corners [M,3] of the leg from `start` to `end` [3] (`legs`); none if it is straight. They lie
+    just outside the cylinder, and their heights change evenly along the leg."""
     ends = np.stack([start, end])
     level, out = ends[:, :2] - axis, np.linalg.norm(ends[:, :2] - axis, axis=1)
     clear = min(radius, float(out.min()))
@@ -129,11 +123,9 @@ def flying_order(matrix: Array, start: int, stops: Sequence[int], home: int) -> 
 def grown(
     legs: Array, tour: Sequence[int], free: Sequence[int], pick: Pick, share: Share, per_stop: float
 ) -> tuple[list[int], float]:
-    """Add stops to a tour until none fits: (the tour, the sum of their gains).
-
-    The stop that is picked joins at its cheapest place, then 2-opt shortens the tour. The cost of a
-    stop is the share of the limits that it adds, and `per_stop`.
-    """
+    """Add stops to a tour until none fits: (the tour, the sum of their gains). The stop that is
+    picked joins at its cheapest place, then 2-opt shortens the tour. The cost of a stop is the
+    share of the limits that it adds, and `per_stop`."""
     way, rest, total = list(tour), list(free), 0.0
     while rest:
         metres, stops = tour_length(legs, way), len(way) - 2
@@ -158,11 +150,9 @@ def planned_tour(
     share: Share,
     per_stop: float,
 ) -> list[int]:
-    """Tour between `ends` of large total gain: `grown` by gain per cost, then improved.
-
-    Each one to three neighbouring stops are dropped and the tour grown again without the first of
-    them, as long as that raises the total gain. gains: after the views taken; changed.
-    """
+    """Tour between `ends` of large total gain: `grown` by gain per cost, then improved. Each one to
+    three neighbouring stops are dropped and the tour grown again without the first of them, as long
+    as that raises the total gain. gains: after the views taken; changed."""
 
     def of(state: PoolGains) -> Pick:
         def pick(stops: list[int], cost: NDArray[np.float64]) -> tuple[int, float]:

@@ -41,8 +41,7 @@ class Visibility:
     - planned(taken, candidates, count, model): at most `count` views to take next, as a set
       (`planned_views`); all candidates where there are no `plan_gains`.
     - path(taken, candidates, count, nearest, model): the same in order, each among the `nearest`
-      to the one before (`planned_path`); none where there are no `plan_gains`.
-    """
+      to the one before (`planned_path`); none where there are no `plan_gains`."""
 
     def __init__(
         self,
@@ -71,11 +70,9 @@ class Visibility:
         tau: float,
         over_dome: bool,
     ) -> Array:
-        """Directional gain of each candidate after the views taken [C].
-
-        It is fast if the views taken begin with those of the call before. Where gains do not fit
-        into the memory, they are computed from scratch.
-        """
+        """Directional gain of each candidate after the views taken [C]. It is fast if the views
+        taken begin with those of the call before. Where gains do not fit into the memory, they are
+        computed from scratch."""
         model = degree, tau, over_dome
         state = self.states.get(model)
         if state is None or state.taken != list(taken[: len(state.taken)]):

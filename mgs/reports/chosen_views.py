@@ -34,8 +34,7 @@ def write_views(out: Path, run: Run, kind: str, every: bool = False) -> str:
     """Write the views that a run took, or all that have images, into the new folder `out`.
 
     kind: a format of NAMES. Images are copied, masks are black and white; the points are centres of
-    the model's Gaussians. Returns a line for the user. Raises InputError if a file is missing.
-    """
+    the model's Gaussians. Returns a line for the user. Raises InputError if a file is missing."""
     frames, world = list(run.taken), run.dataset.world
     if every:
         frames = list(run.dataset.with_images([frame.name for frame in frames]))

@@ -42,8 +42,7 @@ def compact_run(
 
     shared: the receiver has the run's prior, so positions are not sent. say(stage): called as a
     stage starts. Raises InputError if neither can be reached, for a shared prior whose Gaussians
-    were moved or changed by the fit, and as `Run.state`.
-    """
+    were moved or changed by the fit, and as `Run.state`."""
     from mgs.splat import ListCache
 
     cache, whole = ListCache(), run.state.gaussians

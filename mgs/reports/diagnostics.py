@@ -28,10 +28,8 @@ DECADES = 4  # largest range of the logarithmic colour scales, in powers of ten
 
 
 def run_scalars(run: Run) -> dict[str, np.ndarray]:
-    """Scalars of the model of a run (docs/evaluation.md), name -> [N].
-
-    H is about the fitted model, by the run's estimator. `unobserved` is of the Gaussians before
-    training."""
+    """Scalars of the model of a run (docs/evaluation.md), name -> [N]. H is about the fitted model,
+    by the run's estimator. `unobserved` is of the Gaussians before training."""
     from mgs.splat import groups
 
     H, settings, degree = run.state.H, run.settings, run.state.gaussians.sh_degree
@@ -56,8 +54,7 @@ def view_maps(
     (expected z-depth, metres) and a map of each scalar.
 
     scalars: name -> [N]. They are drawn in place of the colours, three at a time. The map of
-    `unobserved` is 1 where unobserved Gaussians have more than half of the weight, else 0.
-    """
+    `unobserved` is 1 where unobserved Gaussians have more than half of the weight, else 0."""
     from mgs.splat import ListCache, render
 
     cache = ListCache()
@@ -93,8 +90,7 @@ def write_information_ply(
     blue, and every scalar.
 
     Colours show the information, from 0 to its largest value (colour map viridis). Dots in names
-    become underscores. scalars: name -> [N]. Raises InputError if the file cannot be written.
-    """
+    become underscores. scalars: name -> [N]. Raises InputError if the file cannot be written."""
     import matplotlib
     from plyfile import PlyData, PlyElement
 
@@ -130,8 +126,7 @@ def write_preview(
     to the model.
 
     maps: `view_maps` of all scalars; title: of the render; unit: name of a length of 1. Raises
-    InputError if the file cannot be written.
-    """
+    InputError if the file cannot be written."""
     from mgs.plotting import NO_GRID, crop, drawing, literal
 
     visible = maps["A"] >= VISIBLE
@@ -157,8 +152,7 @@ def show_map(
     """Draw a channel of `view_maps` into axes without frame, grey where the opacity is below
     VISIBLE.
 
-    window: rows and columns. colours: of a colour map. scale: `norm`, or `vmin` and `vmax`.
-    """
+    window: rows and columns. colours: of a colour map. scale: `norm`, or `vmin` and `vmax`."""
     import matplotlib
 
     values = np.ma.masked_where(maps["A"] < VISIBLE, maps[channel])[window]
@@ -187,8 +181,7 @@ def choose_views(
     not trained on.
 
     trained: names of the training frames; if these are all, the choice is among all frames. Raises
-    InputError for a name that no frame has.
-    """
+    InputError for a name that no frame has."""
     if names:
         by_name = {frame.name: frame for frame in frames}
         for name in names:
@@ -210,8 +203,7 @@ def diagnose(
     paths.
 
     views: names of frames (`choose_views`). progress: called as progress(views done, all). Raises
-    InputError for an unknown view, and as `open_run`.
-    """
+    InputError for an unknown view, and as `open_run`."""
     opened = open_run(run)
     gaussians, trained = opened.state.gaussians, [frame.name for frame in opened.taken]
     frames = choose_views(opened.dataset.frames, trained, views)

@@ -40,8 +40,7 @@ def evaluate_run(
     Metrics and pictures of the same model, dataset and version of mgs are kept, if all are there.
     In an on-demand dataset only frames that the run has taken have an image, so none is held out.
     Raises InputError as `open_run`, if the test views cannot be read, and if another process works
-    on the run.
-    """
+    on the run."""
     from mgs.splat import as_drjit
 
     run = open_run(run)
@@ -124,11 +123,9 @@ def _measured_before(run: Run, subject: str) -> dict[str, Any]:
 
 
 def compare_models(models: Sequence[Gaussians], run: Run) -> tuple[str, list[float] | None]:
-    """Mean PSNR of each model, dB, full frame, on views that a run did not train on.
-
-    Returns the name of the set, "test" if the dataset has test views, else "held-out", and the
-    means, None if there is no such view.
-    """
+    """Mean PSNR of each model, dB, full frame, on views that a run did not train on. Returns the
+    name of the set, "test" if the dataset has test views, else "held-out", and the means, None if
+    there is no such view."""
     tests, taken = run.dataset.test_views(), [frame.name for frame in run.taken]
     name, frames = "test", tests.frames if tests else ()
     if not tests:
@@ -159,8 +156,7 @@ def evaluate(
 
     Raises InputError as `evaluate_run`, `load_gaussians` and `load_dataset`, if a model comes
     without a dataset, if trained names no frame of it, and if dataset or trained are given for a
-    run.
-    """
+    run."""
     if isinstance(subject, Run) or (not isinstance(subject, Gaussians) and Path(subject).is_dir()):
         if dataset is not None or trained:
             own = "is a run, with its own dataset; leave out dataset and trained"

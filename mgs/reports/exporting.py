@@ -74,11 +74,8 @@ def in_srgb(g: Gaussians) -> Gaussians:
 
 def refit_in_srgb(run: Run, progress: Callable[[int, int], None]) -> Gaussians:
     """Fit the colours of a run's linear model, blended in sRGB, to the views taken; the rest is
-    unchanged.
-
-    progress(done, all) is called after each pass. Raises InputError if a file of a frame or, where
-    exposures differ, of the prior cannot be read.
-    """
+    unchanged. progress(done, all) is called after each pass. Raises InputError if a file of a frame
+    or, where exposures differ, of the prior cannot be read."""
     from mgs.fit.fitting import fit_gaussians
 
     frames = run.taken

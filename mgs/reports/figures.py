@@ -34,11 +34,9 @@ Curves = Mapping[str, tuple[Sequence[float], Sequence[float]]]
 
 
 def line_styles(labels: Iterable[str]) -> list[dict[str, Any]]:
-    """Style of the line of each label: keywords for matplotlib's `plot`.
-
-    The first line of a policy has the style of the policy. All others take those of STYLES that are
-    no policy's, one after the other, then all again with dashed and dotted lines.
-    """
+    """Style of the line of each label: keywords for matplotlib's `plot`. The first line of a policy
+    has the style of the policy. All others take those of STYLES that are no policy's, one after the
+    other, then all again with dashed and dotted lines."""
     spare = chain(
         ((style, "-") for style in STYLES[len(POLICY_STYLE) :]),
         ((style, dashes) for dashes in cycle(("--", ":")) for style in STYLES),
@@ -68,8 +66,7 @@ def orbit_figure(
     """Draw the views that each run chose, from above, a panel for each run.
 
     positions: [C,3] camera centres, world. surface: [N,3] points of the rock. choices:
-    label -> indices into positions: (seeds, chosen views in their order). unit: of the world.
-    """
+    label -> indices into positions: (seeds, chosen views in their order). unit: of the world."""
     columns = min(ACROSS, len(choices))
     lines = -(-len(choices) // columns)
     height = 2.75 * lines + (0.6 if columns > 1 else 1.1)
@@ -99,8 +96,7 @@ def draw_cameras(
     their order.
 
     newest: index of a camera to draw in NEWEST, with its line to the rock. Others: as
-    `orbit_figure`.
-    """
+    `orbit_figure`."""
     xy, rock = positions[:, :2], surface[:: max(1, len(surface) // 6000), :2]
     centre = rock.mean(axis=0)
     axis.scatter(*rock.T, s=0.6, color="#b9b4ab", linewidths=0)
@@ -142,8 +138,7 @@ def curves_figure(
     """Draw curves beside each other, a panel for each quantity and a line for each label.
 
     panels: title of the y axis -> curves. x: title of the x axis. limits: of the y axis, `bottom`
-    or `top`.
-    """
+    or `top`."""
     from matplotlib.ticker import MaxNLocator
 
     with drawing(path, max(4.8, 3.6 * len(panels)), 3.1) as figure:
@@ -177,8 +172,7 @@ def comparison_figure(
     """Draw truth and renders of one view, and their absolute differences below (the paper's Fig.
     4), cropped to the rock.
 
-    truth, renders: linear RGB [H,W,3]; captions: label -> text below it (PSNR, SSIM).
-    """
+    truth, renders: linear RGB [H,W,3]; captions: label -> text below it (PSNR, SSIM)."""
     window = crop(truth.max(axis=2) > 0)
     target = srgb_from_linear(truth)[window]
     images = {label: srgb_from_linear(image)[window] for label, image in renders.items()}

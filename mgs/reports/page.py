@@ -59,8 +59,7 @@ def write_page(
     folders: run folders on one dataset, finished or not. progress: called as progress(pictures of
     views drawn, all). Links to other files are relative to the page. The same files give the same
     page, byte for byte. Raises InputError as `mgs.reports.runs.compare_runs`, and if a file is
-    damaged or the page cannot be written.
-    """
+    damaged or the page cannot be written."""
     path, runs = Path(path), compare_runs(folders)
     views = compared_frames(list(runs.values()))
     album = draw_pictures(runs, views, progress)
@@ -97,10 +96,7 @@ def draw_pictures(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Album:
     """Draw the pictures of the page: of every run the views that it took, and of `views` the truth
-    and the renders of all runs.
-
-    Raises InputError if a file of a frame cannot be read.
-    """
+    and the renders of all runs. Raises InputError if a file of a frame cannot be read."""
     frames = [*views, *(frame for run in runs.values() for frame in run.taken)]
     taken = len(frames) - len(views)
     total, done = taken + len(views) * len(runs), 0

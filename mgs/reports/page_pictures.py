@@ -28,8 +28,7 @@ class Album:
     """Pictures of equal size, by name, and error maps that share a colour scale.
 
     window: shown rows and columns of an image. width: of a picture, pixels, at most. pictures: name
-    -> data URI. errors: name -> error map [h,w], which `finish` turns into pictures.
-    """
+    -> data URI. errors: name -> error map [h,w], which `finish` turns into pictures."""
 
     window: tuple[slice, slice] = (slice(None), slice(None))
     width: int = WIDEST
@@ -56,9 +55,7 @@ class Album:
 
     def finish(self) -> float:
         """Turn the error maps into pictures; return the error at the end of their colour scale.
-
-        99.5 % of the pixels of every map are below it, and it is at least a step of 8 bits.
-        """
+        99.5 % of the pixels of every map are below it, and it is at least a step of 8 bits."""
         limit = max((float(np.quantile(e, 0.995)) for e in self.errors.values()), default=0.0)
         limit = max(round(limit, 3), 1 / 255)
         for name, error in self.errors.items():
@@ -88,10 +85,8 @@ def web_picture(pixels: np.ndarray) -> str:
 
 def new_album(frames: Sequence[Frame], count: int) -> Album:
     """An empty album for `count` pictures of views of these frames, all cropped to what any mask
-    holds, with a margin.
-
-    Frames of different sizes are not cropped. Raises InputError if a mask cannot be read.
-    """
+    holds, with a margin. Frames of different sizes are not cropped. Raises InputError if a mask
+    cannot be read."""
     sizes = {(frame.camera.height, frame.camera.width) for frame in frames}
     window: tuple[slice, slice] = (slice(None), slice(None))
     if len(sizes) == 1:
@@ -106,8 +101,7 @@ def draw_taken(album: Album, label: str, run: Run, tick: Callable[[], None]) -> 
 
     Adds `truth/NAME`, `render/NAME/LABEL`, `error/NAME/LABEL`, and `before/NAME/LABEL` and
     `after/NAME/LABEL`: the uncertainty of the model seen from there before and after the view was
-    taken. tick: called after each view. Raises InputError if a file of a frame cannot be read.
-    """
+    taken. tick: called after each view. Raises InputError if a file of a frame cannot be read."""
     from mgs.splat import fisher, groups
 
     gaussians = run.gaussians

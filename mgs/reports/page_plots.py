@@ -108,8 +108,7 @@ def views_plot(metric: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> 
     """A metric of every view, for each run: filled markers for views trained on, open ones for
     others.
 
-    runs: label -> views of metrics.json; views without this metric are left out.
-    """
+    runs: label -> views of metrics.json; views without this metric are left out."""
     traces = []
     for (label, views), style in zip(runs.items(), line_styles(runs), strict=True):
         numbers = [view for view in views if view.get(metric) is not None]
@@ -162,9 +161,7 @@ def curve_plot(label: str, certificate: Mapping[str, Any]) -> dict[str, Any]:
 def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     """The orbit in 3D: the model as points, all poses, seeds, and the chosen views, numbered and
     joined in their order. Other candidates have the colours of their prices, if the run has them.
-
-    The last trace, "shown above", marks the view of the page's slider; the page moves it.
-    """
+    The last trace, "shown above", marks the view of the page's slider; the page moves it."""
     taken, frames = run.indices, run.dataset.frames
     seeds, views = taken[: run.settings.seeds], taken[run.settings.seeds :]
     order = list(range(1, len(views) + 1))

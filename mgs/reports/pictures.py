@@ -27,8 +27,7 @@ def draw_views(
     background: sRGB in [0,1]. exr: write an OpenEXR file too, with linear R G B over the
     background, opacity A and expected z-depth Z in metres, 0 where nothing is drawn. progress:
     called as progress(views done, all). Raises InputError as `mgs.splat.render`, and if a file
-    cannot be written.
-    """
+    cannot be written."""
     from mgs.splat import as_drjit, render
 
     model, linear = as_drjit(gaussians), gaussians.linear

@@ -19,8 +19,7 @@ def compare_runs(runs: Sequence[str | PathLike[str]]) -> dict[str, Run]:
 
     runs: opened runs, their folders, or folders of these. Raises InputError as `open_run`,
     `Run.steps`, `Run.metrics` and `Run.dataset`; if steps.jsonl is not that of the run; if two runs
-    have the same policy and folder name; and if the runs are on different datasets.
-    """
+    have the same policy and folder name; and if the runs are on different datasets."""
     opened = [one for run in runs for one in _opened(run)]
     policies = [run.label for run in opened]
     labelled = {

@@ -33,8 +33,7 @@ class PrunedRun:
 
     before, after: number of Gaussians. predicted, actual: rms change of the training images
     (`mgs.fit.pruning.Pruned`). views: "test" or "held-out". psnr: on these, before and after, dB;
-    None if there are none.
-    """
+    None if there are none."""
 
     before: int
     after: int
@@ -51,8 +50,7 @@ def prune_run(
     RUN/PRUNED.
 
     Both models are compared on the test views of the dataset, or without them on the held-out
-    views. say(stage): called as a stage starts. Raises InputError as `open_run` and `prune`.
-    """
+    views. say(stage): called as a stage starts. Raises InputError as `open_run` and `prune`."""
     from mgs.fit.pruning import prune
 
     opened = open_run(run)
@@ -73,8 +71,7 @@ class RefittedRun:
 
     before: number of learned parameters of the run. lean: the refitted model. views: "test" or
     "held-out". psnr: on these, dB, of the run's own model, of one that was refitted with all
-    parameters, and of the refitted one; None if there are none.
-    """
+    parameters, and of the refitted one; None if there are none."""
 
     before: int
     lean: LeanModel
@@ -96,8 +93,7 @@ def refit_run(
     views of the dataset, or without them on the held-out views. say(stage): called as a stage
     starts. Raises InputError as `open_run` and `lean_fit`, for an unknown learn or sh or if both
     leave nothing to choose, for a loss that is not from 0 to LARGEST_LOSS, for a run whose density
-    is not fixed, and if the prior or the images are not those of the run.
-    """
+    is not fixed, and if the prior or the images are not those of the run."""
     from mgs.fit.evidence import lean_fit
     from mgs.learning import images_of
     from mgs.scene import Scene

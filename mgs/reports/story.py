@@ -40,8 +40,7 @@ def story_frames(run: Run, progress: Progress) -> Film:
 
     The view shown is the brightest of those that the first image leaves more unknown than most,
     among the test views, or else the views never taken, or else all. Raises InputError as `models`,
-    and if an image cannot be read.
-    """
+    and if an image cannot be read."""
     scene, view = scene_of(run), None
     with listening(progress):
         for model in models(run, scene):

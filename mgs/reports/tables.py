@@ -49,8 +49,7 @@ def comparison_rows(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     - ended: the reason (`mgs.run.ending.RunEnd`), only for a run that ended before its budget was
       spent.
 
-    Raises InputError if a run was not evaluated since its last step.
-    """
+    Raises InputError if a run was not evaluated since its last step."""
     for run in runs.values():
         check_measured(run)
     return [table_row(label, run) for label, run in runs.items()]

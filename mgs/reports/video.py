@@ -30,8 +30,7 @@ UNKNOWN = "cividis"  # colour map of what is unknown: blue is known, yellow unkn
 def camera_path(dataset: Dataset, means: np.ndarray, count: int, width: int) -> list[Camera]:
     """Cameras of a turntable, at equal angles.
 
-    means: [N,3] of the Gaussians. count: of cameras. width: of their images, pixels.
-    """
+    means: [N,3] of the Gaussians. count: of cameras. width: of their images, pixels."""
     first = dataset.frames[0].camera
     centre = np.median(means, axis=0)
     eyes = np.array([frame.camera.position for frame in dataset.frames])
@@ -101,8 +100,7 @@ def write_film(
     """Write a film as MP4 (H.264), GIF or animated PNG, by its ending; the file appears complete.
 
     seconds: of each frame; an MP4 shows all as long as the first. Raises InputError for another
-    ending, if imageio-ffmpeg is missing for an MP4, and as `mgs.files.atomic_path`.
-    """
+    ending, if imageio-ffmpeg is missing for an MP4, and as `mgs.files.atomic_path`."""
     check_film(path)
     kind = Path(path).suffix.lower()
     shown = _reported(frames, len(seconds), progress)

@@ -51,8 +51,7 @@ def report(
     - table.md and table.json (`mgs.reports.tables.comparison_rows`).
 
     Files of an earlier report are replaced. Raises InputError as `compare_runs`; if a run is
-    unfinished or was not evaluated since its last step. Then nothing is written.
-    """
+    unfinished or was not evaluated since its last step. Then nothing is written."""
     by_label = compare_runs([runs] if isinstance(runs, str | PathLike) else runs)
     for run in by_label.values():
         check_finished(run)
@@ -98,8 +97,7 @@ def shown_view(runs: Sequence[Run]) -> tuple[Frame, str]:
     It is one of the test views if all runs were measured on them, else of those that the fewest
     runs were trained on: the one whose PSNRs are closest to the runs' means, in least squares. Of
     frames on demand, only those that all runs have taken have an image. Raises InputError as
-    `Dataset.test_views`, and if there is no frame on which all runs were measured.
-    """
+    `Dataset.test_views`, and if there is no frame on which all runs were measured."""
     dataset, key = runs[0].dataset, "views"
     frames: Sequence[Frame]
     tests = dataset.test_views()

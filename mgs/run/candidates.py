@@ -40,8 +40,7 @@ Named = tuple[str, Camera]
 class Site:
     """The object, and the camera that looks at it.
 
-    like: camera whose intrinsics candidates have by default. world: of files of poses.
-    """
+    like: camera whose intrinsics candidates have by default. world: of files of poses."""
 
     prior: Prior
     like: Camera
@@ -72,8 +71,7 @@ def read_poses(path: str | Path, site: Site) -> list[Named]:
     target or a quaternion (COLUMNS). Intrinsics that a file lacks are those of `site.like`.
 
     Raises InputError as `load_cameras`; for a CSV without rows, with unknown, missing or half of
-    the columns, or a number that is none; for more than MOST_POSES poses, or two of one name.
-    """
+    the columns, or a number that is none; for more than MOST_POSES poses, or two of one name."""
     path = Path(path)
     if path.suffix.lower() == ".csv":
         poses = _read_csv(path, site)
@@ -140,8 +138,7 @@ def place_poses(
 
     shape: "dome", spread evenly over the elevations; "ring", a circle at their middle; "grid", a
     cubic lattice of the dome's radius. radius: metres. elevations: lowest and highest above the
-    middle of the object, degrees. Raises InputError if the lattice has no place between them.
-    """
+    middle of the object, degrees. Raises InputError if the lattice has no place between them."""
     low, high = elevations
     if shape == "grid":
         offsets = _lattice(count, radius, elevations)
@@ -199,11 +196,9 @@ def _lattice(count: int, radius: float, elevations: tuple[float, float]) -> NDAr
 
 
 def inside(mesh: Mesh, points: np.ndarray) -> NDArray[np.bool_]:
-    """Whether points [M,3] are inside a mesh, bool [M]: its winding number is above 1/2.
-
-    The winding number sums the signed solid angles of the faces over 4 pi (Van Oosterom and
-    Strackee 1983), so a mesh with holes has an inside too.
-    """
+    """Whether points [M,3] are inside a mesh, bool [M]: its winding number is above 1/2. The
+    winding number sums the signed solid angles of the faces over 4 pi (Van Oosterom and Strackee
+    1983), so a mesh with holes has an inside too."""
     found = np.zeros(len(points), bool)
     corners = mesh.vertices[mesh.faces]
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
@@ -227,8 +222,7 @@ def refusals(
     """Why each candidate cannot be flown; empty if it can.
 
     safe_distance: least distance from the prior's mesh, metres. elevations: lowest and highest
-    above the middle of the object, degrees.
-    """
+    above the middle of the object, degrees."""
     eyes = np.stack([camera.position for _, camera in poses])
     mesh, centre = site.prior.mesh, site.centre
     offset = eyes - centre

@@ -77,8 +77,7 @@ class Checks:
     ) -> dict[str, float]:
         """Entry of the last fit for `predicted_psnr`.
 
-        views: all views taken, under the model. new_views: the new ones, under the model before.
-        """
+        views: all views taken, under the model. new_views: the new ones, under the model before."""
 
         def mean_gain(before: Sequence[int], poses: Sequence[int]) -> float:
             gains = self.scene.surface(state).gains(before, poses, *DIRECTIONAL_D.model)
@@ -144,8 +143,7 @@ def predicted_psnr(entries: Sequence[Mapping[str, float]]) -> float | None:
 
     entries: of every fit so far. "fitted": mean squared error of the views fitted to; "left": mean
     gain of the views not taken; after the first fit also "new", the error of the new view under the
-    model before, and "gain", its gain at that time.
-    """
+    model before, and "gain", its gain at that time."""
     steps = list(pairwise(entries))[-WINDOW:]
     if not steps or "left" not in entries[-1]:
         return None

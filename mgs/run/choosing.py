@@ -24,8 +24,7 @@ def choose(
 
     Of equal views, the one farthest from those taken is chosen. A policy with a `plan` chooses
     among the views of its plan. If the flight has a limit, the result is the first stop of
-    `plan_flight`. Raises InputError if the policy returns no valid score.
-    """
+    `plan_flight`. Raises InputError if the policy returns no valid score."""
     if mission.flies:
         return next(plan_flight(scene, state, policy, mission))
     views = reachable(scene, state, mission)
@@ -82,8 +81,7 @@ def plan_flight(
     With a policy that has `tour_gains` it is the rest of `planned_flight`, and scores are those
     after the views before. Otherwise the tour is `grown` by the view of largest score / cost, as if
     those before it were taken, and scores are those at that time. The cost is the share of the
-    limits that a view adds, and its share of the views that the budget has left.
-    """
+    limits that a view adds, and its share of the views that the budget has left."""
     if plan := planned_flight(scene, state, policy, mission):
         for k, view in enumerate(plan):
             before = replace(state, taken=(*state.taken, *plan[:k]))
@@ -106,11 +104,9 @@ def plan_flight(
 
 
 def planned_flight(scene: Scene, state: State, policy: Policy, mission: Mission) -> Sequence[int]:
-    """Rest of the tour that a policy with `tour_gains` plans after the seeds; empty for others.
-
-    If another view was taken than the next one of the plan, a new plan is made after all views
-    taken.
-    """
+    """Rest of the tour that a policy with `tour_gains` plans after the seeds; empty for others. If
+    another view was taken than the next one of the plan, a new plan is made after all views
+    taken."""
     tour_gains = getattr(policy, "tour_gains", None)
     if tour_gains is None or mission.nearest is not None:
         return []

@@ -30,8 +30,7 @@ class Before:
 
     outline: share of the pixels covered by mask or Gaussians where the two disagree, without the
     rim (`outline_margin`). offset: distance of the centres of the two areas, over the square root
-    of the mask's area.
-    """
+    of the mask's area."""
 
     outline: float
     offset: float
@@ -44,8 +43,7 @@ class ViewIndicators:
     unexplained: mean squared error in the mask over the variance of the image there: 0 is a perfect
     fit, 1 a single colour. error: root of that mean squared error, linear RGB. srgb_error: mean
     squared error of sRGB values in the mask. ratios: quantiles (RATIO_QUANTILES) of the log ratio
-    of the image's brightness to the render's, over the mask. pixels: number compared, or 1.
-    """
+    of the image's brightness to the render's, over the mask. pixels: number compared, or 1."""
 
     before: Before
     unexplained: float
@@ -59,8 +57,7 @@ def before_fit(mask: np.ndarray, alpha: np.ndarray, margin: int) -> Before:
     """Compare a view with the Gaussians before training.
 
     mask: bool [H,W]. alpha: [H,W], drawn from 0.5 up. margin: pixels; a pixel disagrees where it is
-    drawn farther outside the mask, or not drawn farther inside.
-    """
+    drawn farther outside the mask, or not drawn farther inside."""
     body = alpha >= 0.5
     either = int((mask | body).sum())
     outside = ~binary_dilation(mask, iterations=margin)
@@ -80,8 +77,7 @@ def _distance(one: np.ndarray, other: np.ndarray) -> float:
 def outline_margin(start: Gaussians, camera: Camera) -> int:
     """Pixels that a good prior may stand out of the mask: a Gaussian's standard deviation and 1.
 
-    start: the Gaussians before training.
-    """
+    start: the Gaussians before training."""
     _, depth = camera.project(start.means)
     in_front = depth[depth > 0]
     if not len(in_front):
@@ -96,8 +92,7 @@ def view_indicators(
     """Compare a fitted view with a render of the model.
 
     target: [H,W,4 or more], colour and weight (`mgs.data.dataset.target_of`). mask: bool [H,W].
-    rendered: [H,W,3] linear RGB.
-    """
+    rendered: [H,W,3] linear RGB."""
     counted = mask & (target[..., 3] > 0)
     if not counted.any():
         return ViewIndicators(before, 0.0, 0.0)
@@ -159,8 +154,7 @@ def step_indicators(
 
     views: all taken. positions: of their cameras [V,3]. losses: of the start of the fit, then of
     each pass. coverage: Eq. 9, 0 to 1. gains: information gain of every view chosen so far, in
-    order. drift: of `means_drift`. last: whether no views are to come.
-    """
+    order. drift: of `means_drift`. last: whether no views are to come."""
     indicators = {"means": drift}
     if len(losses) >= 2 and min(losses) > 0 and np.isfinite(losses).all():
         # Lowest losses: a fit that starts from a fitted model rises first, then falls.

@@ -24,8 +24,7 @@ class Directional:
     degree: of the spherical harmonics. tau: share of the prior's standard deviation that degrees
     above 0 have. over_dome: I-optimality over a dome of poses; else D-optimality, nats.
     tour: the same three numbers for the plan of a flight. The defaults were chosen on rocks that
-    judge nothing.
-    """
+    judge nothing."""
 
     degree: int = 2
     tau: float = 0.2

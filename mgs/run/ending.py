@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 def diverged(out: Path, step: int, steps: int, losses: Sequence[float]) -> str:
     """Message for a fit that diverged: its first and last losses, and how to go on.
 
-    step: that of the fit. steps: number of finished steps.
-    """
+    step: that of the fit. steps: number of finished steps."""
     first, *passes = (f"{loss:.3g}" for loss in losses)
     fit = "the fit to the seeds" if step == 0 else f"the fit of step {step}"
     rest = {0: "", 1: "; step 0 is kept"}.get(steps, f"; steps 0 to {steps - 1} are kept")
@@ -58,8 +57,7 @@ def run_end(
     views: chosen so far. uncertainty: mean variance that is left, over that of the prior.
     refused: `name` and `information_gain` of the next view, where it is known. metres: length of
     the flight, where no pose is left in its reach. predicted: `mgs.run.checks.predicted_psnr`, dB.
-    given_up: number of poses of which no picture could be taken.
-    """
+    given_up: number of poses of which no picture could be taken."""
     if views >= settings.budget:
         return {"reason": str(RunEnd.BUDGET), "views": views}
     if settings.stop_uncertainty is not None and uncertainty <= settings.stop_uncertainty:

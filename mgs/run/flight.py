@@ -99,8 +99,7 @@ class Flight:
     """The legs of a flight, metres [V,V] (`mgs.policy.tour.legs`), and its limits.
 
     home: pose where it ends. skipped: number of views taken before it; it starts at the last one.
-    tours: those planned, by the views taken and the candidates.
-    """
+    tours: those planned, by the views taken and the candidates."""
 
     limits: FlightLimits
     legs: NDArray[np.float64]

@@ -1,6 +1,5 @@
-"""The folder of a run. docs/nbv.md lists its files and the keys of steps.jsonl.
-
-`config.json` is written first. `checkpoint.npz` is replaced atomically: the commit of a step."""
+"""The folder of a run. docs/nbv.md lists its files and the keys of steps.jsonl. `config.json` is
+written first. `checkpoint.npz` is replaced atomically: the commit of a step."""
 
 from __future__ import annotations
 
@@ -51,8 +50,7 @@ class Checkpoint:
     """State of a run after a step, as the run folder holds it.
 
     gaussians, H, surface, taken: as `mgs.scene.State`. steps: lines of steps.jsonl. inputs: hashes
-    of the inputs (`mgs.run.inputs`). upright: whether the model's world has +Z up.
-    """
+    of the inputs (`mgs.run.inputs`). upright: whether the model's world has +Z up."""
 
     gaussians: Gaussians
     H: np.ndarray
@@ -72,8 +70,7 @@ class Run:
     settings: from the folder's config.json. policy: as it was given in this process, if it was. A
     Run can be given wherever a folder is wanted. Properties raise InputError if a file is missing
     or damaged; `steps` and `state` also if no step is finished yet; `dataset` also if its frames
-    changed.
-    """
+    changed."""
 
     def __init__(
         self,
@@ -257,10 +254,8 @@ def up_of_prior(folder: Path) -> Vector | None:
 
 
 def open_run(folder: str | PathLike[str]) -> Run:
-    """Open a run folder; a `Run` stays as it is.
-
-    Raises InputError as `read_config`, where a setting is wrong, and where the dataset is gone.
-    """
+    """Open a run folder; a `Run` stays as it is. Raises InputError as `read_config`, where a
+    setting is wrong, and where the dataset is gone."""
     if isinstance(folder, Run):
         return folder
     folder = Path(folder)
@@ -355,10 +350,8 @@ def _checkpoint(out: Path) -> Iterator[zipfile.ZipFile | None]:
 
 
 def read_record(out: Path) -> dict[str, Any] | None:
-    """Read the `mgs.run.records.Record` of the last finished step; None before the first.
-
-    Raises InputError where the file is damaged, or claims more than it holds.
-    """
+    """Read the `mgs.run.records.Record` of the last finished step; None before the first. Raises
+    InputError where the file is damaged, or claims more than it holds."""
     with _checkpoint(out) as file:
         if file is None:
             return None

@@ -57,10 +57,7 @@ def camera_digest(camera: Camera) -> str:
 
 def frame_digests(frame: Frame, kinds: Iterable[str]) -> dict[str, str | None]:
     """Hashes of the files of a frame by kind: `image`, `mask`, `rock`, `depth`, `capture` (the
-    record of a live capture); None of no file.
-
-    Raises InputError as `file_digest`.
-    """
+    record of a live capture); None of no file. Raises InputError as `file_digest`."""
     return {
         kind: None if (path := _path(frame, kind)) is None else file_digest(path) for kind in kinds
     }
@@ -76,8 +73,7 @@ def check_unchanged(
 ) -> None:
     """Raises InputError that names the first input of a run which changed since its record.
 
-    prior: hash of the prior as it is now.
-    """
+    prior: hash of the prior as it is now."""
     if record["prior"] != prior:
         raise InputError(changed_prior(out, settings.prior))
     changed = f"changed since {out} was started; restore"

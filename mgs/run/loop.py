@@ -27,8 +27,7 @@ def select_views(
 
     The loop ends when the budget is spent, when no pose is in reach, or by `stop_uncertainty` or
     `stop_gain`. After `stop_gain` the last item is the choice that was refused. Raises InputError
-    as `choose` and `learn`.
-    """
+    as `choose` and `learn`."""
     if state is None:
         seeds, frames = first_views(scene, mission)
         state = learn(scene, seeds, frames=frames)
@@ -80,10 +79,8 @@ def mean_uncertainty(scene: Scene, state: State) -> float:
 def choose_batch(
     scene: Scene, state: State, policy: Policy, mission: Mission
 ) -> tuple[State, list[Choice], Choice | None]:
-    """Choose up to `batch` views about one model, each as if those before it were taken.
-
-    Returns (the state as if they were taken, choices, the choice whose gain is below `stop_gain`).
-    """
+    """Choose up to `batch` views about one model, each as if those before it were taken. Returns
+    (the state as if they were taken, choices, the choice whose gain is below `stop_gain`)."""
     planned, choices = state, list[Choice]()
     for _ in range(min(mission.batch, views_left(state, mission))):
         if not reachable(scene, planned, mission):

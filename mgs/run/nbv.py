@@ -81,11 +81,9 @@ def run_nbv(
     progress: Progress = no_progress,
     **settings: Any,
 ) -> Run:
-    """Choose views one by one, as the paper does; return the finished run.
-
-    Does the same as `mgs nbv`, as in `run_nbv("demo/dataset", "run", policy="d-optimal",
-    budget=8)`: `start_run`, then `resume_nbv`, with their arguments and errors.
-    """
+    """Choose views one by one, as the paper does; return the finished run. Does the same as `mgs
+    nbv`, as in `run_nbv("demo/dataset", "run", policy="d-optimal", budget=8)`: `start_run`, then
+    `resume_nbv`, with their arguments and errors."""
     run = start_run(dataset, out, progress=progress, **settings)
     return resume_nbv(run, on_step, progress, run.policy, settings.get("live"))
 
@@ -103,8 +101,7 @@ def nbv(
 
     policy: a name, an object, or a function; default as in `start_run`. mission: fields of
     `Mission`. `run_nbv` with the scene's dataset, prior and settings; the prior is copied into the
-    run. Raises InputError as `start_run` and `resume_nbv`.
-    """
+    run. Raises InputError as `start_run` and `resume_nbv`."""
     model = {name: getattr(scene.settings, name) for name in ModelSettings.model_fields}
     return run_nbv(
         scene.dataset,
@@ -150,8 +147,7 @@ def start_run(
 
     Leaves no folder behind if it fails. Raises InputError if the folder is not empty, a setting is
     invalid, the dataset is too small, an input is missing or damaged, or the cameras are too near
-    to the prior to draw it.
-    """
+    to the prior to draw it."""
     out = Path(out)
     if holds_run(out) and not force:
         raise InputError(f"{out}: a run {THERE}; `mgs nbv --resume {out}` continues it")
@@ -242,8 +238,7 @@ def start_fit(
     degree are by default those of 3DGS (`as_3dgs`). Photographs without masks are fitted whole,
     from the points that came with the cameras and random ones, unless a prior is given: a surface
     of the object cannot explain what is around it. Their Gaussians are then split where images need
-    more, unless their number is given. Arguments and errors as `start_run`.
-    """
+    more, unless their number is given. Arguments and errors as `start_run`."""
     root, train = Path(dataset), dict(settings.pop("train", {}))
     data, folder = load_dataset(root), Path(prior) if prior is not None else root / "prior"
     built = gaussians is None and (prior is not None or (folder / "prior.json").is_file())
@@ -355,8 +350,7 @@ def resume_nbv(
 
     A finished run is returned as it is. Raises InputError if the folder holds no run, its inputs
     are missing or changed, another process works on it, a fit diverged, or `policy` is not the
-    run's.
-    """
+    run's."""
     run = open_run(run)
     policy = policy or run.policy
     check_named(run, policy)

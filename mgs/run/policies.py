@@ -16,8 +16,7 @@ and may have
 - tour_gains(scene, state): gains by which a flight is planned (`PoolGains`), if any.
 - relaxation(scene, state, views): criterion with upper bounds of plans, if any.
 
-To add one, write a class and a row of POLICIES, or a file of your own (docs/howto/policy.md).
-"""
+To add one, write a class and a row of POLICIES, or a file of your own (docs/howto/policy.md)."""
 
 from __future__ import annotations
 
@@ -63,8 +62,7 @@ def each(views: Sequence[int], score: Callable[[int], float]) -> np.ndarray:
 class Information:
     """A criterion of information at the model so far: criterion(F, H, lam) -> score of a view.
 
-    F: information of the view [N,P]. H: of the views taken [N,P]. lam: lambda [P].
-    """
+    F: information of the view [N,P]. H: of the views taken [N,P]. lam: lambda [P]."""
 
     name: str
     criterion: criteria.Score
@@ -103,8 +101,7 @@ class Paper:
 
     The paper states neither. The loss is that of the estimator `loss-gradient`. Lambda is the mean
     squared gradient of one view taken: the gain of the first choice is then near the paper's 0.091
-    (its Fig. 2; docs/nbv.md).
-    """
+    (its Fig. 2; docs/nbv.md)."""
 
     name: ClassVar[str] = "paper"
     needs_fit: ClassVar[bool] = True
@@ -147,8 +144,7 @@ class Cover:
     For each Gaussian (1 - cos)/2 of the angle between the candidate's direction and the nearest one
     from which it was observed, or 1 if it never was; then the mean over the candidate's view,
     weighted by squared blending weights. In [0, 1]. The paper counts all Gaussians in the frustum,
-    hidden or not, and rounds directions to bins.
-    """
+    hidden or not, and rounds directions to bins."""
 
     name: ClassVar[str] = "cover"
     needs_fit: ClassVar[bool] = False
@@ -180,9 +176,7 @@ def _directions(points: Array, position: Array) -> Array:
 @dataclass(frozen=True)
 class Poses:
     """A rule about camera positions: rule(candidates [C,3], taken [T,3], centre [3]) -> scores [C].
-
-    Positions are metres, +Z up.
-    """
+    Positions are metres, +Z up."""
 
     name: str
     rule: Callable[[Array, Array, Array], Array]

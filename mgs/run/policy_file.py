@@ -108,11 +108,9 @@ def file_of(name: str) -> Path:
 
 
 def load(name: str) -> Policy:
-    """The policy FILE.py:NAME. A file is executed once per process, unless it changes.
-
-    Raises InputError if the file is missing or fails, has no such function, class or object, or it
-    has an unknown parameter.
-    """
+    """The policy FILE.py:NAME. A file is executed once per process, unless it changes. Raises
+    InputError if the file is missing or fails, has no such function, class or object, or it has an
+    unknown parameter."""
     path = file_of(name)
     if not path.is_file():
         where = f"no such file {path}; correct the path (for a run, in its config.json)"
@@ -153,8 +151,7 @@ class Own:
     the attributes of `mgs.run.policies`.
 
     path: its file, where the user named one: then its errors are InputError, with their line.
-    Raises InputError for an unknown parameter without a default.
-    """
+    Raises InputError for an unknown parameter without a default."""
 
     def __init__(self, name: str, function: Callable[..., Any], path: Path | None = None) -> None:
         self.name, self.full, self.function, self.path = label(name), name, function, path
@@ -201,17 +198,14 @@ class Own:
 def check_policy(name: str) -> None:
     """Raise InputError for a name that is neither a row of POLICIES nor of a user's own policy.
 
-    No file is read: `policy_of` does so.
-    """
+    No file is read: `policy_of` does so."""
     if not in_file(name) and not is_function(name):
         policy_named(name)
 
 
 def policy_of(policy: Any) -> Policy:
-    """The policy of a name, or a Python function or object as one. Executes a user's file.
-
-    Raises InputError as `check_policy` and `load`.
-    """
+    """The policy of a name, or a Python function or object as one. Executes a user's file. Raises
+    InputError as `check_policy` and `load`."""
     if not isinstance(policy, str):
         return policy if _complete(policy) else Own(name_of(policy), policy)
     if in_file(policy):

@@ -66,8 +66,7 @@ def run(
     Killed at any moment and called again, it takes the same views as an uninterrupted run. Raises
     InputError as `check_settings`; where another process works on the folder; where the prior, a
     pose or a file of a frame taken has changed; where a frame it takes cannot be read or has an
-    empty mask; and where a fit diverged. The steps before are kept.
-    """
+    empty mask; and where a fit diverged. The steps before are kept."""
     check_settings(settings, len(scene.dataset))
     with working_in(out), listening(stopwatch := Stopwatch(progress)):
         checkpoint = read_checkpoint(out)
@@ -148,10 +147,8 @@ def _go_on(
 
 def check_model(out: Path, scene: Scene, settings: NbvSettings, state: State) -> None:
     """Raises InputError where a state does not belong to a run of these settings and this prior.
-
     Its means must be those of the prior where they are frozen, and its parameters as many as the
-    run learns.
-    """
+    run learns."""
     if state.H.shape[1] != len(scene.lam):
         where = f"{out / 'config.json'}: settings.train.means"
         raise InputError(f"{where} has changed since {out} was started; restore it")
@@ -161,10 +158,8 @@ def check_model(out: Path, scene: Scene, settings: NbvSettings, state: State) ->
 
 
 class Stopwatch:
-    """A progress callback that passes on and measures: seconds between calls, by `Stage`.
-
-    Where a choice is finished (stage "chosen"), its seconds are set apart in `laps`.
-    """
+    """A progress callback that passes on and measures: seconds between calls, by `Stage`. Where a
+    choice is finished (stage "chosen"), its seconds are set apart in `laps`."""
 
     def __init__(self, progress: Progress) -> None:
         self.progress, self.stage = progress, ""

@@ -130,8 +130,7 @@ class NbvSettings(ModelSettings, Mission):
         """The settings with a rate and a prior std of learned means, from the samples' spacing, m.
 
         loose: factor on the default prior std of every kind. What is given stays; nothing changes
-        where means are frozen.
-        """
+        where means are frozen."""
         if self.train.means == "frozen":
             return self
         rates = {"mean": MEAN_RATE * spacing} | self.train.rates
@@ -162,8 +161,7 @@ def validated(
     """Build settings from values, or from `settings` of a file.
 
     within: key of these values, if they are part of other settings. Raises InputError for the first
-    invalid value; it names the setting, and the file if there is one.
-    """
+    invalid value; it names the setting, and the file if there is one."""
     try:
         return model(**values)
     except ValidationError as error:
@@ -185,9 +183,7 @@ def validated(
 
 def settings_in(file: Path) -> dict[str, Any]:
     """Settings that a TOML file, or the config.json of a run, has; paths are from its folder.
-
-    Raises InputError where the file cannot be read, or a key or a value is wrong.
-    """
+    Raises InputError where the file cannot be read, or a key or a value is wrong."""
     if file.suffix == ".json":
         config = read_json(file)
         found = config.get("settings") if isinstance(config, dict) else None

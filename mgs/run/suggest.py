@@ -53,8 +53,7 @@ class View:
     prior's variance that is left there. distance: from the last image taken. azimuth, elevation:
     from the middle of the object, degrees; azimuth 0 is +X of the upright world. way: as `way_to`.
     planned: place in the order of choice, from 1; 0 if not planned. moved: distance from the
-    candidate, where `refine` moved it.
-    """
+    candidate, where `refine` moved it."""
 
     name: str
     camera: Camera
@@ -80,8 +79,7 @@ class Suggestion:
     before each planned view and before home, where it leads around the no-fly cylinder.
     certificate: bounds of the plan by the policy's criterion, with prices in the order of
     `ranking`; None where the policy has none, or all candidates are planned. refined: gain of the
-    plan by Eq. 7 before and after its poses moved; None without `refine`.
-    """
+    plan by Eq. 7 before and after its poses moved; None without `refine`."""
 
     ranking: list[View]
     plan: list[View]
@@ -111,8 +109,7 @@ def suggest(
     flight starts and ends at the first image taken. safe_distance, elevations: as `refusals`.
     refine: move planned poses by `refined`; scores and certificate are those of the candidates.
     settings: fields of `NbvSettings` in place of the run's. Raises InputError if no
-    pose can be flown, fewer can than `views`, a setting is invalid, or the policy fails.
-    """
+    pose can be flown, fewer can than `views`, a setting is invalid, or the policy fails."""
     policy, own = settings.pop("policy", None) or run.policy, run.settings.policy
     if policy is None and (in_file(own) or is_function(own)):
         raise InputError(f"{run.folder}: its policy is a program, {own}; name it with `policy`")
@@ -326,10 +323,8 @@ def _coarse_scene(
 
 
 def coarse_prior(prior: Prior, most: int = COARSE) -> tuple[Prior, NDArray[np.int64]]:
-    """About `most` samples of a prior, one in each cell of a grid, and their indices.
-
-    A prior with at most as many is returned as it is, with all indices.
-    """
+    """About `most` samples of a prior, one in each cell of a grid, and their indices. A prior with
+    at most as many is returned as it is, with all indices."""
     count = len(prior.points)
     if count <= most:
         return prior, np.arange(count)

@@ -44,11 +44,9 @@ def picture(out: Path) -> Path:
 
 
 def command(text: str, timeout: float) -> Transport:
-    """Transport that runs a program; `{pose}` and `{out}` in its arguments become the two paths.
-
-    No shell reads the text. timeout: seconds after which the program is ended. Raises InputError
-    unless both fields are there and the program exists.
-    """
+    """Transport that runs a program; `{pose}` and `{out}` in its arguments become the two paths. No
+    shell reads the text. timeout: seconds after which the program is ended. Raises InputError
+    unless both fields are there and the program exists."""
     try:
         words = shlex.split(text)
     except ValueError as error:
@@ -97,11 +95,9 @@ def _last_line(log: Path) -> str:
 
 
 def watched(timeout: float) -> Transport:
-    """Transport that waits until somebody puts the picture beside the pose.
-
-    A picture is complete when it can be read and no file of the answer changed between two looks.
-    timeout: seconds to wait.
-    """
+    """Transport that waits until somebody puts the picture beside the pose. A picture is complete
+    when it can be read and no file of the answer changed between two looks. timeout: seconds to
+    wait."""
 
     def deliver(pose: Path, out: Path) -> None:
         warnings.warn(

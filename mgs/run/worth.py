@@ -31,11 +31,8 @@ def certificate(
     plan: Sequence[int],
     views: Sequence[int],
 ) -> Certificate | None:
-    """Certify a plan of some of `views` by the policy's criterion.
-
-    Returns None where the policy has no `relaxation`, the plan has no view or all of them, or no
-    view adds anything.
-    """
+    """Certify a plan of some of `views` by the policy's criterion. Returns None where the policy
+    has no `relaxation`, the plan has no view or all of them, or no view adds anything."""
     criterion = _criterion(scene, state, policy, views) if 0 < len(plan) < len(views) else None
     if criterion is None:
         return None
@@ -65,10 +62,8 @@ def _criterion(
 def planned_certificate(
     scene: Scene, state: State, policy: Policy, mission: Mission
 ) -> Certificate | None:
-    """`certificate` of all views that a run will take, also as a tour.
-
-    Returns None where that depends on fits to come, or on the way from view to view.
-    """
+    """`certificate` of all views that a run will take, also as a tour. Returns None where that
+    depends on fits to come, or on the way from view to view."""
     count = views_left(state, mission)
     on_its_way = mission.travel is not None or mission.nearest is not None
     if policy.needs_fit or not hasattr(policy, "relaxation") or on_its_way or count <= 0:
@@ -87,9 +82,7 @@ def planned_certificate(
 
 def enough_views(scene: Scene, state: State, policy: Policy, mission: Mission) -> int:
     """Fewest views of a greedy plan that have the share `enough` of the gain of all candidates.
-
-    Raises InputError where the policy has no `relaxation`, or no candidate adds anything.
-    """
+    Raises InputError where the policy has no `relaxation`, or no candidate adds anything."""
     criterion = _criterion(scene, state, policy, free(scene, state, mission))
     if criterion is not None:
         return len(greedy(criterion, mission.enough or ENOUGH))

@@ -43,8 +43,7 @@ def bound_socket(host: str, port: int) -> socket.socket:
 class Access:
     """Decides which requests a server answers. host: the address it listens on.
 
-    token: None on an address of this machine alone.
-    """
+    token: None on an address of this machine alone."""
 
     def __init__(self, host: str) -> None:
         self.host = host
@@ -77,11 +76,9 @@ class Access:
 
     @contextmanager
     def guarding(self, listening: socket.socket) -> Iterator[None]:
-        """Context manager in which a server of websockets answers as `answered`, on this socket.
-
-        By itself viser would take the next port that is free, and look for one for ever at a host
-        that is not of this machine.
-        """
+        """Context manager in which a server of websockets answers as `answered`, on this socket. By
+        itself viser would take the next port that is free, and look for one for ever at a host that
+        is not of this machine."""
         from websockets.asyncio import server
 
         serve, logger = server.serve, logging.getLogger("mgs.view")

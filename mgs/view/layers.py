@@ -56,8 +56,7 @@ def kernel_image(
 
     The camera and the depth have the lengths that are shown; a colour scale of depth has those of
     the world (`Subject.scale`). Behind the model it is black, and FAR away. Layers other than
-    colour and alpha are drawn where the opacity is at least VISIBLE.
-    """
+    colour and alpha are drawn where the opacity is at least VISIBLE."""
     scalars = {layer: subject.scalars[layer]} if layer in subject.scalars else {}
     maps = view_maps(subject.model, camera, scalars)
     opaque = maps["A"] >= VISIBLE

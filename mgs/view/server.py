@@ -54,8 +54,7 @@ class Viewer:
     """Serve a run folder or a PLY until `close`. `tick` must be called repeatedly.
 
     follow: look for a new step of the run every FOLLOW seconds. Raises InputError as `read_subject`
-    and `bound_socket`.
-    """
+    and `bound_socket`."""
 
     def __init__(
         self, path: str | Path, host: str = "127.0.0.1", port: int = 8080, follow: bool = False
@@ -296,8 +295,7 @@ class Viewer:
 def window_camera(camera: Any) -> Camera | None:
     """Camera of a browser window (viser's CameraHandle), with at most PIXELS.
 
-    None where what the window sent is no camera: a size, field of view or pose out of range.
-    """
+    None where what the window sent is no camera: a size, field of view or pose out of range."""
     from viser.transforms import SE3, SO3
 
     width, height, wxyz = camera.image_width, camera.image_height, np.asarray(camera.wxyz, float)

@@ -82,10 +82,8 @@ class Subject:
 
 def read_subject(path: str | Path, follow: bool = False) -> Subject:
     """Read a run folder or a file of Gaussians. follow: accept a run without a finished step.
-
     Raises InputError if there is neither, if a file is damaged or the dataset has changed, and,
-    unless `follow`, if the run has no finished step.
-    """
+    unless `follow`, if the run has no finished step."""
     path = Path(path)
     if path.is_dir():
         return scaled(_read_run(open_run(path), follow))
