@@ -48,7 +48,6 @@ def thumbnails(paths: Sequence[Path]) -> list[Image.Image]:
 
 
 def picture(rgb: np.ndarray) -> Image.Image:
-    """Picture of linear RGB [H,W,3]."""
     return Image.fromarray(np.round(255 * srgb_from_linear(rgb)).astype(np.uint8))
 
 

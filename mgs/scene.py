@@ -76,7 +76,6 @@ class State:
 
     @property
     def cameras(self) -> list[Camera]:
-        """Cameras of all frames."""
         return [frame.camera for frame in self.frames]
 
     @property
@@ -158,12 +157,10 @@ class Scene:
 
     @cached_property
     def cache(self) -> ListCache:
-        """Block lists of the cameras."""
         return ListCache()
 
     @cached_property
     def memo(self) -> dict[Any, Any]:
-        """Values of `once` by key."""
         return {}
 
     def once(self, key: Any, make: Callable[[], Value]) -> Value:

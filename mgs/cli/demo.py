@@ -74,7 +74,6 @@ def demo(out: Annotated[Path, typer.Argument()] = Path("demo"), seed: Seed = 0) 
 
 
 def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
-    """Raises InputError if the dataset or a run exists with another seed."""
     from mgs.run.folder import open_run
 
     recorded = {run: open_run(run).settings.seed for run in runs if (run / "config.json").is_file()}

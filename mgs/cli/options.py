@@ -151,7 +151,6 @@ def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any
 
 
 def not_none(**options: Any) -> dict[str, Any]:
-    """Keep the options that are not None."""
     return {name: value for name, value in options.items() if value is not None}
 
 

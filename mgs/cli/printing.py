@@ -40,7 +40,6 @@ MEASURED = {
 
 
 def settings_table(keys: Sequence[tuple[str, str, str]]) -> Table:
-    """Table of settings: key, default and description of each."""
     table = Table("--set KEY=VALUE", "", box=box.SIMPLE_HEAD, pad_edge=False)
     for key, default, text in keys:
         shown = f" Default: {default}." if default and "Default" not in text else ""
@@ -76,7 +75,6 @@ def _heading(key: str, new: bool) -> str:
 
 
 def print_run(out: Path, state: Checkpoint, metrics: dict[str, Any], console: Terminal) -> None:
-    """Print the quality of a run's model, and why it has ended."""
     from mgs.reports.tables import metrics_row
     from mgs.run.ending import RunEnd, why_ended
 

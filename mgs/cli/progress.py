@@ -45,7 +45,6 @@ class ProgressBar:
             print(printable_lines(f"{stage}{of}"), file=sys.stderr, flush=True)
 
     def whole(self, name: str, done: int, total: int) -> None:
-        """Show how far the whole work is."""
         if self._whole is None:
             self._whole = self._bar.add_task(name, total=total)
         self._bar.update(self._whole, completed=done, total=total)

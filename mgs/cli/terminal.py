@@ -17,7 +17,6 @@ class Terminal(Console):
         super().__init__(markup=False, highlight=False, emoji=False, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Text to print, also that of a cell of a table."""
         return super().render_str(printable_lines(text), **options)
 
 

@@ -42,7 +42,6 @@ class Views(NamedTuple):
     seen: Array
 
     def of(self, views: Sequence[int]) -> Views:
-        """Some of the views."""
         return Views(self.positions[list(views)], self.seen[list(views)])
 
 
@@ -117,7 +116,6 @@ def gains(
 
 
 def of_points(views: Views, some: slice) -> Views:
-    """The same views for some of the Gaussians."""
     return Views(views.positions, views.seen[:, some])
 
 

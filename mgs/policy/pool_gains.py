@@ -80,14 +80,12 @@ class PoolGains:
         dr.eval(self.S, self.M, self.g, self.q)
 
     def copy(self) -> PoolGains:
-        """The same gains, to be changed apart from these."""
         other = copy(self)
         other.taken = list(self.taken)
         return other
 
     @one_at_a_time
     def of_poses(self, poses: Sequence[int]) -> NDArray[np.float64]:
-        """Gain of each of these poses [C]."""
         weights = mi.Float64(self.weights)
         leverages = weights * self.g
         if self.q is None:
@@ -99,7 +97,6 @@ class PoolGains:
 
     @one_at_a_time
     def take(self, views: Sequence[int]) -> None:
-        """Update the gains with more views, one after another."""
         for view in views:
             self.taken.append(view)
             self._take(view)

@@ -91,7 +91,6 @@ class Relaxation:
         return np.concatenate(in_parts(len(self.base), part))
 
     def gain(self, views: Iterable[int]) -> float:
-        """f of a set of candidates."""
         taken = np.flatnonzero(self._taken(views))
 
         def part(some: slice) -> float:
@@ -298,7 +297,6 @@ def checked(per_view: Array) -> None:
 
 
 def check_finite(per_view: Array) -> None:
-    """Raise InputError where a candidate's information is not finite."""
     bad = [v for v, of_view in enumerate(per_view) if not np.isfinite(of_view).all()]
     if bad:
         raise InputError(f"certificate: candidate {bad[0]} has information that is not finite")
@@ -328,12 +326,10 @@ class Coverage:
 
     @property
     def pairs(self) -> int:
-        """Pairs of a candidate and a Gaussian."""
         return len(self.F) * len(self.H)
 
     @property
     def coarse(self) -> Coverage:
-        """The same."""
         return self
 
     @cached_property
@@ -346,7 +342,6 @@ class Coverage:
         return rows, counts.astype(np.float64)
 
     def gain(self, views: Iterable[int]) -> float:
-        """Number of Gaussians that a set of candidates newly observes."""
         return coverage_greedy(self.F[list(views)].sum(axis=0), self.H, self.lam)
 
     def added(self, views: Iterable[int]) -> Floats:

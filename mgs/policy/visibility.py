@@ -128,7 +128,6 @@ class Visibility:
 
     @cached_property
     def pool(self) -> Views:
-        """All cameras of the run, and what they see."""
         seen = []
         for frame in range(len(self.cameras)):
             report(Stage.SCORE, frame, len(self.cameras))
@@ -137,7 +136,6 @@ class Visibility:
 
     @cached_property
     def dome(self) -> Views:
-        """A dome of cameras around the rock, and what they see."""
         cameras = dome_cameras(self.cameras[0], self.positions, self.centre)
         seen = np.stack([squared_weights(self.exact(camera)) for camera in cameras])
         return Views(np.array([camera.position for camera in cameras]), seen)

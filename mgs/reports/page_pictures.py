@@ -36,7 +36,6 @@ class Album:
     errors: dict[str, np.ndarray] = field(default_factory=dict)
 
     def add_colours(self, name: str, linear: np.ndarray) -> None:
-        """Add a picture of linear RGB [H,W,3]."""
         pixels = np.round(srgb_from_linear(linear) * 255).astype(np.uint8)
         self.pictures[name] = web_picture(self._small(pixels))
 

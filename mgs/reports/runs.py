@@ -63,7 +63,6 @@ def _check_lines(run: Run) -> None:
 
 
 def check_finished(run: Run) -> None:
-    """Raises InputError if a run has not ended."""
     if run.ended is None:
         raise InputError(
             f"{run.folder}: is unfinished, with {len(run.indices)} of {run.planned} views; "

@@ -45,7 +45,6 @@ def write_suggestion(out: Path, run: Run, suggestion: Suggestion) -> None:
 
 
 def numbers(run: Run, suggestion: Suggestion) -> dict[str, Any]:
-    """Contents of suggestions.json."""
     units = {
         "information_gain": f"Eq. 7, {GAIN_UNIT}",
         "unseen": "share of what the picture shows that no image shows",

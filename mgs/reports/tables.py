@@ -68,7 +68,6 @@ def table_row(label: str, run: Run) -> dict[str, Any]:
 
 
 def metrics_row(label: str, metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a row that metrics.json has."""
     row = {"policy": label, "images": metrics["images"]}
     for views in ("test", "all", "held_out"):
         row |= {f"{views}.{name}": value for name, value in metrics.get(views, {}).items()}
@@ -112,14 +111,12 @@ def table_cell(key: str, value: Any) -> str:
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format the rows of `comparison_rows` as a Markdown table."""
     columns = table_columns(rows)
     headings = [table_heading(key, rows) for key in columns]
     return markdown(headings, [[table_cell(key, row.get(key)) for key in columns] for row in rows])
 
 
 def table_heading(key: str, rows: Sequence[Mapping[str, Any]]) -> str:
-    """Heading of a column of these rows."""
     every = "all views" if has_held_out(rows) else "training views"
     return HEADERS[key].replace("{unit}", rows[0]["unit"]).replace("all views", every)
 

@@ -112,7 +112,6 @@ def write_film(
 
 
 def check_film(path: str | Path) -> None:
-    """Raise InputError as `write_film` would, before any frame is drawn."""
     if Path(path).suffix.lower() not in FORMATS:
         raise InputError(f"{path}: films are written as {', '.join(FORMATS)}; choose one of them")
     if Path(path).suffix.lower() == ".mp4":

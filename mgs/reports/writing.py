@@ -30,7 +30,6 @@ FIGURES = (*CHOICES, "comparison", "psnr")
 
 
 def report_files(kind: str) -> list[str]:
-    """Names of the files of a report; `report` says which are not in all."""
     return [*(f"{name}.{kind}" for name in FIGURES), "table.md", "table.json"]
 
 

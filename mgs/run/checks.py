@@ -56,7 +56,6 @@ class Checks:
     def views(
         self, model: Gaussians, state: State, some: Sequence[int]
     ) -> list[detectors.ViewIndicators]:
-        """Compare the images of the last views taken, `some`, with a model."""
         views, frames = [], [state.frames[i] for i in state.taken]
         targets = self.scene.targets(frames, state.exposure)[-len(some) :]
         for frame, target in zip(frames[-len(some) :], targets, strict=True):

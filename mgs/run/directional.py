@@ -38,7 +38,6 @@ class Directional:
 
     @property
     def model(self) -> tuple[int, float, bool]:
-        """Degree, tau and over_dome."""
         return self.degree, self.tau, self.over_dome
 
     def __call__(self, scene: Scene, state: State, views: list[int]) -> np.ndarray:
@@ -68,7 +67,6 @@ class Directional:
         return scene.surface(state).plan_gains(self.tour, FEW)
 
     def relaxation(self, scene: Scene, state: State, views: Sequence[int]) -> Relaxation:
-        """Gain of these views together."""
         surface = scene.surface(state)
         taken, others = surface.pool.of(state.taken), surface.pool.of(views)
         dome = surface.dome if self.over_dome else None

@@ -49,12 +49,10 @@ def reachable(scene: Scene, state: State, mission: Mission) -> list[int]:
 
 
 def views_left(state: State, mission: Mission) -> int:
-    """Number of views that the budget has left."""
     return mission.budget - state.step
 
 
 def flight_of(scene: Scene, state: State, mission: Mission) -> Flight:
-    """Legs between all poses, and the limits of the flight."""
     home, skipped = state.taken[max(state.skipped - 1, 0)], state.skipped
     no_fly = mission.flight.no_fly or 0.0
 
@@ -118,7 +116,6 @@ class Flight:
         return tour.tour_length(self.legs, taken[max(self.skipped - 1, 0) :])
 
     def metres(self, taken: Sequence[int]) -> float:
-        """Metres through all views taken, and home."""
         return self.flown(taken) + float(self.legs[taken[-1], self.home])
 
     def share_from(self, taken: Sequence[int], most: int) -> tour.Share:

@@ -135,7 +135,6 @@ class Run:
 
     @cached_property
     def dataset(self) -> Dataset:
-        """The dataset of the run."""
         dataset = load_dataset(self.settings.dataset, up=up_of_prior(self.settings.prior))
         self.check_frames(dataset)
         return dataset
@@ -148,7 +147,6 @@ class Run:
 
     @cached_property
     def prior(self) -> Prior:
-        """The prior of the run."""
         path = self.settings.prior
         if not path.is_dir():
             where = f"{self.folder / 'config.json'}: prior {path}"
@@ -323,17 +321,14 @@ def write_checkpoint(out: Path, state: Checkpoint) -> None:
 
 
 def write_steps(out: Path, state: Checkpoint) -> None:
-    """Write steps.jsonl from the state, atomically."""
     write_text(out / STEPS, text_of(state.steps))
 
 
 def text_of(steps: Sequence[dict[str, Any]]) -> str:
-    """Text of steps.jsonl."""
     return "".join(json.dumps(line, allow_nan=False) + "\n" for line in steps)
 
 
 def frames_of(steps: Sequence[dict[str, Any]]) -> list[int]:
-    """Indices of the frames taken: seeds, then chosen ones."""
     return [*steps[0]["seeds"], *(line["frame"] for line in steps[1:])]
 
 

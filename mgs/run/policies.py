@@ -130,7 +130,6 @@ class Coverage:
         return each(views, lambda i: criteria.coverage_greedy(F(i), H, lam))
 
     def relaxation(self, scene: Scene, state: State, views: Sequence[int]) -> relaxed.Coverage:
-        """Number of Gaussians that these views newly observe together."""
         surface, lam = scene.surface(state), scene.surface_lam
         rest = ~criteria.observed(state.surface, lam)
         F = np.stack([surface.information(i)[rest, :3] for i in views])
@@ -230,7 +229,6 @@ POLICIES: dict[str, Policy] = {
 
 
 def policy_named(name: str) -> Policy:
-    """A row of POLICIES. Raises InputError for another name."""
     if name not in POLICIES:
         names = ", ".join(POLICIES)
         raise InputError(f"policy {name}: unknown; choose one of {names}, or FILE.py:NAME")

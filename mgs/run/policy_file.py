@@ -67,7 +67,6 @@ def name_of(policy: str | Callable[..., Any]) -> str:
 
 
 def is_function(name: str) -> bool:
-    """Whether the name of a policy is that of a Python function."""
     return name.startswith(FUNCTION)
 
 
@@ -83,7 +82,6 @@ def code_of(policy: Callable[..., Any]) -> str:
 
 
 def in_file(name: str) -> bool:
-    """Whether the name of a policy has the form FILE.py:FUNCTION."""
     return ".py:" in name
 
 
@@ -103,7 +101,6 @@ def label(name: str, budget: int = 1) -> str:
 
 
 def file_of(name: str) -> Path:
-    """The file of a policy FILE.py:FUNCTION."""
     return Path(name.rpartition(":")[0])
 
 

@@ -104,7 +104,6 @@ def asked_again(dataset: Dataset) -> Dataset:
 
 
 def resumed(scene: Scene, settings: NbvSettings, checkpoint: Checkpoint) -> State:
-    """State of the loop from a checkpoint."""
     frames = captured(scene, scene.frames, checkpoint.taken)
     taken, model = tuple(checkpoint.taken), checkpoint.gaussians
     return State(frames, taken, settings.seeds, model, checkpoint.H, checkpoint.surface)
@@ -184,7 +183,6 @@ class Stopwatch:
         self.stage, self.since = stage, now
 
     def take(self) -> dict[str, float]:
-        """Seconds by stage since the last call or lap."""
         self.switch("")
         seconds, self.seconds = self.seconds, {}
         return seconds

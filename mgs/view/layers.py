@@ -27,7 +27,6 @@ LEGENDS = {
 
 
 def layers(subject: Subject) -> list[str]:
-    """Names of the layers that a subject has."""
     return ["colour", "alpha", "depth", *subject.scalars]
 
 

@@ -82,7 +82,6 @@ class Viewer:
         self.server.on_client_disconnect(self._disconnected)
 
     def close(self) -> None:
-        """End the server."""
         with redirect_stdout(StringIO()):
             self.server.stop()
 

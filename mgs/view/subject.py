@@ -54,13 +54,11 @@ class Subject:
 
     @property
     def model(self) -> Gaussians:
-        """The Gaussians of a subject that has some."""
         assert self.gaussians is not None
         return self.gaussians
 
     @property
     def taken(self) -> list[View]:
-        """The seeds, then the chosen views in their order."""
         taken = [view for view in self.views if view.step is not None]
         return sorted(taken, key=lambda view: view.step or 0)
 
@@ -96,7 +94,6 @@ def read_subject(path: str | Path, follow: bool = False) -> Subject:
 
 
 def scaled(subject: Subject) -> Subject:
-    """Shrink a subject until nothing is farther than LARGEST from the middle."""
     g, mesh, (centre, size) = subject.gaussians, subject.mesh, subject.extent
     size = max(size, float(np.linalg.norm(subject.eyes - centre, axis=1).max(initial=0)))
     if size <= LARGEST:
