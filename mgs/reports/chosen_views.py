@@ -14,7 +14,7 @@ from mgs.colour import srgb_from_linear
 from mgs.data.dataset import write_transforms
 from mgs.data.frames import Frame
 from mgs.data.world import World
-from mgs.files import copy_file
+from mgs.files import copy_file, write_text
 from mgs.gaussians import Gaussians
 from mgs.images import write_png
 from mgs.reports.exporting import as_imported
@@ -106,8 +106,6 @@ def _write_colmap(out: Path, frames: Sequence[Frame], points: np.ndarray, world:
         for number, (x, y, z, r, g, b) in enumerate(points.tolist(), 1)
     ]
     lenses = [f"{number} {camera}\n" for camera, number in cameras.items()]
-    folder = out / "sparse" / "0"
-    folder.mkdir(parents=True)
     files = {"cameras.txt": lenses, "images.txt": images, "points3D.txt": rows}
     for name, lines in files.items():
-        (folder / name).write_text("".join(lines), encoding="utf-8")
+        write_text(out / "sparse/0" / name, "".join(lines))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -75,24 +76,23 @@ def encoders(
     """Encoders of the run's model, pruned by each of NOISES where positions are sent."""
     from mgs.fit.pruning import prune
 
-    g, world = run.state.gaussians, run.dataset.world
-    start = _start(run, g) if shared or run.settings.prior.is_dir() else None
+    g, place = run.state.gaussians, (run.dataset.world.up, run.dataset.world.origin)
+    start, gradients = None, partial(_gradients, run)
+    if shared or run.settings.prior.is_dir():
+        start = _start(run, g)
     if shared:
         if start is None:
             moved = "its fit moved the Gaussians of its prior or has others"
             raise InputError(f"{run.folder}: {moved}; leave out `shared_prior`")
         say("weighing errors")
-        yield Encoder(g, lambda model: _gradients(run, model), start, None, world.up, world.origin)
+        yield Encoder(g, gradients, start, None, *place)
         return
     cameras = [frame.camera for frame in run.taken]
     for noise in NOISES:
         say("removing Gaussians")
         indices = prune(g, cameras, noise).kept
         say("weighing errors")
-        layer = start.layer[indices] if start else None
-        yield Encoder(
-            g[indices], lambda model: _gradients(run, model), None, layer, world.up, world.origin
-        )
+        yield Encoder(g[indices], gradients, None, start.layer[indices] if start else None, *place)
 
 
 def _start(run: Run, g: Gaussians) -> Start | None:

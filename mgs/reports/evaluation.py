@@ -94,18 +94,14 @@ def _informed(run: Run) -> dict[str, dict[str, int]]:
     state, settings = run.state, run.settings
     columns = groups(state.gaussians.sh_degree, settings.train.means)
     more = settings.regularisation(columns) < state.H
-    return {
-        kind: {"of": int(more[:, of].size), "informed": int(more[:, of].sum())}
-        for kind, of in columns.items()
-    }
+    parts = {kind: more[:, of] for kind, of in columns.items()}
+    return {kind: {"of": part.size, "informed": int(part.sum())} for kind, part in parts.items()}
 
 
 def _subject(gaussians: Gaussians, frames: Sequence[Frame], trained: list[str]) -> str:
     """Hash of all that the metrics of a run depend on."""
     kinds = ("image", "mask", "rock", "depth")
-    views = [
-        [frame.name, camera_digest(frame.camera), frame_digests(frame, kinds)] for frame in frames
-    ]
+    views = [[f.name, camera_digest(f.camera), frame_digests(f, kinds)] for f in frames]
     software = {name: version for name, version in versions().items() if name != "commit"}
     marks = gaussians.antialiased, gaussians.linear
     model = array_digest(getattr(gaussians, name) for name in ARRAYS), *marks
@@ -182,13 +178,8 @@ def evaluate(
     names, tests = list(trained), views.test_views()
     if unknown := sorted(set(names) - {frame.name for frame in views.frames}):
         raise InputError(f"{views.root}: has no frame {unknown[0]}, which `trained` names")
-    metrics = evaluate_model(
-        subject,
-        views.with_images(names),
-        names,
-        test_frames=tests.frames if tests else (),
-        progress=progress,
-    )
+    frames, test_frames = views.with_images(names), tests.frames if tests else ()
+    metrics = evaluate_model(subject, frames, names, test_frames=test_frames, progress=progress)
     if path is not None:
         write_json(path.with_suffix(".metrics.json"), metrics)
     return metrics

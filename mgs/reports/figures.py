@@ -156,10 +156,8 @@ def curves_figure(
 def _legend_beside(figure: Figure) -> None:
     """Put the legend of the first axes to the right of all, and widen the figure."""
     legend = figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper")
-    box, (width, height) = legend.get_window_extent(), figure.get_size_inches()
-    figure.set_size_inches(
-        width + box.width / figure.dpi, max(height, box.height / figure.dpi + 0.1)
-    )
+    box, (width, height), dpi = legend.get_window_extent(), figure.get_size_inches(), figure.dpi
+    figure.set_size_inches(width + box.width / dpi, max(height, box.height / dpi + 0.1))
 
 
 def comparison_figure(

@@ -64,27 +64,34 @@ def write_page(
     views = compared_frames(list(runs.values()))
     album = draw_pictures(runs, views, progress)
     limit = album.finish()
+    dataset = next(iter(runs.values())).dataset
     text = _fill_in(
         title=", ".join(runs),
-        dataset=next(iter(runs.values())).dataset.root.resolve().name,
+        dataset=dataset.root.resolve().name,
         labels=list(runs),
         command="nbv" if any(run.settings.budget for run in runs.values()) else "fit",
-        outlined=next(iter(runs.values())).dataset.outlined,
+        outlined=dataset.outlined,
         notes={label: notes(run) for label, run in runs.items()},
         summary=summary_rows(runs),
         settings=setting_rows(runs),
         files=[(label, links(run, path)) for label, run in runs.items()],
         data={
             "pictures": album.pictures,
-            "runs": [_section(label, run) for label, run in runs.items()],
+            "runs": [
+                {
+                    "label": label,
+                    "views": [_view(label, run, k, frame) for k, frame in enumerate(run.taken)],
+                    "orbit": orbit_plot(label, run),
+                    "time": timing_plot(label, run.steps),
+                }
+                for label, run in runs.items()
+            ],
             "compared": [_compared(runs, frame) for frame in views],
             "plots": _plots(runs),
         },
         limit=limit,
-        scales={
-            "error": colour_scale(ERROR_COLOURS),
-            "uncertainty": colour_scale(UNCERTAINTY_COLOURS),
-        },
+        error_scale=colour_scale(ERROR_COLOURS),
+        uncertainty_scale=colour_scale(UNCERTAINTY_COLOURS),
     )
     write_text(path, text)
     return path.stat().st_size
@@ -140,15 +147,6 @@ def _spread(frames: Sequence[Frame]) -> list[Frame]:
     return [frames[i * len(frames) // count] for i in range(count)]
 
 
-def _section(label: str, run: Run) -> dict[str, Any]:
-    return {
-        "label": label,
-        "views": [_view(label, run, k, frame) for k, frame in enumerate(run.taken)],
-        "orbit": orbit_plot(label, run),
-        "time": timing_plot(label, run.steps),
-    }
-
-
 def _view(label: str, run: Run, k: int, frame: Frame) -> dict[str, Any]:
     """Facts, pictures (name in the album, caption, alternative text) of the k-th view taken."""
     seeds, view, quality = run.settings.seeds, frame.name, psnr_of(run, frame.name)
@@ -202,14 +200,10 @@ def _plots(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
         ("Coverage that each view added (Fig. 3)", added, "percentage points", True),
     ]
     steps = [step for run in runs.values() for step in run.steps]
-    of_steps = {
-        "uncertainty": ("Variance left, over that of the prior", "mean over all parameters", True)
-    }
-    of_steps |= {
-        key: (f"{METRIC_NAMES[key]} after each step", METRIC_NAMES[key], False)
-        for step in steps
-        for key in measured(step)
-    }
+    left = "Variance left, over that of the prior", "mean over all parameters", True
+    of_steps = {"uncertainty": left}
+    for key in dict.fromkeys(key for step in steps for key in measured(step)):
+        of_steps[key] = f"{METRIC_NAMES[key]} after each step", METRIC_NAMES[key], False
     of_steps["loss"] = ("Loss at the end of each fit", "mean squared error", True)
     for key, (title, axis, zero) in of_steps.items():
         plots.append((title, step_curves(runs, key), axis, zero))
@@ -231,13 +225,9 @@ def _fill_in(**values: Any) -> str:
     from plotly.offline import get_plotlyjs
 
     folder = Path(__file__).parent / "templates"
-    environment = Environment(
-        loader=FileSystemLoader(folder),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    options: dict[str, Any] = {"undefined": StrictUndefined, "autoescape": True}
+    options |= {"trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=FileSystemLoader(folder), **options)
     for name in ("css", "js"):
         values[name] = Markup((folder / f"page.{name}").read_text(encoding="utf-8"))
     values["plotly"] = Markup(get_plotlyjs())

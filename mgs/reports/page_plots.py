@@ -46,10 +46,8 @@ def _plot(
 ) -> dict[str, Any]:
     """A plot with axes x and y. Its table has a row for each x, and a column for each trace."""
     columns = [dict(zip(trace["x"], trace["y"], strict=True)) for trace in data]
-    rows = [
-        [_number(x), *(_number(column[x]) if x in column else "–" for column in columns)]
-        for x in sorted(set().union(*columns))
-    ]
+    xs = sorted(set().union(*columns))
+    rows = [[_number(x), *(_number(column.get(x, "–")) for column in columns)] for x in xs]
     heading = [layout["xaxis"]["title"]["text"], *(trace["name"] for trace in data)]
     numbers = {"heading": heading, "rows": rows}
     return {"title": title, "alt": alt, "data": data, "layout": layout, "numbers": numbers}
@@ -94,10 +92,8 @@ def timing_plot(label: str, steps: Sequence[Mapping[str, Any]]) -> dict[str, Any
         stage: [of_step.get(stage, 0.0) for of_step in seconds]
         for stage in dict.fromkeys(stage for of_step in seconds for stage in of_step)
     }
-    traces = [
-        {"type": "bar", "name": stage, "x": numbers, "y": values}
-        for stage, values in stages.items()
-    ]
+    bar = {"type": "bar", "x": numbers}
+    traces = [bar | {"name": stage, "y": values} for stage, values in stages.items()]
     in_all = ", ".join(f"{stage} {sum(values):.1f} s" for stage, values in stages.items())
     alt = f"Seconds of each stage, step by step, of {label}. In all: {in_all}."
     axes = {"xaxis": _axis("step (0: the seeds)"), "yaxis": _axis("seconds")}
@@ -178,19 +174,15 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     prices = run.steps[0].get("certificate", {}).get("prices", {})
     circle: dict[str, Any] = {"size": 3, "color": "#9a9a9a", "symbol": "circle-open"}
     others = "candidates"
+    bar: dict[str, Any] = {"thickness": 12, "len": 0.6}
     if candidates and all(names[i] in prices for i in candidates):
-        bar = {
-            "title": {"text": "price: a<br>picture adds"},
-            "thickness": 12,
-            "len": 0.6,
-            "x": -0.1,
-        }
+        price = {"title": {"text": "price: a<br>picture adds"}, **bar, "x": -0.1}
         colours = {"color": [prices[names[i]] for i in candidates], "colorscale": "Cividis"}
-        circle = {"size": 5, **colours, "showscale": True, "colorbar": bar}
+        circle = {"size": 5, **colours, "showscale": True, "colorbar": price}
         others = "candidates, by price"
     diamond = {"size": 6, "color": "#D55E00", "symbol": "diamond"}
-    bar = {"title": {"text": "step"}, "thickness": 12, "len": 0.6}
-    scale = {"colorscale": "Viridis", "showscale": bool(views), "colorbar": bar}
+    step = {"title": {"text": "step"}, **bar}
+    scale = {"colorscale": "Viridis", "showscale": bool(views), "colorbar": step}
     steps = [f"{names[i]}, step {k}" for k, i in zip(order, views, strict=True)]
     path = markers("chosen, in their order", views, steps, size=6, color=order, **scale)
     path |= {"mode": "lines+markers+text", "text": [str(k) for k in order]}

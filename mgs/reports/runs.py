@@ -22,12 +22,10 @@ def compare_runs(runs: Sequence[str | PathLike[str]]) -> dict[str, Run]:
     have the same policy and folder name; and if the runs are on different datasets."""
     opened = [one for run in runs for one in _opened(run)]
     policies = [run.label for run in opened]
-    labelled = {
-        run.label
-        if policies.count(run.label) == 1
-        else f"{run.label} ({run.folder.resolve().name})": run
-        for run in opened
-    }
+    labelled = {}
+    for run in opened:
+        folder = f" ({run.folder.resolve().name})" if policies.count(run.label) > 1 else ""
+        labelled[run.label + folder] = run
     if len(labelled) < len(opened):
         same = "two of the runs have the same policy and folder name"
         raise InputError(f"report: {same}; give each run once, or rename a folder")
@@ -64,10 +62,9 @@ def _check_lines(run: Run) -> None:
 
 def check_finished(run: Run) -> None:
     if run.ended is None:
-        raise InputError(
-            f"{run.folder}: is unfinished, with {len(run.indices)} of {run.planned} views; "
-            f"go on with `mgs nbv --resume {run.folder}`, then report"
-        )
+        few = f"is unfinished, with {len(run.indices)} of {run.planned} views"
+        cure = f"go on with `mgs nbv --resume {run.folder}`, then report"
+        raise InputError(f"{run.folder}: {few}; {cure}")
 
 
 def check_measured(run: Run) -> None:

@@ -13,7 +13,6 @@ from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
 from mgs.reports.evaluation import compare_models
 from mgs.run import inputs
 from mgs.run.folder import open_run
-from mgs.run.settings import NbvSettings
 from mgs.splat_places import to_source
 from mgs.splat_ply import write_ply
 
@@ -97,6 +96,7 @@ def refit_run(
     from mgs.fit.evidence import lean_fit
     from mgs.learning import images_of
     from mgs.scene import Scene
+    from mgs.splat import groups
 
     if not 0 <= loss <= LARGEST_LOSS:
         raise InputError(f"loss {loss}: must be from 0 to {LARGEST_LOSS:g} dB")
@@ -119,12 +119,6 @@ def refit_run(
     views, psnr = compare_models([own, lean.whole, lean.gaussians], opened)
     marks = {f"learned_{kind}": mask for kind, mask in lean.learned.items()}
     write_ply(path, to_source(lean.gaussians, opened.dataset.world), marks)
-    return RefittedRun(len(own) * parameters_of_each(settings), lean, views, psnr)
-
-
-def parameters_of_each(settings: NbvSettings) -> int:
-    """Number of learned parameters of a Gaussian in a run: kinds whose rate is not 0."""
-    from mgs.splat import groups
-
     columns, rates = groups(settings.sh, settings.train.means), settings.train.rates
-    return sum(of.stop - of.start for kind, of in columns.items() if rates[kind] > 0)
+    each = sum(of.stop - of.start for kind, of in columns.items() if rates[kind] > 0)
+    return RefittedRun(len(own) * each, lean, views, psnr)

@@ -41,9 +41,7 @@ def camera_path(dataset: Dataset, means: np.ndarray, count: int, width: int) -> 
     angle = np.arctan2(away[0, 1], away[0, 0]) + 2 * np.pi * np.arange(count) / count
     flat, rise = distance * np.cos(elevation), np.full(count, distance * np.sin(elevation))
     places = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), rise]) + centre
-    shape = first.resized(width + width % 2)
-    shape = replace(shape, height=shape.height + shape.height % 2)  # encoders need even numbers
-    return [replace(shape, world_to_camera=look_at(eye, centre)) for eye in places]
+    return [replace(_even(first, width), world_to_camera=look_at(eye, centre)) for eye in places]
 
 
 def path_among(cameras: Sequence[Camera], count: int, width: int) -> list[Camera]:
@@ -52,17 +50,19 @@ def path_among(cameras: Sequence[Camera], count: int, width: int) -> list[Camera
     eyes = np.stack([camera.position for camera in cameras])
     order = flying_order(legs(eyes, eyes[0, :2]), 0, range(1, len(eyes)), 0)
     tour = [0, *order, 0]
-    poses = np.stack([cameras[k].camera_to_world[:3, 1:].T.ravel() for k in tour])  # down, ahead
+    turns = np.stack([cameras[k].camera_to_world[:3, 1:].T.ravel() for k in tour])  # down, ahead
     along = np.cumsum([0, *np.linalg.norm(np.diff(eyes[tour], axis=0), axis=1)])
     at = np.linspace(0, along[-1], count, endpoint=False)
-    path = np.column_stack([np.interp(at, along, column) for column in poses.T])
+    path = np.column_stack([np.interp(at, along, column) for column in turns.T])
     path = gaussian_filter1d(path, count / len(tour) / 2, axis=0, mode="wrap")
-    shape = cameras[0].resized(width + width % 2)
-    shape = replace(shape, height=shape.height + shape.height % 2)  # encoders need even numbers
-    return [
-        replace(shape, world_to_camera=look_at(eye, eye + ahead, -down))
-        for down, ahead, eye in path.reshape(-1, 3, 3)
-    ]
+    poses = [look_at(eye, eye + ahead, -down) for down, ahead, eye in path.reshape(-1, 3, 3)]
+    return [replace(_even(cameras[0], width), world_to_camera=pose) for pose in poses]
+
+
+def _even(camera: Camera, width: int) -> Camera:
+    """The camera with an even width and height, as encoders need."""
+    shape = camera.resized(width + width % 2)
+    return replace(shape, height=shape.height + shape.height % 2)
 
 
 def path_frames(run: Run, beside: str | None, count: int, width: int) -> Film:
@@ -75,13 +75,11 @@ def path_frames(run: Run, beside: str | None, count: int, width: int) -> Film:
         path = path_among([frame.camera for frame in run.taken], count, width)
     for camera in path:
         maps = view_maps(model, camera, scalars)
-        right = [_unknown(maps)] if beside else []
-        yield _side_by_side(picture(maps), *right)
-
-
-def _unknown(maps: dict[str, np.ndarray]) -> np.ndarray:
-    visible = maps["A"][..., None] >= VISIBLE
-    return np.where(visible, painted(maps["uncertainty"], UNKNOWN) / np.float32(255), 0)
+        pictures = [picture(maps)]
+        if beside:
+            unknown = painted(maps["uncertainty"], UNKNOWN) / np.float32(255)
+            pictures.append(np.where(maps["A"][..., None] >= VISIBLE, unknown, 0))
+        yield _side_by_side(*pictures)
 
 
 def _side_by_side(*pictures: np.ndarray) -> np.ndarray:
@@ -137,10 +135,8 @@ def _ffmpeg() -> Any:
 def _write_mp4(path: Path, frames: Film, count: int, rate: float) -> None:
     """Raises OSError if not all frames are in the file, which ffmpeg does not report."""
     first, ffmpeg = next(frames), _ffmpeg()
-    size = (first.shape[1], first.shape[0])
-    writer = ffmpeg.write_frames(
-        str(path), size, fps=rate, codec="libx264", macro_block_size=2, quality=7
-    )
+    size, options = first.shape[1::-1], {"codec": "libx264", "macro_block_size": 2, "quality": 7}
+    writer = ffmpeg.write_frames(str(path), size, fps=rate, **options)
     writer.send(None)
     for frame in (first, *frames):
         writer.send(np.ascontiguousarray(frame))
@@ -159,6 +155,5 @@ def _write_animation(path: Path, frames: Film, seconds: Sequence[float], gif: bo
     if gif:
         pictures = [picture.quantize(256, Image.Quantize.MAXCOVERAGE) for picture in pictures]
     options: dict[str, Any] = {"save_all": True, "append_images": pictures[1:], "loop": 0}
-    durations = [round(1000 * each) for each in seconds[: len(pictures)]]
-    kind = "GIF" if gif else "PNG"
-    pictures[0].save(path, format=kind, duration=durations, optimize=True, **options)
+    options["duration"] = [round(1000 * each) for each in seconds[: len(pictures)]]
+    pictures[0].save(path, format="GIF" if gif else "PNG", optimize=True, **options)

@@ -75,10 +75,8 @@ def report(
 def _draw_choices(paths: Mapping[str, Path], runs: Mapping[str, Run]) -> None:
     first = next(iter(runs.values()))
     positions = np.array([frame.camera.position for frame in first.dataset.frames])
-    choices = {}
-    for label, run in runs.items():
-        seeds = run.settings.seeds
-        choices[label] = run.indices[:seeds], run.indices[seeds:]
+    parts = {label: (run.indices, run.settings.seeds) for label, run in runs.items()}
+    choices = {label: (views[:seeds], views[seeds:]) for label, (views, seeds) in parts.items()}
     means, unit = first.gaussians.means, first.dataset.unit
     figures.orbit_figure(paths["orbit"], positions, means, choices, unit)
     gains = step_curves(runs, "information_gain", x="step")

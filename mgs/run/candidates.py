@@ -114,11 +114,11 @@ def _csv_pose(where: str, index: int, columns: list[str], row: list[str], site: 
     numbers = {key: finite_number(where, key, text) for key, text in cells.items()}
     eye = np.array([numbers[key] for key in POSITION])
     if "qw" not in numbers:
-        target = np.array([numbers[key] for key in TARGET]) if "target_x" in numbers else None
+        target = None
+        if "target_x" in numbers:
+            target = site.enter(np.array([numbers[key] for key in TARGET]))
         try:
-            return name, site.camera(
-                site.enter(eye), None if target is None else site.enter(target)
-            )
+            return name, site.camera(site.enter(eye), target)
         except InputError:
             raise InputError(f"{where}: looks at its own position; correct it") from None
     quaternion = np.array([numbers[key] for key in QUATERNION])
@@ -233,20 +233,15 @@ def refusals(
     near = np.zeros(len(poses), bool)
     if safe_distance > 0:  # measuring takes seconds
         near = distances_to_mesh(eyes, mesh.vertices, mesh.faces) < safe_distance
-    within = inside(mesh, eyes)
+    within, keys = inside(mesh, eyes), [camera.world_to_camera.tobytes() for _, camera in poses]
     reasons = {
         "inside the object": within,
         f"nearer to it than {safe_distance:.3g}": near,
         f"not between {low:g} and {high:g} degrees": beyond,
         "taken already": _are_taken(poses, taken, far),
-        "the same as one before": _are_repeated(poses),
+        "the same as one before": [keys.index(key) < k for k, key in enumerate(keys)],
     }
     return [next((why for why, hit in reasons.items() if hit[k]), "") for k in range(len(poses))]
-
-
-def _are_repeated(poses: Sequence[Named]) -> list[bool]:
-    keys = [camera.world_to_camera.tobytes() for _, camera in poses]
-    return [keys.index(key) < k for k, key in enumerate(keys)]
 
 
 def _are_taken(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -23,11 +24,13 @@ WINDOW = 3  # number of last fits that give the mean excess of `predicted_psnr`.
 LEAST_ERROR = 1e-8  # least mean squared error that is predicted, 80 dB
 
 
+@dataclass(frozen=True)
 class Checks:
     """Compares renders with the images taken."""
 
-    def __init__(self, scene: Scene, settings: NbvSettings, policy: Policy) -> None:
-        self.scene, self.settings, self.policy = scene, settings, policy
+    scene: Scene
+    settings: NbvSettings
+    policy: Policy
 
     def entries(
         self,
@@ -99,29 +102,25 @@ class Checks:
         """`indicators` of the last step, and `warnings` where one now exceeds its limit."""
         assert state.fit is not None
         start, coverage = self.scene.untrained(state), steps[-1]["coverage"]
-        scores = list[float]()
+        gains = [gain for step in steps if (gain := step["information_gain"]) is not None]
         automatic = self.settings.enough is not None  # the last views then add little by design
-        if not automatic and not getattr(self.policy, "geometric", False):
-            gains = [step["information_gain"] for step in steps]
-            scores = [gain for gain in gains if gain is not None]
+        if automatic or getattr(self.policy, "geometric", False):
+            gains = []
         drift = 0.0  # changed Gaussians are not those of the start
         std = self.settings.prior_std.get("mean")
         if std and self.settings.train.density == "fixed":
             drift = detectors.means_drift(state.gaussians.means, start.means, std)
         positions = self.scene.positions([state.frames[i] for i in state.taken])
         last = views_left(state, self.settings) <= 0
-        indicators = detectors.step_indicators(
-            views, positions, state.fit.losses, coverage, scores, drift, last
-        )
+        numbers = state.fit.losses, coverage, gains, drift, last
+        indicators = detectors.step_indicators(views, positions, *numbers)
         if start.opacities.max() < 0.5:  # random points: no surface to compare with
             for name in ("prior", "pose", "coverage"):
                 indicators.pop(name, None)
         if state.choices:  # few passes, whose loss falls with the rates: good runs by up to 25 %
             indicators.pop("unconverged", None)
-        before_this = next(
-            (step["indicators"] for step in reversed(steps[:-1]) if "indicators" in step), None
-        )
-        alarms = detectors.alarms(indicators, before_this)
+        before = [step["indicators"] for step in steps[:-1] if "indicators" in step]
+        alarms = detectors.alarms(indicators, before[-1] if before else None)
         return {"indicators": indicators} | ({"warnings": alarms} if alarms else {})
 
     def _before_fit(self, state: State, frame: Frame) -> tuple[np.ndarray, detectors.Before]:

@@ -57,10 +57,8 @@ def rated(
     except (TypeError, ValueError) as error:
         raise InputError(f"{where} no numbers ({error}); return one for each candidate") from None
     if scores.shape != (len(views),):
-        raise InputError(
-            f"{where} scores of shape {scores.shape} for {len(views)} candidates; return one "
-            "number for each"
-        )
+        wrong = f"scores of shape {scores.shape} for {len(views)} candidates"
+        raise InputError(f"{where} {wrong}; return one number for each")
     positions = scene.positions(state.frames)
     farthest = poses.farthest_pose(positions[views], positions[list(state.taken)], scene.centre)
     weighed = scores / (1.0 if cost is None else cost)

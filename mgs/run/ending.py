@@ -95,8 +95,6 @@ def why_ended(ended: Mapping[str, Any]) -> str:
             note = f"{count} pose{'' if count == 1 else 's'} gave no picture"
             return f"no pose is left in reach, {views}; {note}, resuming asks for them again; {way}"
         return f"no pose is left that the flight's limits allow, {views}; {way}"
-    gain, limit = (
-        f"{ended['information_gain']:.4g} {GAIN_UNIT}",
-        f"less than stop_gain = {ended['limit']:g}",
-    )
-    return f"the next view, {ended['name']}, would gain {gain} after {views}, {limit}"
+    gain = f"{ended['information_gain']:.4g} {GAIN_UNIT} after {views}"
+    limit = f"less than stop_gain = {ended['limit']:g}"
+    return f"the next view, {ended['name']}, would gain {gain}, {limit}"

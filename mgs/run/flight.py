@@ -66,18 +66,16 @@ def flight_of(scene: Scene, state: State, mission: Mission) -> Flight:
 
 def check_seeds(scene: Scene, mission: Mission) -> None:
     """Raise InputError where the flight over the seeds and home exceeds the limits."""
-    seeds = seed_views(scene, mission)
-    matrix = tour.legs(
-        scene.positions(scene.frames), scene.centre[:2], mission.flight.no_fly or 0.0
-    )
-    flight = Flight(mission.flight, matrix, seeds[0])
+    seeds, limits = seed_views(scene, mission), mission.flight
+    positions = scene.positions(scene.frames)
+    matrix = tour.legs(positions, scene.centre[:2], limits.no_fly or 0.0)
+    flight = Flight(limits, matrix, seeds[0])
     metres = flight.metres(seeds)
     if flight.share(metres, len(seeds)) > 1:
-        seconds = metres / mission.flight.speed + mission.flight.hover * len(seeds)
-        raise InputError(
-            f"nbv: the flight over {len(seeds)} seeds and home takes {metres:.1f} m and "
-            f"{seconds:.0f} s; raise `flight.length` or `flight.time`, or lower `seeds`"
-        )
+        seconds = metres / limits.speed + limits.hover * len(seeds)
+        long = f"the flight over {len(seeds)} seeds and home takes {metres:.1f} m, {seconds:.0f} s"
+        cure = "raise `flight.length` or `flight.time`, or lower `seeds`"
+        raise InputError(f"nbv: {long}; {cure}")
 
 
 def seed_views(scene: Scene, mission: Mission) -> list[int]:
@@ -85,10 +83,9 @@ def seed_views(scene: Scene, mission: Mission) -> list[int]:
     fewer are allowed than seeds are needed."""
     may = np.flatnonzero(allowed(scene, mission))
     if len(may) < mission.seeds:
-        raise InputError(
-            f"{scene.dataset.root}: flight.no_fly and flight.clearance allow {len(may)} of its "
-            f"{len(scene.frames)} poses, fewer than {mission.seeds} seeds; lower one of them"
-        )
+        allow = f"flight.no_fly and flight.clearance allow {len(may)} of {len(scene.frames)} poses"
+        few = f"{allow}, fewer than {mission.seeds} seeds; lower one of them"
+        raise InputError(f"{scene.dataset.root}: {few}")
     return scene.seeds(mission.seeds, may.tolist())
 
 

@@ -203,7 +203,7 @@ class Run:
     @property
     def indices(self) -> list[int]:
         """Indices of the frames trained on, in the order of their choice."""
-        return frames_of(self.steps)
+        return [*self.steps[0]["seeds"], *(line["frame"] for line in self.steps[1:])]
 
     @property
     def taken(self) -> list[Frame]:
@@ -221,7 +221,8 @@ class Run:
     @cached_property
     def metrics(self) -> dict[str, Any] | None:
         """Contents of metrics.json; None if the run was not evaluated."""
-        return read_metrics(self.folder)
+        path, cure = self.folder / "metrics.json", f"measure it again with `mgs eval {self.folder}`"
+        return read_checked(Metrics, path, cure) if path.exists() else None
 
     @cached_property
     def poses_moved(self) -> dict[str, dict[str, float]]:
@@ -285,13 +286,6 @@ def read_config(out: Path) -> dict[str, Any]:
     return read_checked(Config, path, "start the run anew")
 
 
-def read_metrics(out: Path) -> dict[str, Any] | None:
-    """Read metrics.json of a run; None if there is none. Raises InputError if it is damaged."""
-    path = out / "metrics.json"
-    cure = f"measure the run again with `mgs eval {out}`"
-    return read_checked(Metrics, path, cure) if path.exists() else None
-
-
 def holds_run(out: Path) -> bool:
     """Whether a folder holds a run. A dataset has a config.json too, without settings of a run."""
     try:
@@ -328,10 +322,6 @@ def text_of(steps: Sequence[dict[str, Any]]) -> str:
     return "".join(json.dumps(line, allow_nan=False) + "\n" for line in steps)
 
 
-def frames_of(steps: Sequence[dict[str, Any]]) -> list[int]:
-    return [*steps[0]["seeds"], *(line["frame"] for line in steps[1:])]
-
-
 @contextmanager
 def _checkpoint(out: Path) -> Iterator[zipfile.ZipFile | None]:
     """Open the checkpoint of a run; None before the first step. Damage becomes an InputError."""
@@ -365,9 +355,8 @@ def read_checkpoint(out: Path) -> Checkpoint | None:
         return None
     with _checkpoint(out) as file:
         assert file is not None
-        arrays: dict[str, Any] = {
-            name: _member(file, name, "f") for name in (*ARRAYS, "H", "surface")
-        }
+        arrays: dict[str, Any]
+        arrays = {name: _member(file, name, "f") for name in (*ARRAYS, "H", "surface")}
         H, surface = arrays.pop("H"), arrays.pop("surface")
         antialiased, linear = record.pop("antialiased"), record.pop("linear")
         gaussians = Gaussians(**arrays, antialiased=antialiased, linear=linear)
@@ -380,10 +369,10 @@ def read_checkpoint(out: Path) -> Checkpoint | None:
 def _member(file: zipfile.ZipFile, name: str, kind: str) -> np.ndarray:
     """An array of a checkpoint. Raises ValueError unless it is stored as it is, its dtype is of
     this kind, and it is as long as its header says, so that it takes no more memory than disk."""
-    known = file.getinfo(f"{name}.npy")
-    if known.compress_type != zipfile.ZIP_STORED or known.flag_bits & 1:
+    info = file.getinfo(f"{name}.npy")
+    if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
         raise ValueError(f"{name} is compressed")
-    with file.open(known) as member:
+    with file.open(info) as member:
         version = np.lib.format.read_magic(member)
         if version not in ((1, 0), (2, 0)):
             raise ValueError(f"{name} has a header of another version")

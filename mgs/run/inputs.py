@@ -58,14 +58,8 @@ def camera_digest(camera: Camera) -> str:
 def frame_digests(frame: Frame, kinds: Iterable[str]) -> dict[str, str | None]:
     """Hashes of the files of a frame by kind: `image`, `mask`, `rock`, `depth`, `capture` (the
     record of a live capture); None of no file. Raises InputError as `file_digest`."""
-    return {
-        kind: None if (path := _path(frame, kind)) is None else file_digest(path) for kind in kinds
-    }
-
-
-def _path(frame: Frame, kind: str) -> Path | None:
-    path: Path | None = getattr(frame, f"{kind}_path")
-    return path
+    paths = {kind: getattr(frame, f"{kind}_path") for kind in kinds}
+    return {kind: None if path is None else file_digest(path) for kind, path in paths.items()}
 
 
 def check_unchanged(
@@ -87,7 +81,7 @@ def check_unchanged(
         for kind, digest in frame_digests(frame, old).items():
             if digest != old[kind]:
                 where = f"{dataset.root / 'transforms.json'}: the {kind} of frame {frame.name}"
-                file = _path(frame, kind) or where
+                file = getattr(frame, f"{kind}_path") or where
                 raise InputError(f"{file} has changed since {out} took it; restore it")
 
 

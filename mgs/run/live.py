@@ -129,10 +129,8 @@ def _warn_of_late(files: dict[Path, set[str]]) -> None:
         for end, path in answers(out).items():
             if end not in ends:
                 ends.add(end)
-                said = (
-                    f"{path}: came after its picture and is not used; write it before the picture"
-                )
-                warnings.warn(Notice(said), stacklevel=3)
+                said = "came after its picture and is not used; write it before the picture"
+                warnings.warn(Notice(f"{path}: {said}"), stacklevel=3)
 
 
 def ask(
@@ -198,13 +196,9 @@ def _flown(path: Path, frame: Frame, image: Path, world: World) -> tuple[Camera,
         raise InputError(f"{path}: has no transform_matrix")
     camera, lens, _ = record_camera(str(path), intrinsics(frame.camera) | record, image)
     plan, camera = frame.camera, world.enter(camera)
-    same = (camera.width, camera.height) == (plan.width, plan.height) and all(
-        np.allclose(one, other, rtol=0, atol=SAME)
-        for one, other in (
-            (camera.world_to_camera, plan.world_to_camera),
-            (camera.K, plan.K),
-        )
-    )
+    size = (camera.width, camera.height) == (plan.width, plan.height)
+    pose = np.allclose(camera.world_to_camera, plan.world_to_camera, rtol=0, atol=SAME)
+    same = size and pose and np.allclose(camera.K, plan.K, rtol=0, atol=SAME)
     return plan if same else camera, lens
 
 
@@ -222,17 +216,10 @@ def _commit(
         raise InputError(f"{shot.mask}: is no mask")
     check_photograph(result)
     camera = world.leave(result.camera)
-    own = {
-        "K": camera.K.tolist(),
-        "width": camera.width,
-        "height": camera.height,
-        "world_to_camera": camera.world_to_camera.tolist(),
-    }
-    record = {
-        "camera": None if result.camera == frame.camera else own,
-        "depth": shot.depth is not None,
-    }
-    write_json(capture_record(frame), record)
+    own: dict[str, Any] = {"K": camera.K.tolist(), "width": camera.width, "height": camera.height}
+    own |= {"world_to_camera": camera.world_to_camera.tolist()}
+    other = None if result.camera == frame.camera else own
+    write_json(capture_record(frame), {"camera": other, "depth": shot.depth is not None})
     return as_captured(frame, world)
 
 

@@ -135,11 +135,9 @@ class NbvSettings(ModelSettings, Mission):
             return self
         rates = {"mean": MEAN_RATE * spacing} | self.train.rates
         train = self.train.model_copy(update={"rates": rates})
-        prior_std = {
-            kind: loose * std if std == PRIOR_STD.get(kind) else std
-            for kind, std in self.prior_std.items()
-        }
-        prior_std = {"mean": loose * MEAN_STD * spacing} | prior_std
+        prior_std = {"mean": loose * MEAN_STD * spacing}
+        for kind, std in self.prior_std.items():
+            prior_std[kind] = loose * std if std == PRIOR_STD.get(kind) else std
         return self.model_copy(update={"train": train, "prior_std": prior_std})
 
 

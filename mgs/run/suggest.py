@@ -129,17 +129,11 @@ def suggest(
         may = allowed(scene, mission)
         blind = [i for i, seen in weights.items() if not seen.any()]
         ruled_out = [i for i in weights if not may[i] and i not in blind]
-        for reason, frames in (
-            ("sees nothing of the object", blind),
-            ("ruled out by flight.no_fly or flight.clearance", ruled_out),
-        ):
-            dropped |= {reason: len(frames)} if frames else {}
-        state = replace(
-            state,
-            frames=tuple(
-                replace(frame, given_up=i in blind) for i, frame in enumerate(state.frames)
-            ),
-        )
+        more = {"sees nothing of the object": blind}
+        more["ruled out by flight.no_fly or flight.clearance"] = ruled_out
+        dropped |= {reason: len(some) for reason, some in more.items() if some}
+        frames = [replace(frame, given_up=i in blind) for i, frame in enumerate(state.frames)]
+        state = replace(state, frames=tuple(frames))
         stops = free(scene, state, mission)
         _check_left(len(poses), len(stops), dropped, 1 if views == "auto" else most, mission.flies)
         if views == "auto":
@@ -201,8 +195,7 @@ def _weights(scene: Scene, state: State, taken: int) -> dict[int, NDArray[np.flo
     weights, count = {}, len(scene.frames)
     for i in range(taken, count):
         report("looking from the candidates", i - taken, count - taken)
-        F = scene.information(state, i)
-        weights[i] = squared_weights(F)[: len(scene.prior.points)]
+        weights[i] = squared_weights(scene.information(state, i))[: len(scene.prior.points)]
     return weights
 
 
@@ -243,20 +236,15 @@ def _describer(
 
 
 def _plan(
-    scene: Scene,
-    state: State,
-    policy: Policy,
-    mission: NbvSettings,
+    scene: Scene, state: State, policy: Policy, mission: NbvSettings
 ) -> tuple[list[Choice], list[int]]:
     """The views of the plan in order of choice, and the way: indices of its poses in flying order,
     from home to home."""
     flight = flight_of(scene, state, mission)
     if mission.flies:
         if not reachable(scene, state, mission):
-            raise InputError(
-                "suggest: no candidate is within the limits of the flight; raise `flight.length` "
-                "or `flight.time`"
-            )
+            beyond = "no candidate is within the limits of the flight"
+            raise InputError(f"suggest: {beyond}; raise `flight.length` or `flight.time`")
         choices, planned = list[Choice](), state
         for view, score in plan_flight(scene, state, policy, mission):
             choice, planned = appraised(scene, planned, view, score)

@@ -100,10 +100,8 @@ def watched(timeout: float) -> Transport:
     wait."""
 
     def deliver(pose: Path, out: Path) -> None:
-        warnings.warn(
-            Notice(f"waiting at most {timeout:g} s for {out} (pose in {pose.name})"),
-            stacklevel=2,
-        )
+        said = f"waiting at most {timeout:g} s for {out} (pose in {pose.name})"
+        warnings.warn(Notice(said), stacklevel=2)
         end, before, reason = time.monotonic() + timeout, None, "the picture is missing"
         while time.monotonic() < end:
             now = [(path, path.stat().st_size) for path in answers(out).values()]

@@ -99,11 +99,8 @@ def scaled(subject: Subject) -> Subject:
     if size <= LARGEST:
         return subject
     scale = LARGEST / size
-    cameras = [view.frame.camera.scaled(scale) for view in subject.views]
-    views = [
-        replace(view, frame=replace(view.frame, camera=camera))
-        for view, camera in zip(subject.views, cameras, strict=True)
-    ]
+    frames = [replace(v.frame, camera=v.frame.camera.scaled(scale)) for v in subject.views]
+    views = [replace(v, frame=frame) for v, frame in zip(subject.views, frames, strict=True)]
     if g is not None:
         larger = g.log_scales + np.float32(np.log(scale))
         g = replace(g, means=g.means * np.float32(scale), log_scales=larger)
