@@ -207,10 +207,8 @@ def _measured(
     (truth, weight), mask = frame.target(), frame.mask()
     true_depth = frame.depth() if frame.depth_path else None
     shares = frame.rock_path is not None
-    metrics = compare(truth, rgb, mask, weight)
-    metrics |= compare_surface(
-        truth, alpha, depth, mask, weight, fractional=shares, true_depth=true_depth
-    )
+    metrics, known = compare(truth, rgb, mask, weight), {"true_depth": true_depth}
+    metrics |= compare_surface(truth, alpha, depth, mask, weight, fractional=shares, **known)
     if folder is not None:
         write_comparison(folder / f"{frame.name}.png", truth[..., :3], rgb, metrics["psnr"])
     return metrics
@@ -227,10 +225,8 @@ def _means(views: list[dict[str, Any]], whole: list[dict[str, Any]]) -> dict[str
 
 
 def _without_nan(view: dict[str, Any]) -> dict[str, Any]:
-    return {
-        key: None if isinstance(value, float) and math.isnan(value) else value
-        for key, value in view.items()
-    }
+    absent = [key for key, value in view.items() if isinstance(value, float) and math.isnan(value)]
+    return view | dict.fromkeys(absent)
 
 
 def write_comparison(

@@ -183,12 +183,10 @@ def _depth_channel(path: Path) -> np.ndarray:
         return channels[(depths or [*channels])[0]]
     if "Z" in channels:
         return channels["Z"]
-    if set(channels) <= set("RGBA") and all(
-        np.array_equal(channels[name], channels["R"], equal_nan=True)
-        for name in channels
-        if name != "A"
-    ):
-        return channels["R"]
+    colours = [channels[name] for name in "RGB" if name in channels]
+    grey = all(np.array_equal(one, colours[0], equal_nan=True) for one in colours)
+    if set(channels) <= set("RGBA") and grey:
+        return colours[0]
     names = ", ".join(channels)
     raise InputError(f"{path}: which of {names} is the depth is not plain; write one channel, Z")
 

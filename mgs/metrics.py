@@ -68,20 +68,15 @@ def _similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
 
     _check_same_shape(a, b)
     if min(a.shape[:2]) < SSIM_WINDOW:
-        size, least = f"{a.shape[1]}x{a.shape[0]}", f"{SSIM_WINDOW}x{SSIM_WINDOW}"
-        raise InputError(f"SSIM needs images of at least {least} pixels, not {size}")
+        size = f"at least {SSIM_WINDOW}x{SSIM_WINDOW} pixels, not {a.shape[1]}x{a.shape[0]}"
+        raise InputError(f"SSIM needs images of {size}")
     lit = ((a != 0) | (b != 0)).any(axis=2)
     lit[a.shape[0] // 2, a.shape[1] // 2] = True  # both images may be black
     box, similarity = around(lit, SSIM_WINDOW), np.ones(a.shape)  # 1 where all around is black
+    window = {"gaussian_weights": True, "sigma": SSIM_SIGMA, "use_sample_covariance": False}
+    pair = (np.asarray(image[box], np.float64) for image in (a, b))
     _, similarity[box] = structural_similarity(
-        np.asarray(a[box], np.float64),
-        np.asarray(b[box], np.float64),
-        channel_axis=-1,
-        data_range=1.0,
-        gaussian_weights=True,
-        sigma=SSIM_SIGMA,
-        use_sample_covariance=False,
-        full=True,
+        *pair, channel_axis=-1, data_range=1.0, full=True, **window
     )
     inner = slice(SSIM_WINDOW // 2, -(SSIM_WINDOW // 2))
     channels = map(np.ascontiguousarray, np.moveaxis(similarity, 2, 0))

@@ -55,7 +55,8 @@ def save_figure(figure: Figure, path: str | Path) -> None:
     Raises InputError for another suffix, and as `mgs.files.atomic_path`."""
     kind = Path(path).suffix.lower()[1:]
     if kind not in FORMATS:
-        raise InputError(f"{path}: figures are {', '.join(FORMATS)}; choose another ending")
+        kinds = ", ".join(FORMATS)
+        raise InputError(f"{path}: figures are written as {kinds}; choose another ending")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format=kind)
 
@@ -87,12 +88,12 @@ def crop(mask: np.ndarray, margin: float = 0.06) -> tuple[slice, slice]:
     """Rows and columns of an image that hold its mask [H,W] and a margin; all if the mask is empty.
 
     margin: share of the image's height and width."""
-    rows, columns = np.nonzero(mask)
-    if len(rows) == 0:
+    if not mask.any():
         return slice(None), slice(None)
-    h, w = mask.shape
-    dy, dx = round(margin * h), round(margin * w)
-    return (
-        slice(max(0, int(rows.min()) - dy), min(h, int(rows.max()) + dy + 1)),
-        slice(max(0, int(columns.min()) - dx), min(w, int(columns.max()) + dx + 1)),
-    )
+
+    def span(indices: np.ndarray, size: int) -> slice:
+        more = round(margin * size)
+        return slice(max(0, int(indices.min()) - more), min(size, int(indices.max()) + more + 1))
+
+    rows, columns = map(span, np.nonzero(mask), mask.shape)
+    return rows, columns

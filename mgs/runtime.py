@@ -139,7 +139,8 @@ def _set_variant(name: str) -> None:
 
     where = f"{VARIANT_VARIABLE}={name}"
     if name not in mi.variants():
-        raise InputError(f"{where}: no such variant; choose {VARIANT} or cuda_ad_rgb")
+        choice = f"choose {VARIANT} or cuda_ad_rgb"
+        raise InputError(f"{where}: Mitsuba has no such variant; {choice}")
     if name.startswith("llvm"):
         _choose_libllvm()
         _check_libllvm()

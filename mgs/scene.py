@@ -217,15 +217,17 @@ class Scene:
     def image(self) -> Callable[[Frame], np.ndarray]:
         """image(frame) -> target of a fit [H,W,4 or 5] (`mgs.data.dataset.target_of`)."""
         alpha = self.settings.train.alpha_weight > 0
-        return kept_within(
-            IMAGE_BYTES, lambda frame: target_of(frame, alpha), lambda image: image.nbytes
-        )
+        size = lambda image: image.nbytes  # noqa: E731
+        return kept_within(IMAGE_BYTES, lambda frame: target_of(frame, alpha), size)
 
     def targets(self, frames: Sequence[Frame], gains: np.ndarray | None) -> Sequence[np.ndarray]:
         """Targets of a fit to frames; colours are divided by `gains` [V,3], if given."""
-        if gains is None:
-            return Deferred(range(len(frames)), lambda k: self.image(frames[k]))
-        return Deferred(range(len(frames)), lambda k: without_gain(self.image(frames[k]), gains[k]))
+
+        def target(k: int) -> np.ndarray:
+            image = self.image(frames[k])
+            return image if gains is None else without_gain(image, gains[k])
+
+        return Deferred(range(len(frames)), target)
 
     def fitted(
         self,

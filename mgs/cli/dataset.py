@@ -12,11 +12,7 @@ from mgs.errors import InputError
 from mgs.files import working_in
 
 
-def dataset(
-    action: Literal["check", "masks"],
-    path: Path,
-    prior: Path | None = None,
-) -> None:
+def dataset(action: Literal["check", "masks"], path: Path, prior: Path | None = None) -> None:
     """Check a dataset, or make masks for one that has none.
 
     `mgs dataset check DATASET` checks that every file can be read and has the right size, and that

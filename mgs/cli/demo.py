@@ -82,4 +82,5 @@ def check_seed(dataset: Path, runs: list[Path], seed: int) -> None:
         recorded[dataset] = config.get("seed", seed) if isinstance(config, dict) else seed
     for folder, other in recorded.items():
         if other != seed:
-            raise InputError(f"{folder}: has `seed` {other}; give that seed, or another folder")
+            was = f"was made with `seed` {other}, not {seed}"
+            raise InputError(f"{folder}: {was}; give that seed, or another folder")

@@ -69,28 +69,17 @@ def evaluate(
                 smaller = [subject / name for name in (REFITTED, PRUNED)]
                 files = [path for path in smaller if path.is_file()]
             for path in files:
-                name = path.name if path == subject else f"  {path.stem.partition('_')[2]}"
-                rows.append(
-                    metrics_row(
-                        name,
-                        measured(
-                            path,
-                            dataset,
-                            prior=prior if path == subject else None,
-                            progress=progress,
-                        ),
-                    )
-                )
+                name, of = path.name, prior
+                if path != subject:
+                    name, of = f"  {path.stem.partition('_')[2]}", None
+                metrics = measured(path, dataset, prior=of, progress=progress)
+                rows.append(metrics_row(name, metrics))
                 lines.append(f"wrote {path.with_suffix('.metrics.json')}")
     print_quality(Terminal(), rows)
     _print(lines)
 
 
-def diagnose(
-    runs: list[Path],
-    views: str | None = None,
-    force: bool = False,
-) -> None:
+def diagnose(runs: list[Path], views: str | None = None, force: bool = False) -> None:
     """Draw maps of the Fisher information and the uncertainty of a run's model, for views and for
     Gaussians.
 

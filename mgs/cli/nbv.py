@@ -87,21 +87,22 @@ def nbv(
     console = Terminal()
     values = parse_settings(settings, nbv)
     live = live_capture(capture_command, capture_folder, values.pop("capture", {}))
+    own = not_none(budget=budget, seeds=seeds, batch=batch, seed=seed)
     if resume is not None:
-        others = not_none(dataset=dataset, out=out, prior=prior, gaussians=gaussians, budget=budget)
-        others |= not_none(source=source)
-        others |= not_none(seeds=seeds, batch=batch, seed=seed, config=config, force=force or None)
-        for name in others | values:
+        others = not_none(dataset=dataset, out=out, prior=prior, gaussians=gaussians, source=source)
+        others |= not_none(config=config, force=force or None)
+        for name in others | own | values:
             where = f"--resume takes its settings from {resume / 'config.json'}; change it there"
             raise InputError(f"nbv: {name}: {where}")
         resume_and_print(resume, console, policy, live=live)
         return
     recorded = settings_in(config) if config else {}
-    values = merged(recorded, values)
-    own = recorded.get("policy", "")
-    if in_file(own) and policy is None:
-        raise InputError(f"{config}: its policy is a program, {own}; to run it, add --policy {own}")
-    values |= not_none(policy=policy, budget=budget, seeds=seeds, batch=batch, seed=seed)
+    rule = recorded.get("policy", "")
+    if in_file(rule) and policy is None:
+        raise InputError(
+            f"{config}: its policy is a program, {rule}; to run it, add --policy {rule}"
+        )
+    values = merged(recorded, values) | not_none(policy=policy) | own
     dataset = dataset or values.get("dataset")
     if gaussians is None and source is None:
         prior = prior or values.get("prior")
@@ -169,10 +170,7 @@ def start_and_print(
 
 
 def resume_and_print(
-    run: Path | Run,
-    console: Terminal,
-    policy: str | None = None,
-    live: Live | None = None,
+    run: Path | Run, console: Terminal, policy: str | None = None, live: Live | None = None
 ) -> None:
     """Run or resume the loop of a run with a line for each step, evaluate, print the quality.
 

@@ -153,7 +153,8 @@ def suggest(
         )
         crossed = _crossed(run, result)
         if crossed and plan:
-            raise InputError(f"suggest: {crossed}: no flight plan is written; give flight.no_fly")
+            cure = "so no flight plan is written; give flight.no_fly"
+            raise InputError(f"suggest: {crossed}, {cure}")
         if out is not None:
             from mgs.reports.suggestion import write_suggestion
 

@@ -214,11 +214,7 @@ class Certificate:
 
 
 def certify(
-    criterion: Criterion,
-    plan: Sequence[int],
-    name: str,
-    most: int = NODES,
-    seconds: float = np.inf,
+    criterion: Criterion, plan: Sequence[int], name: str, most: int = NODES, seconds: float = np.inf
 ) -> Certificate:
     """Certificate of a plan by the policy `name`: `best_set` for as many views, with its limits,
     and `least_bound` for one less. Raises InputError as `upper_bound`."""

@@ -129,11 +129,7 @@ def _draw_length(axis: Axes, unit: str) -> None:
 
 
 def curves_figure(
-    path: str | Path,
-    title: str,
-    panels: Mapping[str, Curves],
-    x: str = "images",
-    **limits: float,
+    path: str | Path, title: str, panels: Mapping[str, Curves], x: str = "images", **limits: float
 ) -> None:
     """Draw curves beside each other, a panel for each quantity and a line for each label.
 

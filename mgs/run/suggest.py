@@ -185,7 +185,8 @@ def _settings(run: Run, taken: int, views: int, given: dict[str, Any]) -> NbvSet
 def _check_left(count: int, left: int, dropped: dict[str, int], views: int, flies: bool) -> None:
     reasons = "; ".join(f"{number} {why}" for why, number in dropped.items()) or "none was dropped"
     if not left:
-        raise InputError(f"suggest: none of {count} candidates can fly ({reasons}); give others")
+        none = f"none of the {count} candidates can be flown ({reasons})"
+        raise InputError(f"suggest: {none}; give others")
     if left < views and not flies:
         raise InputError(f"suggest: views {views} of {left} candidates ({reasons}); lower it")
 
