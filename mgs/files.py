@@ -288,7 +288,8 @@ class Ours:
         there = {path.name for path in folder.iterdir()}
         own = (*self.names, LOCK, ".*.part*")
         other = [name for name in sorted(there) if not any(fnmatch(name, one) for one in own)]
-        inputs = [str(path) for path in self.reads if folder.resolve() in resolved_parents(path)]
+        place = folder.resolve()
+        inputs = [str(path) for path in self.reads if Path(path).resolve().is_relative_to(place)]
         why = ""
         if inputs:
             why = f"{inputs[0]} is in it and is read"
@@ -297,12 +298,6 @@ class Ours:
             why = f"this command did not make it, since {why}"
         if why:
             raise InputError(f"{folder}: `force` leaves it alone: {why}; choose another folder")
-
-
-def resolved_parents(path: str | Path) -> list[Path]:
-    """The path itself and all folders that hold it, without symbolic links."""
-    whole = Path(path).resolve()
-    return [whole, *whole.parents]
 
 
 def check_new_folder(path: str | Path, ours: Ours | None = None) -> Path:

@@ -42,7 +42,11 @@ def report(
     if out is not None or html is None:
         _write_figures(runs, out or Path("report"), figures or "png", force)
     if html is not None:
-        _write_page(runs, html)
+        from mgs.reports.page import write_page
+
+        with progress_bar() as bar:
+            size = write_page(html, runs, progress=partial(bar, "drawing"))
+        echo(f"wrote {html} ({size / 1e6:.1f} MB)")
 
 
 def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
@@ -68,11 +72,3 @@ def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
     choices = any(run.settings.budget for run in by_label.values())
     if choices and not any(file.stem == "psnr" for file in files):
         echo("PSNR against images is left out: make all runs with evaluate_every to have it")
-
-
-def _write_page(runs: list[Path], html: Path) -> None:
-    from mgs.reports.page import write_page
-
-    with progress_bar() as bar:
-        size = write_page(html, runs, progress=partial(bar, "drawing"))
-    echo(f"wrote {html} ({size / 1e6:.1f} MB)")

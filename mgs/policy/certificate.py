@@ -11,8 +11,8 @@ from __future__ import annotations
 import heapq
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import asdict, dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,6 +191,10 @@ class Certificate:
     stopped: str
     prices: list[float]
     curve: list[dict[str, float]] = field(default_factory=list)
+
+    def record(self, names: Iterable[str]) -> dict[str, Any]:
+        """The certificate as JSON, with prices by name of the candidate."""
+        return asdict(self) | {"prices": dict(zip(names, self.prices, strict=True))}
 
     def sentence(self) -> str:
         """The certificate in words; shares are rounded to the safe side."""

@@ -21,6 +21,7 @@ from mgs.seeds import generator
 SCALES = (1e-3, 1.0)  # of steps: rms error of an image, (pixel value) per coefficient
 HALVINGS = 9  # halvings of that range, in its logarithm: steps are found to 1.4 %
 VIEWS = 16  # most views, evenly spread over those taken, in which errors are weighed
+STEP = 1e-4  # linear RGB, by which the slope of sRGB is measured
 NOISES = (PRUNE_NOISE, 4 * PRUNE_NOISE)  # by pruning, if positions are sent: the better
 
 
@@ -115,15 +116,11 @@ def _gradients(run: Run, g: Gaussians) -> Iterator[Mapping[str, np.ndarray]]:
     weight = np.sqrt(len(run.taken) / len(frames))
     for frame in frames:
         image = np.asarray(render(model, frame.camera).rgb)
-        slope = _slope(image) if g.linear else np.ones_like(image)
+        slope = np.ones_like(image)
+        if g.linear:  # derivative of sRGB by linear RGB, 0 where it is clipped
+            slope = (srgb_from_linear(image + STEP) - srgb_from_linear(image)) / STEP
         signs = rng.choice([-weight, weight], image.shape)
         yield vjp(model, (signs * slope).astype(np.float32), frame.camera)
-
-
-def _slope(linear: np.ndarray) -> np.ndarray:
-    """Derivative of sRGB by linear RGB, 0 where it is clipped."""
-    step = 1e-4
-    return (srgb_from_linear(linear + step) - srgb_from_linear(linear)) / step
 
 
 def _fitted(

@@ -51,26 +51,19 @@ def numbers(run: Run, suggestion: Suggestion) -> dict[str, Any]:
         "unknown": "mean share of the prior's variance left in what the picture shows",
         "distance": f"from the last image, {run.dataset.unit}",
     }
-    world = run.dataset.world
+    world, worth = run.dataset.world, suggestion.certificate
+    names = [view.name for view in suggestion.ranking]
     return {
         "policy": run.label,
         "images": len(run.taken),
         "convention": CONVENTION,
         "units": units,
         "flight": {"metres": suggestion.metres, "seconds": suggestion.seconds},
-        "certificate": _certificate(suggestion),
+        "certificate": worth.record(names) if worth else None,
         "dropped": suggestion.dropped,
         "plan": [_record(view, world) for view in suggestion.plan],
         "ranking": [_record(view, world) for view in suggestion.ranking],
     }
-
-
-def _certificate(suggestion: Suggestion) -> dict[str, Any] | None:
-    if suggestion.certificate is None:
-        return None
-    names = [view.name for view in suggestion.ranking]
-    prices = dict(zip(names, suggestion.certificate.prices, strict=True))
-    return asdict(suggestion.certificate) | {"prices": prices}
 
 
 def _record(view: View, world: World) -> dict[str, Any]:

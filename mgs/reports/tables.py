@@ -12,27 +12,21 @@ from mgs.reports.runs import check_measured
 from mgs.run.ending import RunEnd
 from mgs.run.folder import Run
 
-HEADERS = {
-    "policy": "policy",
-    "images": "images",
-    "test.psnr": "PSNR, test views (dB)",
-    "test.ssim": "SSIM, test views",
-    "test.psnr_corrected": "PSNR, test views, exposure fitted (dB)",
-    "test.psnr_mask": "masked PSNR, test views (dB)",
-    "test.ssim_mask": "masked SSIM, test views",
-    "test.psnr_mask_corrected": "masked PSNR, test views, exposure fitted (dB)",
-    "all.psnr": "PSNR, all views (dB)",
-    "all.ssim": "SSIM, all views",
-    "held_out.psnr": "PSNR, held-out views (dB)",
-    "held_out.ssim": "SSIM, held-out views",
-    "held_out.psnr_corrected": "PSNR, held-out views, exposure fitted (dB)",
-    "held_out.psnr_mask": "masked PSNR, held-out views (dB)",
-    "held_out.ssim_mask": "masked SSIM, held-out views",
-    "held_out.psnr_mask_corrected": "masked PSNR, held-out views, exposure fitted (dB)",
-    "coverage": "coverage (%)",
-    "path": "path ({unit})",
-    "ended": "ended by",
+SETS = {"test": "test views", "all": "all views", "held_out": "held-out views"}
+WHOLE = {"psnr": "PSNR, {} (dB)", "ssim": "SSIM, {}"}
+OTHERS = {
+    "psnr_corrected": "PSNR, {}, exposure fitted (dB)",
+    "psnr_mask": "masked PSNR, {} (dB)",
+    "ssim_mask": "masked SSIM, {}",
+    "psnr_mask_corrected": "masked PSNR, {}, exposure fitted (dB)",
 }
+HEADERS = {"policy": "policy", "images": "images"}
+HEADERS |= {
+    f"{key}.{metric}": heading.format(views)
+    for key, views in SETS.items()
+    for metric, heading in (WHOLE if key == "all" else WHOLE | OTHERS).items()
+}
+HEADERS |= {"coverage": "coverage (%)", "path": "path ({unit})", "ended": "ended by"}
 """Columns of the table: key in a row of `comparison_rows` -> heading."""
 
 

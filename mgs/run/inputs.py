@@ -89,7 +89,7 @@ def policy_record(policy: str) -> dict[str, str]:
     """The hash of a policy's file, as an entry of a record; empty for a policy of ours."""
     if not policy_file.in_file(policy):
         return {}
-    return {"policy": file_digest(policy_file.file_of(policy))}
+    return {"policy": file_digest(Path(policy.rpartition(":")[0]))}
 
 
 def changed_prior(out: Path, prior: Path) -> str:

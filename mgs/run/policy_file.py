@@ -100,22 +100,16 @@ def label(name: str, budget: int = 1) -> str:
     return Path(name).name if in_file(name) else name
 
 
-def file_of(name: str) -> Path:
-    return Path(name.rpartition(":")[0])
-
-
 def load(name: str) -> Policy:
     """The policy FILE.py:NAME. A file is executed once per process, unless it changes. Raises
     InputError if the file is missing or fails, has no such function, class or object, or it has an
     unknown parameter."""
-    path = file_of(name)
-    if not path.is_file():
+    file, _, target = name.rpartition(":")
+    if not (path := Path(file)).is_file():
         where = f"no such file {path}; correct the path (for a run, in its config.json)"
         raise InputError(f"policy {name}: {where}")
     with _users_code(name, path):
-        module = _executed(path, path.read_bytes())
-        target = name.rpartition(":")[2]
-        function = getattr(module, target, None)
+        function = getattr(_executed(path, path.read_bytes()), target, None)
         if not callable(function):
             raise InputError(f"policy {name}: {path} has no function {target}; name one it has")
         return Own(name, function() if isinstance(function, type) else function, path)
@@ -204,16 +198,13 @@ def policy_of(policy: Any) -> Policy:
     """The policy of a name, or a Python function or object as one. Executes a user's file. Raises
     InputError as `check_policy` and `load`."""
     if not isinstance(policy, str):
-        return policy if _complete(policy) else Own(name_of(policy), policy)
+        complete = hasattr(policy, "name") and hasattr(policy, "needs_fit")
+        return policy if complete else Own(name_of(policy), policy)
     if in_file(policy):
         return load(policy)
     if is_function(policy):
         raise InputError(f"policy {policy}: is a Python function; give it again in Python")
     return policy_named(policy)
-
-
-def _complete(policy: Any) -> bool:
-    return hasattr(policy, "name") and hasattr(policy, "needs_fit")
 
 
 def _failed(path: Path, error: BaseException) -> str:

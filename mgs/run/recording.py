@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -244,11 +244,8 @@ class Recorder:
         """Entry of the seeds' line: what the plan of all views to come is worth."""
         scene, policy, settings = self.scene, self.policy, self.settings
         worth = planned_certificate(scene, state, policy, settings)
-        if worth is None:
-            return {}
         names = [state.frames[i].name for i in free(scene, state, settings)]
-        prices = dict(zip(names, worth.prices, strict=True))
-        return {"certificate": asdict(worth) | {"prices": prices}}
+        return {"certificate": worth.record(names)} if worth else {}
 
     def lines(self, state: State) -> list[dict[str, Any]]:
         """Lines of the new steps, with all that is known before their images are read."""
