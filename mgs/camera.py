@@ -115,9 +115,7 @@ class Camera:
         """K, pose and image size as bytes: the key of a view in caches and seeds."""
         size = f"{self.width}x{self.height}".encode()
         numbers = self.K.tobytes() + self.world_to_camera.tobytes() + size
-        return (
-            numbers if self.film is None else numbers + repr(self.corner).encode() + self.film.key
-        )
+        return numbers + (repr(self.corner).encode() + self.film.key if self.film else b"")
 
     def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Project world points [N,3], metres, to pixels [N,2] and z-depths [N], metres. Pixels are

@@ -7,23 +7,10 @@ from typing import TypeVar
 
 Row = TypeVar("Row")
 
-EXTRAS = {
-    "pymeshlab": "prior",
-    "manifold3d": "prior",
-    "sklearn": "prior",
-    "cv2": "prior",
-    "pycolmap": "import",
-    "gtsam": "survey",
-    "small_gicp": "survey",
-    "pyoidn": "denoise",
-    "plotly": "page",
-    "jinja2": "page",
-    "viser": "view",
-    "gsply": "export",
-    "constriction": "export",
-    "imageio_ffmpeg": "video",
-    "rosbags": "ros",
-}
+EXTRAS = dict.fromkeys(("pymeshlab", "manifold3d", "sklearn", "cv2"), "prior")
+EXTRAS |= {"pycolmap": "import", "gtsam": "survey", "small_gicp": "survey", "pyoidn": "denoise"}
+EXTRAS |= {"plotly": "page", "jinja2": "page", "viser": "view", "gsply": "export"}
+EXTRAS |= {"constriction": "export", "imageio_ffmpeg": "video", "rosbags": "ros"}
 """Modules that only some commands need -> extra of pyproject.toml that installs them."""
 
 

@@ -98,11 +98,9 @@ class Gaussians:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Gaussians):
             return NotImplemented
-        pairs = ((getattr(self, name), getattr(other, name)) for name in ARRAYS)
+        pairs = [[np.asarray(getattr(one, name)) for one in (self, other)] for name in ARRAYS]
         same = all(getattr(self, name) == getattr(other, name) for name in MARKS)
-        return same and all(
-            np.array_equal(np.asarray(mine), np.asarray(theirs)) for mine, theirs in pairs
-        )
+        return same and all(np.array_equal(mine, theirs) for mine, theirs in pairs)
 
     __hash__ = None  # type: ignore[assignment]  # its arrays can change
 

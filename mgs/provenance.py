@@ -29,12 +29,10 @@ def _commit() -> dict[str, str]:
     checkout = Path(__file__).parent.parent
     if not (checkout / ".git").exists():
         return {}
-    git = ["git", "-C", str(checkout), "describe"]
-    options = ["--always", "--exclude", "*", "--abbrev=7", "--dirty=+"]
+    git = ["git", "-C", str(checkout), "describe", "--always", "--exclude", "*"]
+    git += ["--abbrev=7", "--dirty=+"]
     try:
-        result = subprocess.run(
-            [*git, *options], capture_output=True, text=True, timeout=10, check=True
-        )
+        said = subprocess.check_output(git, stderr=subprocess.DEVNULL, text=True, timeout=10)
     except (OSError, subprocess.SubprocessError):
         return {}
-    return {"commit": result.stdout.strip()}
+    return {"commit": said.strip()}

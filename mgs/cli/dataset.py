@@ -41,9 +41,8 @@ def _make_masks(path: Path, prior: Path) -> None:
     console = Terminal()
     with working_in(path), progress_bar("masks", console) as progress:
         masks = make_masks(data, mesh_prior.mesh, partial(progress, "masks"))
-    console.print(
-        f"{path}: {len(masks)} masks of {prior}; look at {path / SHEET} before you use them"
-    )
+    sheet = path / SHEET
+    console.print(f"{path}: {len(masks)} masks of {prior}; look at {sheet} before you use them")
 
 
 def _check(path: Path) -> None:
@@ -57,15 +56,11 @@ def _check(path: Path) -> None:
     camera, (low, high) = data.frames[0].camera, check.depth_range
     absent = len(data) - len(taken_frames(data))
     waiting = f" ({absent} of them on demand, not taken yet)" if absent else ""
-    console.print(
-        f"{path}: {len(data)} frames{waiting}, {camera.width}x{camera.height}, "
-        f"rock on {check.mask_share:.0%} of the pixels"
-    )
+    rock = f"{camera.width}x{camera.height}, rock on {check.mask_share:.0%} of the pixels"
+    console.print(f"{path}: {len(data)} frames{waiting}, {rock}")
     if high > 0:
-        console.print(
-            f"depth of the rock {low:.2f} to {high:.2f} m; "
-            f"neighbours see through {check.seen_through:.1%} of it"
-        )
+        through = f"neighbours see through {check.seen_through:.1%} of it"
+        console.print(f"depth of the rock {low:.2f} to {high:.2f} m; {through}")
     if check.problems:
         for problem in check.problems:
             console.print(f"- {problem}", soft_wrap=True, highlight=False)

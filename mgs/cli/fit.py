@@ -53,16 +53,9 @@ def fit(
     console = Terminal()
     train = not_none(passes=passes, means=means, density=density, loss=loss)
     options = not_none(sh=sh, exposure=exposure, seed=seed, refine_poses=refine_poses)
-    run = start_and_print(
-        dataset,
-        out,
-        console,
-        start_fit,
-        prior=prior,
-        gaussians=parse_gaussians(gaussians),
-        force=force,
-        **merged(parse_settings(settings, fit), options | {"train": train}),
-    )
+    values = merged(parse_settings(settings, fit), options | {"train": train})
+    values |= {"prior": prior, "gaussians": parse_gaussians(gaussians), "force": force}
+    run = start_and_print(dataset, out, console, start_fit, **values)
     if run.poses_moved:
         console.print(moves_in_words(run.poses_moved, run.dataset.unit))
     if prior is None and (seen := run.prior.numbers.get("triangulated")) is not None:
@@ -74,10 +67,7 @@ def fit(
 def moves_in_words(moves: dict[str, dict[str, float]], unit: str) -> str:
     """Format the mean and largest move of poses. moves: by frame, degrees and length."""
     name = max(moves, key=lambda one: moves[one]["degrees"])
-    degrees, length = (
-        sum(move[key] for move in moves.values()) / len(moves) for key in ("degrees", "length")
-    )
-    return (
-        f"poses moved {degrees:.2f} degrees and {length:.3g} {unit} in the mean, "
-        f"{name} most: {moves[name]['degrees']:.2f} and {moves[name]['length']:.3g}"
-    )
+    degrees = sum(move["degrees"] for move in moves.values()) / len(moves)
+    length = sum(move["length"] for move in moves.values()) / len(moves)
+    most = f"{name} most: {moves[name]['degrees']:.2f} and {moves[name]['length']:.3g}"
+    return f"poses moved {degrees:.2f} degrees and {length:.3g} {unit} in the mean, {most}"

@@ -152,17 +152,13 @@ def simplify(
 
 
 def _pruned(result: PrunedRun, noise: float) -> list[str]:
-    share = 1 - result.after / result.before
-    lines = [
-        f"{result.before:,} Gaussians, {result.after:,} stay: {share:.0%} are left out",
-        f"rms change of a pixel value: predicted {result.predicted:.2g}, "
-        f"measured {result.actual:.2g}, allowed {noise:.2g}",
-    ]
+    share, before, after = 1 - result.after / result.before, result.before, result.after
+    lines = [f"{before:,} Gaussians, {after:,} stay: {share:.0%} are left out"]
+    values = f"predicted {result.predicted:.2g}, measured {result.actual:.2g}, allowed {noise:.2g}"
+    lines.append(f"rms change of a pixel value: {values}")
     if result.psnr:
-        before, after = result.psnr
-        lines.append(
-            f"PSNR on the {result.views} views: {before:.2f} dB before, {after:.2f} dB after"
-        )
+        decibels = "{:.2f} dB before, {:.2f} dB after".format(*result.psnr)
+        lines.append(f"PSNR on the {result.views} views: {decibels}")
     return lines
 
 

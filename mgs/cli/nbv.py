@@ -108,17 +108,9 @@ def nbv(
         prior = prior or values.get("prior")
     if dataset is None or out is None:
         raise InputError("nbv: give a DATASET and --out RUN; or --resume RUN")
-    run = start_and_print(
-        dataset,
-        out,
-        console,
-        live=live,
-        prior=prior,
-        gaussians=parse_gaussians(gaussians),
-        source=source,
-        force=force,
-        **{key: value for key, value in values.items() if key not in ("dataset", "prior")},
-    )
+    values |= {"prior": prior, "gaussians": parse_gaussians(gaussians), "source": source}
+    values.pop("dataset", None)
+    run = start_and_print(dataset, out, console, live=live, force=force, **values)
     resume_and_print(run, console, run.settings.policy, live=live)
 
 

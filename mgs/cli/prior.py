@@ -163,19 +163,15 @@ def prior(
     console.print(_table(result.numbers))
     agreement = result.numbers.get("colour_agreement", 1.0)
     if agreement < AGREEMENT:
-        console.print(
-            f"the photographs agree on only {agreement:.0%} of the surface's colours (on a correct "
-            f"surface on {AGREEMENT:.0%} or more), so it may be wrong; fit with `--means free`",
-            soft_wrap=True,
-        )
+        few = f"the photographs agree on only {agreement:.0%} of the surface's colours"
+        right = f"on a correct surface on {AGREEMENT:.0%} or more"
+        cure = "so it may be wrong; fit with `--means free`"
+        console.print(f"{few} ({right}), {cure}", soft_wrap=True)
     wrong = result.numbers.get("outline_error", 0.0)
     if wrong > OUTLINE:
-        console.print(
-            f"the outlines of mesh and masks disagree in {wrong:.1%} of the covered pixels of the "
-            f"median view (limit {OUTLINE:.0%}): a part of the object is missing or too much, or "
-            "masks and poses do not fit",
-            soft_wrap=True,
-        )
+        many = f"{wrong:.1%} of the covered pixels of the median view (limit {OUTLINE:.0%})"
+        why = "a part of the object is missing or too much, or masks and poses do not fit"
+        console.print(f"the outlines of mesh and masks disagree in {many}: {why}", soft_wrap=True)
     written = sorted(path.name for path in folder.iterdir())
     console.print(f"wrote {folder}: {', '.join(written)}")
 

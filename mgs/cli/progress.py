@@ -61,12 +61,8 @@ def progress_bar(stage: str = "reading", console: Terminal | None = None) -> Ite
     The object it yields is called as progress(stage, done, total). For a function that reports
     (done, total) alone, pass `functools.partial(progress, "rendering")`.
     """
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
+    name = TextColumn("{task.description}", markup=False)
+    columns = name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     console = console or Terminal()
     off = not (console.is_terminal or console.is_jupyter)  # it would leave an empty line
     with Progress(*columns, console=console, transient=True, disable=off) as bar:

@@ -77,6 +77,5 @@ def renewed(arguments: Sequence[str]) -> list[str]:
 
 
 def _notice(old: str, now: list[str]) -> None:
-    warnings.warn(
-        Notice(f"{old} is now {shlex.join(now)}; it ends with this release"), stacklevel=3
-    )
+    said = f"{old} is now {shlex.join(now)}; it ends with this release"
+    warnings.warn(Notice(said), stacklevel=3)

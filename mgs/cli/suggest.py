@@ -141,16 +141,8 @@ def suggest(
         candidates, safe, band = _candidates(run, poses, dome, asked)
         from mgs.run.suggest import suggest as suggested
 
-        result = suggested(
-            run,
-            candidates,
-            count,
-            safe_distance=safe,
-            elevations=band,
-            refine=asked.refine,
-            progress=progress,
-            **changes,
-        )
+        changes |= {"safe_distance": safe, "elevations": band, "refine": asked.refine}
+        result = suggested(run, candidates, count, progress=progress, **changes)
         crossed = _crossed(run, result)
         if crossed and plan:
             cure = "so no flight plan is written; give flight.no_fly"
@@ -278,11 +270,9 @@ def _print(console: Terminal, result: Suggestion, run: Run, crossed: str, place:
     from mgs.policy.criteria import GAIN_UNIT
 
     if run.prior.kind == "random":
-        console.print(
-            "the model has no surface of an object: nothing tells seen from unseen, and gains are "
-            "no guide; import with masks or depth, or fit with `prior`",
-            soft_wrap=True,
-        )
+        lacks = "the model has no surface of an object: nothing tells seen from unseen"
+        cure = "import with masks or depth, or fit with `prior`"
+        console.print(f"{lacks}, and gains are no guide; {cure}", soft_wrap=True)
     for reason, count in result.dropped.items():
         console.print(f"candidates left out: {count} {reason}")
     rows = result.plan if len(result.plan) > 1 else result.ranking[:SHOWN]

@@ -60,10 +60,8 @@ def survey(
         progress("writing")
         numbers = save_survey(unfinished, frames, flown, settings)
     console.print(_table(numbers))
-    console.print(
-        f"wrote {folder}: a dataset with estimated poses and measured depth, "
-        "cloud.ply, survey.json, survey.png"
-    )
+    what = "a dataset with estimated poses and measured depth, cloud.ply, survey.json, survey.png"
+    console.print(f"wrote {folder}: {what}")
 
 
 def _table(numbers: dict[str, Any]) -> Table:

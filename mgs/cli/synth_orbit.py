@@ -91,7 +91,7 @@ def synth_orbit(
             mesh,
             noise,
             progress=partial(progress, "rendering"),
-            say=partial(console.print, markup=False),
+            say=console.print,
             mesh_up=mesh_up,
             test_views=test_views,
             on_demand=on_demand,

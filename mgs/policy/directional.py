@@ -59,10 +59,8 @@ def dome_cameras(like: Camera, positions: Array, centre: Array) -> list[Camera]:
     `like` and the median distance of `positions` [V,3] from the centre, metres."""
     radius = float(np.median(np.linalg.norm(np.asarray(positions) - centre, axis=1)))
     settings = Orbit(kind="hemisphere", radius=radius, elevations=DOME_ELEVATIONS)
-    return [
-        Camera(like.K, like.width, like.height, look_at(eye, centre))
-        for eye in orbit_positions(settings, DOME, centre)
-    ]
+    poses = [look_at(eye, centre) for eye in orbit_positions(settings, DOME, centre)]
+    return [Camera(like.K, like.width, like.height, pose) for pose in poses]
 
 
 def basis(points: Array, views: Views, degree: int) -> NDArray[np.float64]:
@@ -81,9 +79,8 @@ def basis(points: Array, views: Views, degree: int) -> NDArray[np.float64]:
 
 def precision(degree: int, tau: float, lam: float) -> NDArray[np.float64]:
     """Diagonal of Lambda [K]: lam for degree 0, lam / tau^2 for higher degrees."""
-    return np.repeat(
-        [lam, *[lam / tau**2] * degree], [2 * order + 1 for order in range(degree + 1)]
-    )
+    orders = [2 * order + 1 for order in range(degree + 1)]
+    return np.repeat([lam, *[lam / tau**2] * degree], orders)
 
 
 def information(points: Array, views: Views, degree: int) -> NDArray[np.float64]:

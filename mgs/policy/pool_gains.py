@@ -115,9 +115,8 @@ class PoolGains:
         w = None if self.M is None else _times(self.S, _times(self.M, u))
         k = weights / (1 + weights * _dot(y, u))
         both = None if w is None else dr.square(k) * _dot(y, w)
-        self.S = [
-            entry - k * u[a] * u[b] for entry, (a, b) in zip(self.S, _upper(len(y)), strict=True)
-        ]
+        pairs = zip(self.S, _upper(len(y)), strict=True)
+        self.S = [entry - k * u[a] * u[b] for entry, (a, b) in pairs]
         u, w = _interleaved(u), None if w is None else _interleaved(w)
         dr.eval(self.S, u, w, k, both)
         self._update(u, w, k, both)
@@ -149,11 +148,8 @@ class PoolGains:
         K = (self.degree + 1) ** 2
         if K % 4:
             return [_at(vectors, self.of * K + b) for b in range(K)]
-        return [
-            v
-            for b in range(K // 4)
-            for v in dr.gather(mi.Vector4d, vectors, self.of * (K // 4) + b)
-        ]
+        fours = [dr.gather(mi.Vector4d, vectors, self.of * (K // 4) + b) for b in range(K // 4)]
+        return [v for four in fours for v in four]
 
 
 def _upper(K: int) -> list[tuple[int, int]]:
@@ -171,10 +167,9 @@ def _times(matrix: list[Any], vector: list[Any]) -> list[Any]:
 def _interleaved(vector: list[Any]) -> Any:
     n, K = len(vector[0]), len(vector)
     packed, first = dr.zeros(mi.Float64, n * K), dr.arange(mi.UInt32, n) * K
+    add, mode = dr.ReduceOp.Add, dr.ReduceMode.NoConflicts
     for b, values in enumerate(vector):
-        dr.scatter_reduce(
-            dr.ReduceOp.Add, packed, values, first + b, mode=dr.ReduceMode.NoConflicts
-        )
+        dr.scatter_reduce(add, packed, values, first + b, mode=mode)
     return packed
 
 

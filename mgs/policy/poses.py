@@ -39,10 +39,8 @@ def spread(candidates: Array, taken: Array, centre: Array) -> list[int]:
 
 def angles(ours: Array, theirs: Array, centre: Array) -> NDArray[np.float64]:
     """Angles [A,B] at `centre` between camera centres [A,3] and [B,3], radians."""
-    a, b = (
-        offset / np.linalg.norm(offset, axis=1, keepdims=True)
-        for offset in (ours - centre, theirs - centre)
-    )
+    offsets = ours - centre, theirs - centre
+    a, b = (offset / np.linalg.norm(offset, axis=1, keepdims=True) for offset in offsets)
     return np.asarray(np.arccos(np.clip(a @ b.T, -1, 1)))
 
 

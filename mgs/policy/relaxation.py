@@ -388,10 +388,8 @@ class Coverage:
             mean = np.maximum(-solved.ineqlin.marginals, 0)
             mean /= mean.sum()
             prices, x = mean @ slopes, solved.x[:-1]
-            yield (
-                value,
-                Bound(float(mean @ heights + prices @ _largest(prices, *box, size)), x, prices),
-            )
+            above = float(mean @ heights + prices @ _largest(prices, *box, size))
+            yield value, Bound(above, x, prices)
 
 
 Criterion = Relaxation | Coverage

@@ -58,9 +58,8 @@ class Visibility:
         self.planned, self.path = cache(self._planned), cache(self._path)
         self.states: dict[Model, PoolGains] = {}
         # A copy, because the kernel returns part of a larger array.
-        self.information = kept_within(
-            IMAGE_BYTES, lambda frame: np.array(exact(cameras[frame])), lambda F: F.nbytes
-        )
+        copied = lambda frame: np.array(exact(cameras[frame]))  # noqa: E731
+        self.information = kept_within(IMAGE_BYTES, copied, lambda F: F.nbytes)
 
     def gains(
         self,

@@ -188,11 +188,8 @@ def _compared(runs: Mapping[str, Run], frame: Frame) -> dict[str, Any]:
 
 def _plots(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     gain, covered = step_curves(runs, "information_gain"), step_curves(runs, "coverage", 100)
-    added = {
-        label: (x[1:], [b - a for a, b in pairwise(y)])
-        for label, (x, y) in covered.items()
-        if len(y) > 1
-    }
+    longer = {label: (x, y) for label, (x, y) in covered.items() if len(y) > 1}
+    added = {key: (x[1:], [b - a for a, b in pairwise(y)]) for key, (x, y) in longer.items()}
     title, axis = "Information gain of each chosen view", f"information gain ({GAIN_UNIT})"
     plots = [
         (f"{title} (the paper's Fig. 2)", gain, axis, True),

@@ -50,14 +50,12 @@ def summary_rows(runs: Mapping[str, Run]) -> list[tuple[str, list[str]]]:
     what no run has, then the size of the model and the time."""
     rows = [table_row(label, run) for label, run in runs.items()]
     seconds = [sum(sum(s.get("seconds", {}).values()) for s in run.steps) for run in runs.values()]
-    return [
-        *(
-            (table_heading(key, rows), [table_cell(key, row.get(key)) for row in rows])
-            for key in table_columns(rows)[1:]
-        ),
-        ("Gaussians", [f"{len(run.gaussians):,}" for run in runs.values()]),
-        ("time of all steps (s)", [f"{value:.1f}" for value in seconds]),
+    keys = table_columns(rows)[1:]
+    table = [
+        (table_heading(key, rows), [table_cell(key, row.get(key)) for row in rows]) for key in keys
     ]
+    table.append(("Gaussians", [f"{len(run.gaussians):,}" for run in runs.values()]))
+    return [*table, ("time of all steps (s)", [f"{value:.1f}" for value in seconds])]
 
 
 def measured(step: Mapping[str, Any]) -> dict[str, float]:
@@ -121,8 +119,5 @@ def links(run: Run, page: Path) -> list[tuple[str, str]]:
     prior = run.settings.prior
     files += [(prior / name, f"prior: {name}") for name in ("mesh.ply", "points.ply")]
     start = page.resolve().parent
-    return [
-        (quote(Path(os.path.relpath(file.resolve(), start)).as_posix()), name)
-        for file, name in files
-        if file.is_file()
-    ]
+    there = [(os.path.relpath(f.resolve(), start), name) for f, name in files if f.is_file()]
+    return [(quote(Path(path).as_posix()), name) for path, name in there]

@@ -186,9 +186,8 @@ class Run:
             intact = False
         if not intact:
             write_ply(path, model)
-            warnings.warn(
-                Notice(f"{path}: was damaged; restored from checkpoint.npz"), stacklevel=3
-            )
+            said = f"{path}: was damaged; restored from checkpoint.npz"
+            warnings.warn(Notice(said), stacklevel=3)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -268,12 +267,9 @@ def open_run(folder: str | PathLike[str]) -> Run:
 
 def start(out: Path, settings: NbvSettings, dataset: Dataset) -> None:
     """Write config.json, the first file of a run."""
-    config = {
-        "settings": settings.model_dump(mode="json"),
-        "versions": versions(),
-        "frames": [frame.name for frame in dataset.frames],
-    }
-    write_json(out / "config.json", config)
+    frames = [frame.name for frame in dataset.frames]
+    config = {"settings": settings.model_dump(mode="json"), "versions": versions()}
+    write_json(out / "config.json", config | {"frames": frames})
 
 
 def read_config(out: Path) -> dict[str, Any]:
@@ -297,18 +293,11 @@ def holds_run(out: Path) -> bool:
 
 def write_checkpoint(out: Path, state: Checkpoint) -> None:
     """Commit a step: the state in one file, renamed into place; then the readable lines."""
-    text = json.dumps(
-        {
-            "taken": state.taken,
-            "steps": state.steps,
-            "inputs": state.inputs,
-            "upright": True,
-            "antialiased": state.gaussians.antialiased,
-            "linear": state.gaussians.linear,
-        },
-        allow_nan=False,
-    )
-    arrays = {name: getattr(state.gaussians, name) for name in ARRAYS}
+    g, record = state.gaussians, {"taken": state.taken, "steps": state.steps}
+    record |= {"inputs": state.inputs, "upright": True}
+    record |= {"antialiased": g.antialiased, "linear": g.linear}
+    text = json.dumps(record, allow_nan=False)
+    arrays = {name: getattr(g, name) for name in ARRAYS}
     with atomic_path(out / CHECKPOINT) as temporary, open(temporary, "wb") as file:
         np.savez(file, H=state.H, surface=state.surface, json=np.array(text), **arrays)
     write_steps(out, state)

@@ -103,16 +103,8 @@ def nbv(
     `Mission`. `run_nbv` with the scene's dataset, prior and settings; the prior is copied into the
     run. Raises InputError as `start_run` and `resume_nbv`."""
     model = {name: getattr(scene.settings, name) for name in ModelSettings.model_fields}
-    return run_nbv(
-        scene.dataset,
-        out,
-        prior=scene.prior,
-        policy=policy,
-        on_step=on_step,
-        progress=progress,
-        **model,
-        **mission,
-    )
+    model |= {"prior": scene.prior, "policy": policy, "on_step": on_step, "progress": progress}
+    return run_nbv(scene.dataset, out, **model, **mission)
 
 
 def start_run(
@@ -276,9 +268,8 @@ def write_refined(folder: Path, given: Dataset, frames: Sequence[Frame]) -> None
     tests = given.test_views()
     if tests is not None:
         write_transforms(folder / TEST_FOLDER, [*map(elsewhere, tests.frames)], given.world)
-    write_json(
-        folder / POSES, {"dataset": str(given.root.resolve()), "moved": moves(given.frames, frames)}
-    )
+    moved = {"dataset": str(given.root.resolve()), "moved": moves(given.frames, frames)}
+    write_json(folder / POSES, moved)
     write_transforms(folder, [*map(elsewhere, frames)], given.world)
 
 
@@ -356,14 +347,9 @@ def resume_nbv(
     check_named(run, policy)
     live = live if live is None or isinstance(live, Live) else Live(live)
     scores = None if policy is None else policy_of(policy)
+    scene, retry = replace(scene_of(run, live), on_pass=on_pass), bool(live)
     state = recording.run(
-        run.folder,
-        run.settings,
-        replace(scene_of(run, live), on_pass=on_pass),
-        scores,
-        on_step=on_step,
-        progress=progress,
-        retry=bool(live),
+        run.folder, run.settings, scene, scores, on_step=on_step, progress=progress, retry=retry
     )
     dataset = None if run.dataset.on_demand else run.dataset  # captured poses are in its files
     return Run(run.folder, run.settings, dataset, run.prior, policy, state)

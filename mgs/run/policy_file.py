@@ -147,11 +147,8 @@ class Own:
     def __init__(self, name: str, function: Callable[..., Any], path: Path | None = None) -> None:
         self.name, self.full, self.function, self.path = label(name), name, function, path
         names = ["rng", *OF_ONE, *ARGUMENTS]
-        parameters = [
-            parameter.name
-            for parameter in inspect.signature(function).parameters.values()
-            if parameter.default is parameter.empty or parameter.name in names
-        ]
+        every = inspect.signature(function).parameters.values()
+        parameters = [p.name for p in every if p.default is p.empty or p.name in names]
         if unknown := next((one for one in parameters if one not in names), None):
             choice = f"choose from {', '.join(names)}"
             raise InputError(f"policy {name}: unknown parameter {unknown}; {choice}")

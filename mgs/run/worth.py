@@ -88,8 +88,6 @@ def enough_views(scene: Scene, state: State, policy: Policy, mission: Mission) -
         return len(greedy(criterion, mission.enough or ENOUGH))
     why = "no candidate adds anything; give the number"
     if not hasattr(policy, "relaxation"):
-        why = (
-            "has no bound by which a number of views could be enough; give the number, or use "
-            "directional-i, directional-d, d-optimal or coverage"
-        )
+        others = "directional-i, directional-d, d-optimal or coverage"
+        why = f"has no bound to tell how many views are enough; give the number, or use {others}"
     raise InputError(f"policy {policy.name}: {why}")

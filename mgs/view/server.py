@@ -269,9 +269,8 @@ class Viewer:
             colours = layers.gaussian_colours(subject, layer) / 255
         if client.splats is None:
             splats = layers.covariances(g), colours, g.opacities[:, None]
-            client.splats = client.handle.scene.add_gaussian_splats(
-                "/gaussians", g.means, *splats, visible=False
-            )
+            add = client.handle.scene.add_gaussian_splats
+            client.splats = add("/gaussians", g.means, *splats, visible=False)
         elif layer != client.layer:
             client.splats.rgbs = colours
         client.layer = layer
