@@ -14,7 +14,7 @@ import secrets
 import shutil
 import stat
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -175,19 +175,6 @@ def write_text(path: str | Path, text: str) -> None:
     Raises InputError as `atomic_path`."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(text.encode(errors="backslashreplace"))
-
-
-def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """Write records as CSV in UTF-8 and return the path; the file appears complete. Columns are all
-    keys in order of appearance. None and missing keys give empty cells. Raises InputError as
-    `atomic_path`."""
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    file = io.StringIO(newline="")
-    writer = csv.DictWriter(file, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(path, file.getvalue())
-    return Path(path)
 
 
 LARGEST = 1 << 25  # most bytes of a text file that is read whole: 30,000 frames of transforms.json

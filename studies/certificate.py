@@ -15,7 +15,6 @@ import numpy as np
 from scipy.stats import spearmanr
 
 import mgs
-from mgs.files import write_csv
 from mgs.learning import fit_views
 from mgs.policy import certificate, poses
 from mgs.policy.relaxation import Relaxation
@@ -30,6 +29,7 @@ from studies.frame.output import (
     over_scenes,
     scene_mean,
     table,
+    write_csv,
     write_table,
 )
 from studies.frame.program import WORKERS, Study, Work, study_of

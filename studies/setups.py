@@ -21,7 +21,6 @@ import numpy as np
 
 import mgs
 from mgs.evaluation import psnr_over
-from mgs.files import write_csv
 from mgs.learning import fit_views, surface_information, with_view
 from mgs.policy.poses import path_length
 from mgs.run import policy_file
@@ -37,6 +36,7 @@ from studies.frame.output import (
     over_scenes,
     table,
     with_interval,
+    write_csv,
     write_table,
 )
 from studies.frame.program import WORKERS, Options, Study, Work, study_of

@@ -16,7 +16,7 @@ import numpy as np
 
 import mgs
 from mgs.data.dataset import target_of
-from mgs.files import write_csv, write_json, write_text
+from mgs.files import write_json, write_text
 from mgs.fit.fitting import Fit, fit_gaussians
 from mgs.fit.settings import MEAN_RATE, PASSES, RATES
 from mgs.policy import criteria
@@ -30,7 +30,7 @@ from mgs.splat import groups
 from studies.faults import IMAGE_FAULTS, PRIOR_FAULTS, captured, pose_noise
 from studies.frame.case import Case, Rock, Size, judge
 from studies.frame.claim import Claim, Effects, Row, judged, paired, single, verdict_table
-from studies.frame.output import Panel, draw_panels
+from studies.frame.output import Panel, draw_panels, write_csv
 from studies.frame.program import WORKERS, Study, Work, names_of, study_of
 from studies.frame.sweep import Cell, result_of
 

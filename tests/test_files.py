@@ -21,6 +21,7 @@ from mgs.data.meshes import load_mesh
 from mgs.errors import InputError
 from mgs.files import TOKEN, atomic_folder, atomic_path, copy_file, locked, read_json, write_json
 from mgs.images import read_exr, read_mask, read_png, read_rgba, read_values, write_exr, write_png
+from studies.frame.output import write_csv
 
 
 def test_what_the_disk_says_is_one_line(tmp_path):
@@ -39,7 +40,7 @@ def test_what_the_disk_says_is_one_line(tmp_path):
 
 def test_records_with_other_keys_share_one_csv(tmp_path):
     records = [{"a": 1, "b": None}, {"c": "x, y", "a": 0.5}]
-    assert files.write_csv(tmp_path / "a.csv", records) == tmp_path / "a.csv"
+    assert write_csv(tmp_path / "a.csv", records) == tmp_path / "a.csv"
     assert (tmp_path / "a.csv").read_bytes() == b'a,b,c\n1,,\n0.5,,"x, y"\n'
 
 

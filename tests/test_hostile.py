@@ -32,6 +32,7 @@ from mgs.run.folder import open_run, text_of
 from mgs.run.records import Record, checked
 from mgs.splat_ply import write_ply
 from mgs.view.subject import read_subject
+from studies.frame.output import write_csv
 
 
 def bomb(path: Path, side: int) -> Path:
@@ -457,7 +458,7 @@ def test_a_device_is_not_replaced(tmp_path, make):
 
 
 def test_half_characters_of_names_are_written(tmp_path):
-    files.write_csv(tmp_path / "a.csv", [{"name": "a\udcff"}])
+    write_csv(tmp_path / "a.csv", [{"name": "a\udcff"}])
     assert (tmp_path / "a.csv").read_bytes() == b"name\na\\udcff\n"
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from mgs.cli.options import Settings, merged, not_none, parse_settings, with_keys
 from mgs.run.policies import POLICIES
 from mgs.run.policy_file import in_file
-from mgs.run.settings import NbvSettings, Positive, settings_in, validated
+from mgs.run.settings import Frozen, NbvSettings, Positive, settings_in, validated
 
 if TYPE_CHECKING:
     from mgs.cli.terminal import Terminal
@@ -23,10 +23,8 @@ if TYPE_CHECKING:
 NAMES = f"Names (docs/nbv.md): {', '.join(POLICIES)}."
 
 
-class Capture(BaseModel):
+class Capture(Frozen):
     """Settings of live capture, given again when a run is resumed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     timeout: Positive = 600.0
     """Longest wait for a picture, seconds."""

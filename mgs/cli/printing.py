@@ -19,12 +19,8 @@ GROUPS = {"test": "test", "all": "all", "held_out": "held out"}  # in headings o
 SHOWN = {
     True: ("test.psnr", "test.ssim", "test.psnr_mask", "held_out.psnr", "held_out.psnr_mask"),
     False: (
-        "all.psnr",
-        "all.ssim",
-        "held_out.psnr",
-        "held_out.ssim",
-        "held_out.psnr_mask",
-        "held_out.ssim_mask",
+        *("all.psnr", "all.ssim", "held_out.psnr", "held_out.ssim"),
+        *("held_out.psnr_mask", "held_out.ssim_mask"),
     ),
 }
 """Columns of `print_quality` with and without test views: as many as fit into 80 characters."""

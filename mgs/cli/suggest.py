@@ -6,7 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 from rich.table import Table
 
 from mgs import runtime
@@ -16,7 +16,7 @@ from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
 from mgs.progress import listening
-from mgs.run.settings import FlightLimits, Positive, SearchLimits, validated
+from mgs.run.settings import FlightLimits, Frozen, Positive, SearchLimits, validated
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,10 +34,8 @@ PASSES = 2  # passes of the fit to photographs alone: enough to choose a view by
 FILES = ("suggestions.json", "suggestions.png", "transforms.json")  # names in the folder --out
 
 
-class Candidates(BaseModel):
+class Candidates(Frozen):
     """Settings of candidates, and limits of the flight."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     ring: Annotated[int, Field(ge=1)] | None = None
     """Candidates: this many poses on a ring."""

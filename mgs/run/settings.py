@@ -26,10 +26,14 @@ from mgs.run.policy_file import check_policy
 ENOUGH = 0.95  # share of the gain that is enough by default (docs/certificate.md)
 
 
-class FlightLimits(BaseModel):
-    """Limits of a flight, which starts and ends at the first view taken, and of its poses."""
+class Frozen(BaseModel):
+    """Settings whose docstrings are their help."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class FlightLimits(Frozen):
+    """Limits of a flight, which starts and ends at the first view taken, and of its poses."""
 
     length: Scale | None = None
     """Longest flight in metres, from the first image and back to it. Default: no limit."""
@@ -45,10 +49,8 @@ class FlightLimits(BaseModel):
     """Lowest height of a pose above the object's lowest point, metres."""
 
 
-class SearchLimits(BaseModel):
+class SearchLimits(Frozen):
     """Limits of the search for a better set than the plan, which proves how good the plan is."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     nodes: Annotated[int, Field(ge=0)] | None = None
     """Most nodes of branch and bound. Default: 40, or about a second of them."""
@@ -56,10 +58,8 @@ class SearchLimits(BaseModel):
     """Most seconds; results then depend on the machine. Default: no limit."""
 
 
-class Mission(BaseModel):
+class Mission(Frozen):
     """Limits of a run: how many views it takes, where the camera may go, and when it ends."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     seeds: Annotated[int, Field(ge=1)] = 4
     """Number of seed views for the first fit, spread evenly over the directions of the poses."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mgs.files import write_csv, write_json, write_text
+from mgs.files import write_json, write_text
 from mgs.plotting import NO_GRID, STYLE, drawing
 from mgs.provenance import versions
 from mgs.reports.figures import POLICY_STYLE, STYLES
@@ -29,6 +30,18 @@ if TYPE_CHECKING:
 
 Content = str | Callable[[Row], str]
 """Content of a column: a format such as "psnr:.2f" (key and format), or a function of the row."""
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
+    """Write records as CSV and return the path. Columns are all keys in order of appearance. None
+    and missing keys give empty cells."""
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    file = io.StringIO(newline="")
+    writer = csv.DictWriter(file, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, file.getvalue())
+    return path
 
 
 def table(columns: Mapping[str, Content], rows: Iterable[Row]) -> str:
