@@ -154,13 +154,11 @@ def read_values(path: str | Path) -> np.ndarray:
 
 
 def read_depth(path: str | Path, unit: float = 1e-3, float_unit: float = 1.0) -> np.ndarray:
-    """Depth in metres, float32 [H,W], from EXR, or an image in steps of `unit` metres; of a TIFF of
-    floating-point numbers in steps of `float_unit`. Negative numbers, those beyond
-    NO_RETURN and UNKNOWN_DEPTH become 0.
+    """Depth in metres, float32 [H,W], from EXR, or an image in steps of `unit` metres, of a TIFF of
+    floats `float_unit`. Negative numbers, those beyond NO_RETURN and UNKNOWN_DEPTH become 0.
 
     Raises InputError as `read_exr` and `read_values`, for 8 bits, if most numbers are negative, and
-    where it is not plain which channel of an EXR is the depth: it is named Z or depth, in a layer
-    or not, is the only one, or all of R, G and B are equal."""
+    where no channel of an EXR is the depth: named Z or depth, the only one, or R, G and B alike."""
     path = Path(path)
     if path.suffix.lower() == ".exr":
         depth = _depth_channel(path)

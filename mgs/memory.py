@@ -94,10 +94,8 @@ def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:
     """Copy an array into contiguous memory that begins at a multiple of ALIGNMENT and extends
     beyond its end.
 
-    Every array that Dr.Jit takes over from NumPy must be one. Dr.Jit 1.5 does not copy it, and its
-    kernels read a few numbers beyond the end, where the process would crash if the memory ends
-    there. The alignment decides which kernel is compiled: without a fixed one, a call with a
-    hundred arrays would be compiled again nearly every time."""
+    Every array that Dr.Jit takes over from NumPy must be one: it is not copied, and kernels read a
+    few numbers beyond the end. The alignment decides which kernel is compiled."""
     values = np.asarray(values)
     memory = np.empty(values.size + PADDING + ALIGNMENT, dtype)
     first = -memory.ctypes.data % ALIGNMENT // memory.itemsize

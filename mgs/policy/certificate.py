@@ -174,11 +174,10 @@ def _fixed(
 class Certificate:
     """Worth of a plan of k of C candidates by a criterion; it says nothing about PSNR.
 
-    criterion: name of the policy. views, candidates: k and C.
-    share, best: gain of the plan, and of the best set that the search met, over the bound of any k.
-    fewer: bound of any k - 1 over the plan's gain; None for one view. of_all: gain of the plan over
-    that of all candidates. nodes, stopped: of the search (`Best`). prices: of the bound of any k
-    [C] (`Bound`), over its value. curve: see `curve`."""
+    criterion: name of the policy. views, candidates: k and C. share, best: gain of the plan, and of
+    the best set met, over the bound of any k. fewer: bound of any k - 1 over the plan's gain, or
+    None. of_all: gain over that of all candidates. nodes, stopped: of the search (`Best`). prices:
+    of the bound [C], over its value."""
 
     criterion: str
     views: int

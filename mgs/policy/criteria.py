@@ -31,12 +31,11 @@ def regularisation(
     pixel_noise: float = PIXEL_NOISE,
     prior_std: Mapping[str, float] = PRIOR_STD,
 ) -> NDArray[np.float64]:
-    """lam [P] = (sigma_e / tau)^2, the prior's information about each parameter, in the units of H.
+    """lam [P] = (sigma_e / tau)^2, the prior's information about each parameter, in the units of H,
+    (pixel value / parameter)^2.
 
-    J^T J has units (pixel value / parameter)^2, so each kind of parameter needs its own lam. With a
-    prior theta ~ N(theta_0, tau^2) the posterior precision is H / sigma_e^2 + 1 / tau^2
-    = (H + lam) / sigma_e^2. So with this lam, Eq. 7 is 2/l times the mutual information of the
-    parameters and the new image, in nats (diagonal, linearised).
+    With a prior theta ~ N(theta_0, tau^2) the posterior precision is (H + lam) / sigma_e^2, so Eq.
+    7 is 2/l times the mutual information of the parameters and the new image, nats.
 
     groups: columns of each kind of parameter (`mgs.splat.groups`). prior_std: tau of each kind;
     that of colour is for degree 0. Higher degrees have DIRECTIONAL_STD."""

@@ -70,11 +70,9 @@ def path_length(positions: Array) -> float:
 def seed_views(positions: Array, centre: Array, count: int) -> list[int]:
     """`count` distinct frames spread over the directions of a pool, in the order of their azimuths.
 
-    k-medoids: from the frames nearest to evenly spaced azimuths (0, 360/count, ...), which are best
-    on an even ring, one frame at a time is exchanged as long as that lowers the sum over the pool
-    of the squared angle to the nearest of them.
-
-    positions: camera centres [C,3]; centre: the rock [3]; metres. Needs count <= C."""
+    k-medoids: from the frames nearest to even azimuths, one frame at a time is exchanged as long as
+    that lowers the sum over the pool of the squared angle to the nearest. positions: camera centres
+    [C,3]; centre: the rock [3]; metres. Needs count <= C."""
     azimuth, squared = azimuths(positions, centre), angles(positions, positions, centre) ** 2
     seeds = list[int]()
     for target in 2 * np.pi * np.arange(count) / count:

@@ -96,11 +96,10 @@ def new_album(frames: Sequence[Frame], count: int) -> Album:
 
 
 def draw_taken(album: Album, label: str, run: Run, tick: Callable[[], None]) -> None:
-    """Draw the views that a run has taken, in their order.
-
-    Adds `truth/NAME`, `render/NAME/LABEL`, `error/NAME/LABEL`, and `before/NAME/LABEL` and
-    `after/NAME/LABEL`: the uncertainty of the model seen from there before and after the view was
-    taken. tick: called after each view. Raises InputError if a file of a frame cannot be read."""
+    """Draw the views that a run has taken, in order: `truth/NAME`, `render/NAME/LABEL`,
+    `error/NAME/LABEL`, and the uncertainty of the model before and after, `before/...`,
+    `after/...`. tick: called after each view. Raises InputError if a file of a frame cannot be
+    read."""
     from mgs.splat import fisher, groups
 
     gaussians = run.gaussians

@@ -28,11 +28,9 @@ LARGEST_LOSS = 10.0  # of `refit_run`, dB: with that next to nothing is learned 
 
 @dataclass(frozen=True)
 class PrunedRun:
-    """Result of `prune_run`.
-
-    before, after: number of Gaussians. predicted, actual: rms change of the training images
-    (`mgs.fit.pruning.Pruned`). views: "test" or "held-out". psnr: on these, before and after, dB;
-    None if there are none."""
+    """Numbers of Gaussians before and after, rms change of the training images, predicted and
+    actual, and PSNR before and after on `views`, "test" or "held-out", dB; None if there are
+    none."""
 
     before: int
     after: int
@@ -66,11 +64,9 @@ def prune_run(
 
 @dataclass(frozen=True)
 class RefittedRun:
-    """Result of `refit_run`.
-
-    before: number of learned parameters of the run. lean: the refitted model. views: "test" or
-    "held-out". psnr: on these, dB, of the run's own model, of one that was refitted with all
-    parameters, and of the refitted one; None if there are none."""
+    """Learned parameters of the run, the refitted model, and PSNR on `views`, "test" or "held-out",
+    dB: of the run's own model, of one refitted with all parameters, and of the refitted one, or
+    None."""
 
     before: int
     lean: LeanModel
@@ -88,11 +84,10 @@ def refit_run(
     """Fit the views of a run once more (`mgs.fit.evidence.lean_fit`), and write RUN/REFITTED.
 
     A vertex of the file has a byte for each kind of parameter, `learned_colour` and so on: 1 if it
-    was learned; otherwise the file holds the prior's value. The models are compared on the test
-    views of the dataset, or without them on the held-out views. say(stage): called as a stage
-    starts. Raises InputError as `open_run` and `lean_fit`, for an unknown learn or sh or if both
-    leave nothing to choose, for a loss that is not from 0 to LARGEST_LOSS, for a run whose density
-    is not fixed, and if the prior or the images are not those of the run."""
+    was learned; else the file holds the prior's value. The models are compared on the test views,
+    or without them on the held-out views. say(stage): called as a stage starts. Raises InputError
+    as `open_run` and `lean_fit`, for wrong arguments, for a run whose density is not fixed, and if
+    the prior or the images are not those of the run."""
     from mgs.fit.evidence import lean_fit
     from mgs.learning import images_of
     from mgs.scene import Scene

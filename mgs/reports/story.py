@@ -36,11 +36,9 @@ def models(run: Run, scene: Scene) -> Iterator[State]:
 
 def story_frames(run: Run, progress: Progress) -> Film:
     """Frames of the story, one for each view taken: the cameras from above, the render of one view,
-    and the share of the variance that is left in it.
-
-    The view shown is the brightest of those that the first image leaves more unknown than most,
-    among the test views, or else the views never taken, or else all. Raises InputError as `models`,
-    and if an image cannot be read."""
+    and the share of the variance that is left in it. The view is the brightest of those that the
+    first image leaves more unknown than most, among test views, views never taken, or all. Raises
+    InputError as `models`, and if an image cannot be read."""
     scene, view = scene_of(run), None
     with listening(progress):
         for model in models(run, scene):

@@ -33,17 +33,10 @@ HEADERS |= {"coverage": "coverage (%)", "path": "path ({unit})", "ended": "ended
 def comparison_rows(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     """Numbers of each run, a row each. runs: by label (`mgs.reports.runs.compare_runs`).
 
-    - policy: the label; images: number of training images; coverage: Gaussians observed,
-      per cent.
-    - path: length of the straight lines from view to view, first seed first; unit: of that length,
-      metres where it is "m".
-    - test.NAME (if the dataset has test views), all.NAME, held_out.NAME: means in metrics.json,
-      PSNR in dB; None if there is no view to average.
-    - exposure: True, only for a run that estimated the exposure of images.
-    - ended: the reason (`mgs.run.ending.RunEnd`), only for a run that ended before its budget was
-      spent.
-
-    Raises InputError if a run was not evaluated since its last step."""
+    policy: the label; images: number of training images; coverage: per cent. path: length of the
+    lines from view to view, in `unit`. test.NAME, all.NAME, held_out.NAME: means in metrics.json,
+    PSNR in dB. exposure: True, if the run estimated it. ended: the reason, only if before the
+    budget was spent. Raises InputError if a run was not evaluated since its last step."""
     for run in runs.values():
         check_measured(run)
     return [table_row(label, run) for label, run in runs.items()]

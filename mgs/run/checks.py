@@ -134,10 +134,8 @@ class Checks:
 def predicted_psnr(entries: Sequence[Mapping[str, float]]) -> float | None:
     """Mean PSNR of the views not taken, dB; None without a new view, or if all are taken.
 
-    The image of a new view is a test of the model before it. Its error is above the mean error of
-    the images which that model was fitted to. This excess is about proportional to the view's
-    directional gain (D of `mgs.policy.directional`), so the last views give the factor for the
-    views not taken.
+    The image of a new view tests the model before it. How far its error exceeds that of the images
+    fitted to is about proportional to its directional gain, and the last views give the factor.
 
     entries: of every fit so far. "fitted": mean squared error of the views fitted to; "left": mean
     gain of the views not taken; after the first fit also "new", the error of the new view under the

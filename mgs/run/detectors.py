@@ -40,10 +40,9 @@ class Before:
 class ViewIndicators:
     """A captured image compared with the Gaussians before training, and with the fitted model.
 
-    unexplained: mean squared error in the mask over the variance of the image there: 0 is a perfect
-    fit, 1 a single colour. error: root of that mean squared error, linear RGB. srgb_error: mean
-    squared error of sRGB values in the mask. ratios: quantiles (RATIO_QUANTILES) of the log ratio
-    of the image's brightness to the render's, over the mask. pixels: number compared, or 1."""
+    unexplained: mean squared error in the mask over the variance of the image there, 0 to 1. error:
+    its root, linear RGB. srgb_error: mean squared error of sRGB there. ratios: quantiles
+    (RATIO_QUANTILES) of the log ratio of image to render. pixels: number compared, or 1."""
 
     before: Before
     unexplained: float

@@ -22,9 +22,8 @@ class Directional:
     """Directional optimality: information about colour in all directions, D or I.
 
     degree: of the spherical harmonics. tau: share of the prior's standard deviation that degrees
-    above 0 have. over_dome: I-optimality over a dome of poses; else D-optimality, nats.
-    tour: the same three numbers for the plan of a flight. The defaults were chosen on rocks that
-    judge nothing."""
+    above 0 have. over_dome: I-optimality over a dome of poses; else D-optimality, nats. tour: the
+    same for the plan of a flight. Chosen on rocks that judge nothing."""
 
     degree: int = 2
     tau: float = 0.2

@@ -54,10 +54,9 @@ def run_end(
 ) -> dict[str, Any] | None:
     """`ended` of steps.jsonl where the run ends here: the `reason` and its numbers; else None.
 
-    views: chosen so far. uncertainty: mean variance that is left, over that of the prior.
-    refused: `name` and `information_gain` of the next view, where it is known. metres: length of
-    the flight, where no pose is left in its reach. predicted: `mgs.run.checks.predicted_psnr`, dB.
-    given_up: number of poses of which no picture could be taken."""
+    views: chosen so far. uncertainty: mean variance left, over that of the prior. refused: name and
+    gain of the next view, if known. metres: of the flight, where no pose is in reach. predicted:
+    PSNR of the views not taken, dB. given_up: number of poses without a picture."""
     if views >= settings.budget:
         return {"reason": str(RunEnd.BUDGET), "views": views}
     if settings.stop_uncertainty is not None and uncertainty <= settings.stop_uncertainty:

@@ -65,12 +65,12 @@ POSES = "poses.json"  # in the dataset of a run that refined poses: how far each
 
 
 class Run:
-    """A run folder: its settings, and what its files hold, each read once at first use.
+    """A run folder: its settings, and what its files hold, each read once at first use. Can be
+    given wherever a folder is wanted.
 
-    settings: from the folder's config.json. policy: as it was given in this process, if it was. A
-    Run can be given wherever a folder is wanted. Properties raise InputError if a file is missing
-    or damaged; `steps` and `state` also if no step is finished yet; `dataset` also if its frames
-    changed."""
+    settings: from config.json. policy: as it was given in this process. Properties raise InputError
+    if a file is missing or damaged; `steps` and `state` if no step is finished; `dataset` if its
+    frames changed."""
 
     def __init__(
         self,

@@ -43,12 +43,10 @@ MOST_BLUR = 0.6  # largest blur, 0 to 1, by Crete et al. (2007). Sharp pictures 
 
 @dataclass(frozen=True)
 class Live:
-    """Settings of live capture.
-
-    deliver: a transport (`mgs.run.transports`), or your own function(pose file, picture file).
-    folder: where the two files are; by default RUN/dataset/flight. tries: for each pose. failure:
-    after these, skip (take the next best pose in its place) or stop. distance: largest from the
-    pose asked for, in units of the world; by default REACH."""
+    """Settings of live capture. deliver: a transport (`mgs.run.transports`), or your own
+    function(pose file, picture file). folder: of both, by default RUN/dataset/flight. tries: for
+    each pose. failure: then skip (take the next best pose) or stop. distance: largest from the pose
+    asked for, by default REACH."""
 
     deliver: Transport
     folder: Path | None = None
@@ -77,11 +75,9 @@ def begin(folder: Path, poses: Dataset, prior: Prior) -> None:
 
 
 def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[[Frame], Frame]:
-    """Return capture(frame) -> the frame as it was captured.
-
-    A frame that was captured or given up before is returned at once. Refused pictures are asked for
-    again, `live.tries` times in all; each is one line. Raises InputError where the run then stops,
-    and where a picture is needed without `live`."""
+    """Return capture(frame) -> the frame as it was captured; at once if it was captured or given up
+    before. Refused pictures are asked for again, `live.tries` times in all. Raises InputError where
+    the run then stops, and where a picture is needed without `live`."""
     silhouette = cache(lambda: silhouette_of(prior.mesh))
     centre = prior.points.mean(axis=0)
     token = token_of(dataset) if live and live.folder else ""
@@ -137,8 +133,8 @@ def ask(
     folder: Path, frame: Frame, dataset: Dataset, attempt: int, token: str = ""
 ) -> tuple[Path, Path]:
     """Write the pose file of a frame; return its path, and that of the picture to come. Both names
-    end with the token of the run, where its folder may be that of several. Raises InputError where
-    an answer lies there already though this pose was never asked for."""
+    end with the token, if any. Raises InputError where an answer lies there already though this
+    pose was never asked for."""
     heading, pitch = heading_and_pitch(frame.camera)
     camera = dataset.world.leave(frame.camera)
     name = f"{frame.name}-{token}" if token else frame.name

@@ -97,11 +97,9 @@ def FisherRF() -> Information:
 
 @dataclass(frozen=True)
 class Paper:
-    """Eq. 7 as the paper has it: squared gradients of one scalar loss per image, one lambda.
-
-    The paper states neither. The loss is that of the estimator `loss-gradient`. Lambda is the mean
-    squared gradient of one view taken: the gain of the first choice is then near the paper's 0.091
-    (its Fig. 2; docs/nbv.md)."""
+    """Eq. 7 as the paper has it: squared gradients of one scalar loss per image (`loss-gradient`),
+    and one lambda: the mean squared gradient of one view taken. The paper states neither; the gain
+    of the first choice is then near its 0.091 (Fig. 2; docs/nbv.md)."""
 
     name: ClassVar[str] = "paper"
     needs_fit: ClassVar[bool] = True
@@ -141,9 +139,9 @@ class Cover:
     """COVER ("Coverage Optimization for Camera View Selection", 2026): new viewing directions.
 
     For each Gaussian (1 - cos)/2 of the angle between the candidate's direction and the nearest one
-    from which it was observed, or 1 if it never was; then the mean over the candidate's view,
-    weighted by squared blending weights. In [0, 1]. The paper counts all Gaussians in the frustum,
-    hidden or not, and rounds directions to bins."""
+    from which it was observed, or 1; then the mean over the candidate's view, weighted by squared
+    blending weights. The paper counts all Gaussians in the frustum, and rounds directions to
+    bins."""
 
     name: ClassVar[str] = "cover"
     needs_fit: ClassVar[bool] = False

@@ -104,12 +104,12 @@ def suggest(
 ) -> Suggestion:
     """Rank poses by what a picture from each would add to the model of a run, and plan `views`.
 
-    views: "auto" for the fewest that have the share `enough` of the gain of all candidates. With a
-    limit of the flight it is the most, and the plan is that of `plan_flight`. The
-    flight starts and ends at the first image taken. safe_distance, elevations: as `refusals`.
-    refine: move planned poses by `refined`; scores and certificate are those of the candidates.
-    settings: fields of `NbvSettings` in place of the run's. Raises InputError if no
-    pose can be flown, fewer can than `views`, a setting is invalid, or the policy fails."""
+    views: "auto" for the fewest that have the share `enough` of the gain of all candidates; with a
+    limit of the flight the most. The flight starts and ends at the first image taken.
+    safe_distance, elevations: as `refusals`. refine: move planned poses by `refined`; scores and
+    certificate are those of the candidates. settings: fields of `NbvSettings` in place of the
+    run's. Raises InputError if fewer poses can be flown than `views`, a setting is invalid, or the
+    policy fails."""
     policy, own = settings.pop("policy", None) or run.policy, run.settings.policy
     if policy is None and (in_file(own) or is_function(own)):
         raise InputError(f"{run.folder}: its policy is a program, {own}; name it with `policy`")

@@ -53,9 +53,8 @@ def kernel_image(
     """Draw a layer from a camera: sRGB uint8 [H,W,3], z-depth float32 [H,W], and (low, high) of the
     colour scale.
 
-    The camera and the depth have the lengths that are shown; a colour scale of depth has those of
-    the world (`Subject.scale`). Behind the model it is black, and FAR away. Layers other than
-    colour and alpha are drawn where the opacity is at least VISIBLE."""
+    Camera and depth have the lengths that are shown, the scale of depth those of the world. Behind
+    the model it is black, and FAR away. Scalars are drawn where the opacity is at least VISIBLE."""
     scalars = {layer: subject.scalars[layer]} if layer in subject.scalars else {}
     maps = view_maps(subject.model, camera, scalars)
     opaque = maps["A"] >= VISIBLE
