@@ -13,11 +13,10 @@ from program import steps
 
 from mgs.colour import SH_C0
 from mgs.learning import learn
-from mgs.policy import criteria, directional, plans, pool_gains
+from mgs.policy import criteria, directional, pool_gains, visibility
 from mgs.policy.directional import Views, gains
-from mgs.policy.plans import planned_path, planned_views
 from mgs.policy.pool_gains import PoolGains
-from mgs.policy.visibility import Visibility
+from mgs.policy.visibility import Visibility, planned_path, planned_views
 from mgs.run import flight
 from mgs.run import folder as run_folder
 from mgs.run.choosing import choose
@@ -277,7 +276,7 @@ def test_a_path_gains_as_much_as_any_within_reach(monkeypatch, taken):
     best = max(gain(taken, path) for path in paths)
     assert 0.99 < gain(taken, planned_path(held, reach, 4)) / best < 1.0001
     assert held.taken == taken
-    monkeypatch.setattr(plans, "WIDTH", 1)
+    monkeypatch.setattr(visibility, "WIDTH", 1)
     assert gain(taken, planned_path(held, reach, 4)) / best < 0.98
 
 
