@@ -76,7 +76,7 @@ def evaluate(
                 rows.append(metrics_row(name, metrics))
                 lines.append(f"wrote {path.with_suffix('.metrics.json')}")
     print_quality(Terminal(), rows)
-    _print(lines)
+    echo("\n".join(lines))
 
 
 def diagnose(runs: list[Path], views: str | None = None, force: bool = False) -> None:
@@ -148,7 +148,7 @@ def simplify(
                 lines = _pruned(prune_run(run, say=bar, **of_prune), noise or PRUNE_NOISE)
             else:
                 lines = _refitted(refit_run(run, say=bar, **of_refit))
-        _print([*lines, f"wrote {run / name}"])
+        echo("\n".join([*lines, f"wrote {run / name}"]))
 
 
 def _pruned(result: PrunedRun, noise: float) -> list[str]:
@@ -187,8 +187,3 @@ def _refitted(result: RefittedRun) -> list[str]:
         f"fitted in the same way; of the run's own model {own:.2f} dB"
     )
     return lines
-
-
-def _print(lines: list[str]) -> None:
-    for line in lines:
-        Terminal().print(line, soft_wrap=True)

@@ -60,13 +60,6 @@ def _check_lines(run: Run) -> None:
         raise InputError(f"{path}: is missing or damaged; write it anew with {resume}")
 
 
-def check_finished(run: Run) -> None:
-    if run.ended is None:
-        few = f"is unfinished, with {len(run.indices)} of {run.planned} views"
-        cure = f"go on with `mgs nbv --resume {run.folder}`, then report"
-        raise InputError(f"{run.folder}: {few}; {cure}")
-
-
 def check_measured(run: Run) -> None:
     """Raises InputError if a run was not evaluated since its last step."""
     if run.measured is None:

@@ -14,13 +14,7 @@ from mgs.evaluation import render_view
 from mgs.files import write_json, write_text
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.reports import figures
-from mgs.reports.runs import (
-    check_finished,
-    check_measured,
-    compare_runs,
-    least_trained,
-    step_curves,
-)
+from mgs.reports.runs import check_measured, compare_runs, least_trained, step_curves
 from mgs.reports.tables import comparison_rows, markdown_table, table_cell
 from mgs.run.folder import Run
 
@@ -53,7 +47,10 @@ def report(
     unfinished or was not evaluated since its last step. Then nothing is written."""
     by_label = compare_runs([runs] if isinstance(runs, str | PathLike) else runs)
     for run in by_label.values():
-        check_finished(run)
+        if run.ended is None:
+            few = f"is unfinished, with {len(run.indices)} of {run.planned} views"
+            cure = f"go on with `mgs nbv --resume {run.folder}`, then report"
+            raise InputError(f"{run.folder}: {few}; {cure}")
         check_measured(run)
     out, (frame, views) = Path(out), shown_view(list(by_label.values()))
     choices = any(run.settings.budget for run in by_label.values())

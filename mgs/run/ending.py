@@ -57,21 +57,21 @@ def run_end(
     views: chosen so far. uncertainty: mean variance left, over that of the prior. refused: name and
     gain of the next view, if known. metres: of the flight, where no pose is in reach. predicted:
     PSNR of the views not taken, dB. given_up: number of poses without a picture."""
+
+    def end(reason: RunEnd, **numbers: Any) -> dict[str, Any]:
+        return {"reason": str(reason), "views": views, **numbers}
+
     if views >= settings.budget:
-        return {"reason": str(RunEnd.BUDGET), "views": views}
-    if settings.stop_uncertainty is not None and uncertainty <= settings.stop_uncertainty:
-        numbers = {"uncertainty": uncertainty, "limit": settings.stop_uncertainty}
-        return {"reason": str(RunEnd.UNCERTAINTY), "views": views, **numbers}
-    limit = settings.stop_psnr
-    if limit is not None and predicted is not None and predicted >= limit:
-        return {"reason": str(RunEnd.PSNR), "views": views, "psnr": predicted, "limit": limit}
+        return end(RunEnd.BUDGET)
+    if (limit := settings.stop_uncertainty) is not None and uncertainty <= limit:
+        return end(RunEnd.UNCERTAINTY, uncertainty=uncertainty, limit=limit)
+    if (limit := settings.stop_psnr) is not None and predicted is not None and predicted >= limit:
+        return end(RunEnd.PSNR, psnr=predicted, limit=limit)
     if metres is not None:
-        failures = {"given_up": given_up} if given_up else {}
-        return {"reason": str(RunEnd.FLIGHT), "views": views, "metres": metres, **failures}
+        return end(RunEnd.FLIGHT, metres=metres, **({"given_up": given_up} if given_up else {}))
     gain = refused.get("information_gain", math.inf) if refused else math.inf
-    if refused and settings.stop_gain is not None and gain < settings.stop_gain:
-        view = {"name": refused["name"], "information_gain": gain}
-        return {"reason": str(RunEnd.GAIN), "views": views, **view, "limit": settings.stop_gain}
+    if refused and (limit := settings.stop_gain) is not None and gain < limit:
+        return end(RunEnd.GAIN, name=refused["name"], information_gain=gain, limit=limit)
     return None
 
 
