@@ -207,8 +207,8 @@ def _measured(
     (truth, weight), mask = frame.target(), frame.mask()
     true_depth = frame.depth() if frame.depth_path else None
     shares = frame.rock_path is not None
-    metrics, known = compare(truth, rgb, mask, weight), {"true_depth": true_depth}
-    metrics |= compare_surface(truth, alpha, depth, mask, weight, fractional=shares, **known)
+    metrics, surface = compare(truth, rgb, mask, weight), (truth, alpha, depth, mask, weight)
+    metrics |= compare_surface(*surface, fractional=shares, true_depth=true_depth)
     if folder is not None:
         write_comparison(folder / f"{frame.name}.png", truth[..., :3], rgb, metrics["psnr"])
     return metrics

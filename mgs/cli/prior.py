@@ -155,11 +155,11 @@ def prior(
             finite = {key: value for key, value in checks.items() if not math.isnan(value)}
             result = replace(result, numbers=result.numbers | finite)
         progress("figure")
-        built = result
+        original = result
         if up == "auto" and "plane_normal" in result.numbers:
             result = result.with_up(result.numbers["plane_normal"])
         save_prior(unfinished, result)
-        draw_prior(unfinished / "prior.png", built, segmented)
+        draw_prior(unfinished / "prior.png", original, segmented)
     console.print(_table(result.numbers))
     agreement = result.numbers.get("colour_agreement", 1.0)
     if agreement < AGREEMENT:

@@ -90,10 +90,10 @@ def _read_csv(path: Path, site: Site) -> list[Named]:
     (_, first), *lines = read_csv(path) or [(0, [])]
     columns = [name.strip().lower() for name in first]
     unknown = [name for name in columns if name not in COLUMNS]
-    known = ", ".join(COLUMNS)
     if unknown or not columns:
         what = f"has the column {unknown[0]!r}" if unknown else "is empty"
-        raise InputError(f"{path}: {what}; its first line must name columns of {known}")
+        first = f"its first line must name columns of {', '.join(COLUMNS)}"
+        raise InputError(f"{path}: {what}; {first}")
     for group in (POSITION, TARGET, QUATERNION):
         lacking = [name for name in group if name not in columns]
         if lacking and (group == POSITION or len(lacking) < len(group)):
@@ -199,7 +199,7 @@ def inside(mesh: Mesh, points: np.ndarray) -> NDArray[np.bool_]:
     """Whether points [M,3] are inside a mesh, bool [M]: its winding number is above 1/2. The
     winding number sums the signed solid angles of the faces over 4 pi (Van Oosterom and Strackee
     1983), so a mesh with holes has an inside too."""
-    found = np.zeros(len(points), bool)
+    within = np.zeros(len(points), bool)
     corners = mesh.vertices[mesh.faces]
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     for k in np.flatnonzero(((points > low) & (points < high)).all(axis=1)):
@@ -208,8 +208,8 @@ def inside(mesh: Mesh, points: np.ndarray) -> NDArray[np.bool_]:
         volume = np.einsum("fk,fk->f", a, np.cross(b, c))
         ab, bc, ca = (np.einsum("fk,fk->f", p, q) for p, q in ((a, b), (b, c), (c, a)))
         angle = np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
-        found[k] = angle.sum() / (2 * np.pi) > 0.5
-    return found
+        within[k] = angle.sum() / (2 * np.pi) > 0.5
+    return within
 
 
 def refusals(
@@ -249,9 +249,9 @@ def _are_taken(
 ) -> NDArray[np.bool_]:
     eyes = np.stack([camera.position for camera in taken])
     ahead = np.stack([camera.world_to_camera[2, :3] for camera in taken])
-    found = np.zeros(len(poses), bool)
+    hits = np.zeros(len(poses), bool)
     for k, (_, camera) in enumerate(poses):
         close = np.linalg.norm(eyes - camera.position, axis=1) <= SAME_PLACE * far[k]
         turned = ahead @ camera.world_to_camera[2, :3] >= np.cos(np.radians(SAME_VIEW))
-        found[k] = (close & turned).any()
-    return found
+        hits[k] = (close & turned).any()
+    return hits

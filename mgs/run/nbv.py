@@ -233,8 +233,8 @@ def start_fit(
     more, unless their number is given. Arguments and errors as `start_run`."""
     root, train = Path(dataset), dict(settings.pop("train", {}))
     data, folder = load_dataset(root), Path(prior) if prior is not None else root / "prior"
-    built = gaussians is None and (prior is not None or (folder / "prior.json").is_file())
-    kind = load_prior(folder).kind if built else choose_source(data.survey())
+    ready = gaussians is None and (prior is not None or (folder / "prior.json").is_file())
+    kind = load_prior(folder).kind if ready else choose_source(data.survey())
     bare = prior is None and kind == "points" and not has_masks(data.frames)
     whole = "random" if bare and train.get("means", "free") == "free" else None
     kind = whole or kind
@@ -364,11 +364,11 @@ def check_named(run: Run, policy: str | Callable[..., Any] | None) -> None:
         call = f"mgs.resume_nbv({str(run.folder)!r}, policy={label(own)})"
         if policy is None or isinstance(policy, str):
             raise InputError(f"{run.folder}: its policy is a Python function; in Python: {call}")
-        kept = run.folder / POLICY_SOURCE
-        with reading(kept):
-            same = kept.read_text(encoding="utf-8") == code_of(policy)
+        file = run.folder / POLICY_SOURCE
+        with reading(file):
+            same = file.read_text(encoding="utf-8") == code_of(policy)
         if not same:
-            raise InputError(f"policy {label(own)}: is not as in {kept}; restore it, or start anew")
+            raise InputError(f"policy {label(own)}: is not as {file} has it; restore it")
     if in_file(own) and policy is None:
         resume = f"`mgs nbv --resume {run.folder} --policy {own}`"
         raise InputError(f"{run.folder}: its policy is a program, {own}; to run it: {resume}")

@@ -144,10 +144,10 @@ class NbvSettings(ModelSettings, Mission):
 def with_defaults(values: Mapping[str, Any], alpha_weight: float = ALPHA_WEIGHT) -> dict[str, Any]:
     """Add this alpha_weight to fields of NbvSettings that lack it."""
     train = values.get("train", {})
-    given = train.model_dump(exclude_unset=True) if isinstance(train, TrainSettings) else train
-    if not isinstance(given, Mapping):
+    fields = train.model_dump(exclude_unset=True) if isinstance(train, TrainSettings) else train
+    if not isinstance(fields, Mapping):
         return dict(values)  # `validated` reports it
-    return {**values, "train": {"alpha_weight": alpha_weight, **given}}
+    return {**values, "train": {"alpha_weight": alpha_weight, **fields}}
 
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -184,14 +184,14 @@ def settings_in(file: Path) -> dict[str, Any]:
     Raises InputError where the file cannot be read, or a key or a value is wrong."""
     if file.suffix == ".json":
         config = read_json(file)
-        found = config.get("settings") if isinstance(config, dict) else None
+        table = config.get("settings") if isinstance(config, dict) else None
     else:
-        found = read_toml(file)
-    if not isinstance(found, dict):
+        table = read_toml(file)
+    if not isinstance(table, dict):
         raise InputError(f"{file}: has no settings; give a TOML file or the config.json of a run")
-    validated(NbvSettings, {"dataset": "", "prior": "", **found}, file)
-    paths = {key: file.parent / found[key] for key in ("dataset", "prior") if key in found}
-    return {**found, **paths}
+    validated(NbvSettings, {"dataset": "", "prior": "", **table}, file)
+    paths = {key: file.parent / table[key] for key in ("dataset", "prior") if key in table}
+    return {**table, **paths}
 
 
 BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}  # pydantic's
