@@ -128,9 +128,8 @@ def reading(path: Path, what: str = "file") -> Iterator[None]:
     except FileNotFoundError:
         raise InputError(f"{path}: no such {what}") from None
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror or error}); give a file that can be read"
-        ) from None
+        why = error.strerror or error
+        raise InputError(f"{path}: cannot be read ({why}); give one that can be read") from None
 
 
 @contextmanager

@@ -100,9 +100,8 @@ def _open_image(path: Path, decode: bool = True) -> tuple[Any, bytes]:
     except InputError:
         raise
     except UnidentifiedImageError:
-        raise InputError(
-            f"{path}: not a readable image; give a PNG or JPEG, or write it again if it is damaged"
-        ) from None
+        cure = "give a PNG or JPEG, or write it again if it is damaged"
+        raise InputError(f"{path}: not a readable image; {cure}") from None
     except (OSError, SyntaxError, ValueError) as error:
         raise InputError(f"{path}: not a readable image ({error}); write it again") from None
     return image, data

@@ -78,9 +78,8 @@ def find_libllvm() -> Libllvm:
             return library
         problems.append(f"libLLVM {path}: is version {library.version[0]}, older than {MIN_LLVM}")
     if explicit:
-        raise InputError(
-            f"{problems[0]}, but {LIBRARY_VARIABLE} names it; unset that, or let it name {_GOOD}"
-        )
+        named = f"{problems[0]}, but {LIBRARY_VARIABLE} names it"
+        raise InputError(f"{named}; unset that, or let it name {_GOOD}")
     raise InputError(f"{problems[0] if problems else 'libLLVM: none found'}; install {_GOOD}")
 
 
@@ -176,10 +175,8 @@ def _check_libllvm() -> None:
         needs = "it needs x86-64 with AVX and FMA, or ARM64"
         raise InputError(f"Dr.Jit cannot use libLLVM {find_libllvm()} on this processor; {needs}")
     if version[0] < MIN_LLVM:
-        raise InputError(
-            f"Dr.Jit was started with libLLVM {version[0]} before mgs could choose; "
-            f"let {LIBRARY_VARIABLE} name {_GOOD}"
-        )
+        early = f"Dr.Jit was started with libLLVM {version[0]} before mgs could choose"
+        raise InputError(f"{early}; let {LIBRARY_VARIABLE} name {_GOOD}")
 
 
 def _prepare_variant() -> None:
@@ -188,10 +185,8 @@ def _prepare_variant() -> None:
 
     differentiable = dr.is_jit_v(mi.Float) and dr.is_diff_v(mi.Float)
     if not (differentiable and mi.is_rgb and dr.type_v(mi.Float) == dr.VarType.Float32):
-        raise InputError(
-            f"Mitsuba's variant {mi.variant()} is set, and mgs needs differentiable RGB in single "
-            f"precision; take {VARIANT} (the default) or cuda_ad_rgb"
-        )
+        other = f"Mitsuba's variant {mi.variant()} is set, and mgs needs differentiable RGB in"
+        raise InputError(f"{other} single precision; take {VARIANT} (the default) or cuda_ad_rgb")
     if dr.backend_v(mi.Float) == dr.JitBackend.LLVM:
         _check_libllvm()
         _keep_order()

@@ -109,18 +109,17 @@ class Scene:
 
     def __post_init__(self) -> None:
         if not isinstance(self.dataset, Dataset) or not isinstance(self.prior, Prior):
-            raise TypeError(
-                "Scene: needs a dataset and a prior that are loaded: "
-                "mgs.Scene(mgs.load_dataset(FOLDER), mgs.load_prior(FOLDER))"
-            )
+            call = "mgs.Scene(mgs.load_dataset(FOLDER), mgs.load_prior(FOLDER))"
+            raise TypeError(f"Scene: needs a dataset and a prior that are loaded: {call}")
         if self.settings is None:
             weight = ALPHA_WEIGHT if self.dataset.outlined else 0.0
             settings = ModelSettings(train=TrainSettings(alpha_weight=weight))
             object.__setattr__(self, "settings", settings)
         if not np.allclose(self.prior.world.up, self.dataset.world.up):
+            up, own = self.dataset.world.up, self.prior.world.up
+            up, own = self.dataset.world.up, f"was built with up {self.prior.world.up}"
             raise InputError(
-                f"prior: was built with up {self.prior.world.up}, the dataset has "
-                f"{self.dataset.world.up}; load the dataset with `up` of the prior"
+                f"prior: {own}, the dataset has {up}; load that with `up` of the prior"
             )
 
     @cached_property

@@ -97,9 +97,8 @@ def nbv(
     recorded = settings_in(config) if config else {}
     rule = recorded.get("policy", "")
     if in_file(rule) and policy is None:
-        raise InputError(
-            f"{config}: its policy is a program, {rule}; to run it, add --policy {rule}"
-        )
+        program = f"its policy is a program, {rule}"
+        raise InputError(f"{config}: {program}; to run it, add --policy {rule}")
     values = merged(recorded, values) | not_none(policy=policy) | own
     dataset = dataset or values.get("dataset")
     if gaussians is None and source is None:

@@ -124,10 +124,8 @@ def suggest(
         fit["train"] = {"passes": PASSES}
     place = parse_origin(origin) if origin else _place(source)
     if plan and place is None:
-        raise InputError(
-            "suggest: `plan` needs `origin`, the place of the world's 0 as LAT,LON,ALT, which "
-            "only photographs with GPS have"
-        )
+        zero = "the place of the world's 0 as LAT,LON,ALT, which only photographs with GPS have"
+        raise InputError(f"suggest: `plan` needs `origin`, {zero}")
     ours = Ours(FILES, [path for path in (source, poses, prior) if path]) if force else None
     if out is not None:
         check_new_folder(out, ours)

@@ -92,8 +92,8 @@ def _read_csv(path: Path, site: Site) -> list[Named]:
     unknown = [name for name in columns if name not in COLUMNS]
     if unknown or not columns:
         what = f"has the column {unknown[0]!r}" if unknown else "is empty"
-        first = f"its first line must name columns of {', '.join(COLUMNS)}"
-        raise InputError(f"{path}: {what}; {first}")
+        must = f"its first line must name columns of {', '.join(COLUMNS)}"
+        raise InputError(f"{path}: {what}; {must}")
     for group in (POSITION, TARGET, QUATERNION):
         lacking = [name for name in group if name not in columns]
         if lacking and (group == POSITION or len(lacking) < len(group)):

@@ -34,10 +34,8 @@ def bound_socket(host: str, port: int) -> socket.socket:
         return socket.create_server((host, port), family=family)
     except OSError as error:
         reason = (error.strerror or str(error)).partition(" (while")[0]
-        raise InputError(
-            f"host {host} port {port}: cannot be served there ({reason}); "
-            "choose another port or host"
-        ) from None
+        where = f"host {host} port {port}: cannot be served there ({reason})"
+        raise InputError(f"{where}; choose another port or host") from None
 
 
 class Access:
