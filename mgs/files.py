@@ -240,9 +240,10 @@ def _parsed(path: str | Path, kind: str, parse: Callable[[bytes], Any], most: in
     except (ValueError, RecursionError, SyntaxError, LookupError, csv.Error) as error:
         # RecursionError: nested too deeply; SyntaxError: of XML; LookupError: of its encoding
         reason = "nested too deeply" if isinstance(error, RecursionError) else str(error)[:200]
-        raise InputError(f"{path}: not valid {kind} ({reason}); write it again") from None
+        raise InputError(f"{path}: not valid {kind} ({reason}); {DAMAGED}") from None
 
 
+DAMAGED = "the file is damaged, write it again"
 THERE = "is there already; choose another place, or replace it with `force`"
 """End of the message of every command whose output exists."""
 

@@ -17,7 +17,7 @@ import mgs
 from mgs.camera import MAX_PIXELS, MAX_SIDE, Camera
 from mgs.colour import linear_from_pixels, srgb_from_linear
 from mgs.errors import InputError
-from mgs.files import atomic_path, not_writable, parsing, reading
+from mgs.files import DAMAGED, atomic_path, not_writable, parsing, reading
 from mgs.memory import check_room
 
 PNG_BIT_DEPTH = 24  # byte of a PNG file with the bits of a sample (PNG specification, 11.2.1)
@@ -103,7 +103,7 @@ def _open_image(path: Path, decode: bool = True) -> tuple[Any, bytes]:
         cure = "give a PNG or JPEG, or write it again if it is damaged"
         raise InputError(f"{path}: not a readable image; {cure}") from None
     except (OSError, SyntaxError, ValueError) as error:
-        raise InputError(f"{path}: not a readable image ({error}); write it again") from None
+        raise InputError(f"{path}: not a readable image ({error}); {DAMAGED}") from None
     return image, data
 
 
@@ -301,7 +301,7 @@ def _exr_size(path: Path) -> tuple[int, int]:
 @contextmanager
 def _reading_exr(path: Path) -> Iterator[None]:
     """Context manager: turns errors of OpenEXR into InputError, and hides what it prints."""
-    with parsing(path, "EXR", "the file is damaged, write it again"), _silent():
+    with parsing(path, "EXR", DAMAGED), _silent():
         yield
 
 

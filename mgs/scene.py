@@ -115,12 +115,10 @@ class Scene:
             weight = ALPHA_WEIGHT if self.dataset.outlined else 0.0
             settings = ModelSettings(train=TrainSettings(alpha_weight=weight))
             object.__setattr__(self, "settings", settings)
-        if not np.allclose(self.prior.world.up, self.dataset.world.up):
-            up, own = self.dataset.world.up, self.prior.world.up
-            up, own = self.dataset.world.up, f"was built with up {self.prior.world.up}"
-            raise InputError(
-                f"prior: {own}, the dataset has {up}; load that with `up` of the prior"
-            )
+        own, up = self.prior.world.up, self.dataset.world.up
+        if not np.allclose(own, up):
+            other = f"was built with up {own}, the dataset has {up}"
+            raise InputError(f"prior: {other}; load the dataset with `up` of the prior")
 
     @cached_property
     def frames(self) -> tuple[Frame, ...]:
