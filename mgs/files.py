@@ -96,9 +96,8 @@ def remove_leftovers(folder: Path) -> None:
 def not_writable(path: Path, error: Exception) -> InputError:
     """InputError for a path that cannot be written, with the reason of the system."""
     reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
-    return InputError(
-        f"{path}: cannot be written ({reason}); choose a place you may write to, with room"
-    )
+    cure = "choose a place you may write to, with room"
+    return InputError(f"{path}: cannot be written ({reason}); {cure}")
 
 
 def check_writable(path: str | Path) -> Path:

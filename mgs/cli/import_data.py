@@ -171,33 +171,27 @@ def _advice(source: Source, result: Dataset) -> Iterator[str]:
     if source.no_cloud:
         yield f"the points that the source names, {source.no_cloud}, do not exist"
     if any(source.origin):
-        yield (
-            "the cameras are far from the origin, where float32 is coarse: "
-            f"{_numbers(source.origin)} is the origin now; exports and suggested poses add it "
-            "again, and a flight plan needs its latitude and longitude as `mgs suggest --origin`"
-        )
+        far = "the cameras are far from the origin, where float32 is coarse"
+        place = f"{_numbers(source.origin)} is the origin now; exports and suggested poses add it"
+        plan = "a flight plan needs its latitude and longitude as `mgs suggest --origin`"
+        yield f"{far}: {place} again, and {plan}"
     some = result.frames[:: max(1, len(result) // 10)]
     masks = [frame.mask() for frame in some if frame.mask_path]
     empty = sum(not mask.any() for mask in masks)
     if empty > MOSTLY * len(masks):
-        yield (
-            f"{empty} of {len(masks)} masks looked at are empty: the object must be white "
-            "in them, and a mesh in the cameras' axes"
-        )
+        many = f"{empty} of {len(masks)} masks looked at are empty"
+        yield f"{many}: the object must be white in them, and a mesh in the cameras' axes"
     if masks and all(mask.all() for mask in masks):
         yield "the masks cover their pictures whole: only the object must be white in them"
     stops = [value for shot in source.shots if (value := exif_exposure(shot.image)) is not None]
     if stops and max(stops) - min(stops) > EXPOSURE_DIFFERS:
-        yield (
-            f"by their EXIF, exposure differs by up to {max(stops) - min(stops):.1f} stops "
-            "between photographs; `mgs fit --exposure` estimates a gain for each"
-        )
+        most = f"by up to {max(stops) - min(stops):.1f} stops between photographs"
+        cure = "`mgs fit --exposure` estimates a gain for each"
+        yield f"by their EXIF, exposure differs {most}; {cure}"
     camera = result.frames[0].camera
     if camera.width * camera.height > MANY_PIXELS:
-        yield (
-            f"images of {camera.width}x{camera.height} take long to fit; "
-            "--downscale 2 or more makes them smaller"
-        )
+        size = f"{camera.width}x{camera.height}"
+        yield f"images of {size} take long to fit; --downscale 2 or more makes them smaller"
 
 
 def _print_summary(

@@ -166,24 +166,19 @@ def _refitted(result: RefittedRun) -> list[str]:
     model, left_out = result.lean, result.lean.left_out
     share = model.parameters / result.before
     shares = ", ".join(f"{kind} {mask.mean():.0%}" for kind, mask in model.learned.items())
-    lines = [
-        f"{model.parameters:,} parameters are learned, {share:.0%} of the run's {result.before:,}",
-        f"learned by: {shares} of the Gaussians",
-    ]
+    count, degree = f"{model.parameters:,} parameters are learned", model.gaussians.sh_degree
+    lines = [f"{count}, {share:.0%} of the run's {result.before:,}"]
+    lines.append(f"learned by: {shares} of the Gaussians")
+    tried = "SH degree 0: no other was tried"
     if left_out:
         more = "more" if left_out.pays else "not more"
-        lines.append(
-            f"SH degree {model.gaussians.sh_degree}: on views left out, neighbours together, "
-            f"degree 1 gains {left_out.gain:+.3f} dB, {more} than its standard error of "
-            f"{left_out.error:.3f}"
-        )
-    else:
-        lines.append("SH degree 0: no other was tried")
+        gain = f"degree 1 gains {left_out.gain:+.3f} dB, {more} than its standard error of"
+        tried = f"SH degree {degree}: on views left out, neighbours together, {gain}"
+        tried += f" {left_out.error:.3f}"
+    lines.append(tried)
     if not result.psnr:
         return [*lines, "PSNR: there are no views on which to compare the models"]
     own, whole, lean = result.psnr
-    lines.append(
-        f"PSNR on the {result.views} views: {lean:.2f} dB, {whole:.2f} dB where all parameters are "
-        f"fitted in the same way; of the run's own model {own:.2f} dB"
-    )
-    return lines
+    other = f"{whole:.2f} dB where all parameters are fitted in the same way"
+    values = f"{lean:.2f} dB, {other}; of the run's own model {own:.2f} dB"
+    return [*lines, f"PSNR on the {result.views} views: {values}"]

@@ -114,10 +114,8 @@ def _export_compact(
         with atomic_path(path) as temporary:
             temporary.write_bytes(data)
         count, (before, after) = len(result.file.model), result.psnr
-        echo(
-            f"wrote {count:,} Gaussians to {path} ({len(data):,} bytes); "
-            f"PSNR of the views taken: {before:.2f} dB in the run, {after:.2f} dB in the file"
-        )
+        values = f"PSNR of the views taken: {before:.2f} dB in the run, {after:.2f} dB in the file"
+        echo(f"wrote {count:,} Gaussians to {path} ({len(data):,} bytes); {values}")
 
 
 def _bytes(text: str) -> int:
@@ -149,21 +147,17 @@ def _in_srgb(model: Path, linear: Gaussians) -> Gaussians:
     from mgs.run.folder import open_run
 
     if not model.is_dir():
-        echo(
-            "colours are converted from linear RGB to sRGB one by one, and mixtures are a little "
-            "darker; the export of a run folder fits them again"
-        )
+        cost = "colours are converted from linear RGB to sRGB one by one, and mixtures are a little"
+        echo(f"{cost} darker; the export of a run folder fits them again")
         return in_srgb(linear)
     run = open_run(model)
     with progress_bar() as bar:
         fitted = refit_in_srgb(run, partial(bar, "fitting colours, blended in sRGB"))
     name, values = compare_models([run.gaussians, fitted], run)
     if values is not None:
-        echo(
-            f"PSNR of the {name} views: {values[0]:.2f} dB blended in linear RGB, as in the run; "
-            f"{values[1]:.2f} dB blended in sRGB, as exported, with colours fitted again to the "
-            "views taken"
-        )
+        linear_rgb = f"{values[0]:.2f} dB blended in linear RGB, as in the run"
+        srgb = f"{values[1]:.2f} dB blended in sRGB, as exported, with colours fitted again"
+        echo(f"PSNR of the {name} views: {linear_rgb}; {srgb} to the views taken")
     return as_imported(run, fitted)
 
 

@@ -20,24 +20,19 @@ def notes(run: Run) -> list[str]:
     """Sentences about what is unfinished or missing, the end of the run, and its warnings."""
     taken, lines = len(run.indices), []
     if run.ended is None:
-        lines.append(
-            f"Unfinished: {taken} of {run.planned} views are taken; "
-            f"`mgs nbv --resume {run.folder}` goes on."
-        )
+        resume = f"`mgs nbv --resume {run.folder}` goes on"
+        lines.append(f"Unfinished: {taken} of {run.planned} views are taken; {resume}.")
     elif run.ended["reason"] != RunEnd.BUDGET:  # a spent budget is no news
         lines.append(f"The run has ended: {why_ended(run.ended)}.")
     if run.metrics is None:
         lines.append(f"Not measured: `mgs eval {run.folder}` adds its PSNR and SSIM.")
     elif run.measured is None:
-        lines.append(
-            f"metrics.json is of {run.metrics['images']} images, the model of {taken}: its numbers "
-            f"are left out; `mgs eval {run.folder}` measures again."
-        )
+        of = f"metrics.json is of {run.metrics['images']} images, the model of {taken}"
+        again = f"`mgs eval {run.folder}` measures again"
+        lines.append(f"{of}: its numbers are left out; {again}.")
     if run.settings.estimator != "exact":
-        lines.append(
-            f"Its information gain is by the estimator {run.settings.estimator}: "
-            "compare it with that of the same estimator only."
-        )
+        gain = f"Its information gain is by the estimator {run.settings.estimator}"
+        lines.append(f"{gain}: compare it with that of the same estimator only.")
     if certificate := run.steps[0].get("certificate"):
         lines.append(Certificate(**certificate).sentence())
     for step in run.steps:

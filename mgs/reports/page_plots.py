@@ -198,11 +198,9 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     ]
     axes = {f"{a}axis": _axis(f"{a} ({run.dataset.unit})") for a in "xyz"}
     view = {"eye": {"x": 0.9, "y": 0.9, "z": 0.7}}
-    alt = (
-        f"Camera positions of {label} in 3D around the model. "
-        f"Seeds: {', '.join(names[i] for i in seeds)}. "
-        f"Chosen, in this order: {', '.join(names[i] for i in views) or 'none yet'}."
-    )
+    first, later = (", ".join(names[i] for i in some) for some in (seeds, views))
+    alt = f"Camera positions of {label} in 3D around the model. Seeds: {first}. "
+    alt += f"Chosen, in this order: {later or 'none yet'}."
     layout = {"scene": {"aspectmode": "data", "camera": view, **axes}}
     return {"title": f"Orbit, {label}", "alt": alt, "data": traces, "layout": layout}
 

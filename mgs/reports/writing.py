@@ -124,10 +124,8 @@ def _psnr_panels(runs: Mapping[str, Run]) -> dict[str, figures.Curves]:
     on_demand = next(iter(runs.values())).dataset.on_demand
     every = "views taken so far" if on_demand else "all views"
     for prefix, views in (("test_", "test views"), ("", every)):
-        panels = {
-            f"PSNR, {views} (dB)": step_curves(runs, f"{prefix}psnr"),
-            f"masked PSNR, {views} (dB)": step_curves(runs, f"{prefix}psnr_mask"),
-        }
+        keys = {f"PSNR, {views} (dB)": "psnr", f"masked PSNR, {views} (dB)": "psnr_mask"}
+        panels = {title: step_curves(runs, prefix + key) for title, key in keys.items()}
         if all(len(curves) == len(runs) for curves in panels.values()):
             return panels
     return {}

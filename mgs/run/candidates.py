@@ -100,10 +100,8 @@ def _read_csv(path: Path, site: Site) -> list[Named]:
             raise InputError(f"{path}: lacks the column {lacking[0]}; add it, or correct its name")
     if not lines:
         raise InputError(f"{path}: lists no poses; add a line with x, y and z for each")
-    return [
-        _csv_pose(f"{path}: line {number}", k, columns, row, site)
-        for k, (number, row) in enumerate(lines)
-    ]
+    rows = [(f"{path}: line {number}", k, columns, row) for k, (number, row) in enumerate(lines)]
+    return [_csv_pose(*row, site) for row in rows]
 
 
 def _csv_pose(where: str, index: int, columns: list[str], row: list[str], site: Site) -> Named:
@@ -172,11 +170,8 @@ def way_to(camera: Camera, images: Sequence[Frame], site: Site, unit: str) -> st
     if abs(turn) >= FELT:
         side = "right" if turn > 0 else "left"
         words.append(f"{abs(np.degrees(turn)):.0f}° round the object to the {side}")
-    moves = [
-        (far - np.linalg.norm(end), "nearer", "farther"),
-        (end[2] - start[2], "higher", "lower"),
-    ]
-    for length, positive, negative in moves:
+    nearer = far - np.linalg.norm(end), "nearer", "farther"
+    for length, positive, negative in (nearer, (end[2] - start[2], "higher", "lower")):
         if abs(length) >= FELT * far:
             size = f"{abs(length):.1f} m" if unit == "m" else f"{abs(length) / far:.0%}"
             words.append(f"{size} {positive if length > 0 else negative}")

@@ -84,10 +84,9 @@ def why_ended(ended: Mapping[str, Any]) -> str:
         limit = f"no more than stop_uncertainty = {ended['limit']:g}"
         return f"{ended['uncertainty']:.4g} of the prior's variance is left after {views}, {limit}"
     if ended["reason"] == RunEnd.PSNR:
-        return (
-            f"the masked PSNR of the views not taken is predicted to be {ended['psnr']:.1f} dB "
-            f"after {views}, no less than stop_psnr = {ended['limit']:g}"
-        )
+        limit = f"after {views}, no less than stop_psnr = {ended['limit']:g}"
+        psnr = f"the masked PSNR of the views not taken is predicted to be {ended['psnr']:.1f} dB"
+        return f"{psnr} {limit}"
     if ended["reason"] == RunEnd.FLIGHT:
         way = f"the flight is {ended['metres']:.1f} m long with the way home"
         if count := ended.get("given_up"):
