@@ -181,7 +181,10 @@ def recording(kind: str, file: str) -> Callable[[Path], None]:
 
 def of_recording(path: Path) -> None:
     """Read the recording of which a file is one, as far as the sizes of its images."""
-    alone, deep = path.suffix in (".bag", ".xml"), path.parent.name == "rtabmap_calib"
+    alone, deep = (
+        path.suffix in (".bag", ".xml"),
+        path.parent.name in ("rtabmap_calib", "bundle", "cams"),
+    )
     root = path if alone else path.parents[deep]
     pose = "/slam/pose" if path.suffix == ".mcap" else None
     for shot in read_source(root, unpack=root.parent / "unpacked", pose=pose).shots:
@@ -247,8 +250,14 @@ ROBOTS = (
     ("RTAB-Map", "rtabmap/rtabmap_camera_poses.txt"),
     ("RTAB-Map", "rtabmap/rtabmap_calib/1.yaml"),
     ("Metashape", "metashape/cameras.xml"),
+    ("OpenSfM", "opensfm/opensfm/reconstruction.json"),
+    ("Bundler", "bundler/bundle/bundle.out"),
+    ("Bundler", "bundler/list.txt"),
+    ("LLFF", "llff/poses_bounds.npy"),
+    ("MVSNet", "mvsnet/cams/kf_0000_cam.txt"),
+    ("3D Gaussian Splatting", "splats/cameras.json"),
 )
-"""Recordings that robots and scanners make, and files of theirs."""
+"""Recordings of robots, scanners and other programs, and files of theirs."""
 
 RUN = ("config.json", "steps.jsonl", "metrics.json")
 

@@ -14,8 +14,10 @@ from program import command, said
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
+from mgs.camera import Camera
 from mgs.data import tracks
 from mgs.data.dataset import load_dataset
+from mgs.data.sources import read_source
 from mgs.errors import InputError
 
 MOUNT = tracks.rigid((0.1, -0.2, 0.3), (0.5, -0.5, 0.5, -0.5))
@@ -266,6 +268,72 @@ def write_metashape(root: Path, dataset) -> Path:
     return root / "cameras.xml"
 
 
+def peer_parts(root: Path, dataset) -> list[tuple[str, np.ndarray, Camera]]:
+    """Name, world to camera and camera of each frame; the images lie in root/images."""
+    shutil.copytree(dataset.root / "images", root / "images")
+    return [(f.image_path.name, f.camera.world_to_camera, f.camera) for f in dataset.frames]
+
+
+def write_opensfm(root: Path, dataset) -> Path:
+    shots, camera = {}, dataset.frames[0].camera
+    for name, pose, _ in peer_parts(root, dataset):
+        rotation = Rotation.from_matrix(pose[:3, :3]).as_rotvec().tolist()
+        shots[name] = {"camera": "c", "rotation": rotation, "translation": pose[:3, 3].tolist()}
+    lens = {"projection_type": "perspective", "width": camera.width, "height": camera.height}
+    lens |= {"focal": camera.K[0, 0] / camera.width, "k1": 0.0, "k2": 0.0}
+    place = {"latitude": 47.0, "longitude": 8.0, "altitude": 400.0}
+    part = {"cameras": {"c": lens}, "shots": shots, "points": {}, "reference_lla": place}
+    (root / "opensfm").mkdir()
+    (root / "opensfm/reconstruction.json").write_text(json.dumps([part]))
+    return root
+
+
+def write_bundler(root: Path, dataset) -> Path:
+    """y up, z backwards; one camera more that is not placed."""
+    parts = peer_parts(root, dataset)
+    listed = [f"./images/{name} 0 70.4" for name, *_ in parts] + ["./images/lost.jpg"]
+    lines = ["# Bundle file v0.3", f"{len(listed)} 1"]
+    for _, pose, camera in parts:
+        turned = [[1], [-1], [-1]] * pose[:3]
+        rows = [*turned[:, :3].tolist(), turned[:, 3].tolist()]
+        lines += [f"{camera.K[0, 0]} 0 0", *(" ".join(map(repr, row)) for row in rows)]
+    lines += ["0 0 0", *["0 0 0"] * 4, "0.1 0.2 0.3", "255 0 0", "2 0 5 1.5 2.5 1 6 3.5 4.5"]
+    (root / "list.txt").write_text("\n".join(listed))
+    (root / "bundle").mkdir()
+    (root / "bundle/bundle.out").write_text("\n".join(lines))
+    return root
+
+
+def write_llff(root: Path, dataset) -> Path:
+    rows = []
+    for _, pose, camera in peer_parts(root, dataset):
+        right, down, ahead, eye = np.linalg.inv(pose)[:3].T
+        shape = [camera.height, camera.width, camera.K[0, 0]]
+        rows.append([*np.column_stack([down, right, -ahead, eye, shape]).ravel(), 1.0, 9.0])
+    np.save(root / "poses_bounds.npy", np.array(rows))
+    return root
+
+
+def write_mvsnet(root: Path, dataset) -> Path:
+    (root / "cams").mkdir(parents=True)
+    for name, pose, camera in peer_parts(root, dataset):
+        text = ["\n".join(" ".join(map(repr, row)) for row in m.tolist()) for m in (pose, camera.K)]
+        words = f"extrinsic\n{text[0]}\n\nintrinsic\n{text[1]}\n\n0.5 0.1\n"
+        (root / f"cams/{Path(name).stem}_cam.txt").write_text(words)
+    return root
+
+
+def write_splatting(root: Path, dataset) -> Path:
+    rows = []
+    for name, pose, camera in peer_parts(root, dataset):
+        back, (fx, fy) = np.linalg.inv(pose), np.diag(camera.K)[:2].tolist()
+        row = {"img_name": Path(name).stem, "fx": fx, "fy": fy}
+        row |= {"width": camera.width, "height": camera.height}
+        rows.append(row | {"position": back[:3, 3].tolist(), "rotation": back[:3, :3].tolist()})
+    (root / "cameras.json").write_text(json.dumps(rows))
+    return root
+
+
 WRITERS = {
     "ROS bag 2": lambda root, data: write_bag(root / "bag", data),
     "ROS bag MCAP": lambda root, data: write_bag(
@@ -276,13 +344,23 @@ WRITERS = {
     "Open3D": lambda root, data: write_open3d(root / "open3d", data),
     "RTAB-Map": lambda root, data: write_rtabmap(root / "rtabmap", data),
     "Metashape": lambda root, data: write_metashape(root / "metashape", data),
+    "OpenSfM": lambda root, data: write_opensfm(root / "opensfm", data),
+    "Bundler": lambda root, data: write_bundler(root / "bundler", data),
+    "LLFF": lambda root, data: write_llff(root / "llff", data),
+    "MVSNet": lambda root, data: write_mvsnet(root / "mvsnet", data),
+    "3D Gaussian Splatting": lambda root, data: write_splatting(root / "splats", data),
 }
+OPTIONS = {
+    "ROS bag MCAP": ("--pose", "/slam/pose"),
+    **dict.fromkeys([*WRITERS][-4:], ("--unit", 1, "--up", "0,0,1")),
+}
+"""What the files of these programs do not say."""
 
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_cameras_pixels_and_depth_are_those_recorded(dataset, tmp_path, capsys, kind):
     source, out = WRITERS[kind](tmp_path, dataset), tmp_path / "out"
-    command("import", source, "--out", out, *(("--pose", "/slam/pose") if "MCAP" in kind else ()))
+    command("import", source, "--out", out, *OPTIONS.get(kind, ()))
     printed, _ = said(capsys)
     assert "lengths in metres" in printed
     assert not (tmp_path / "out.unpacked").exists()
@@ -293,8 +371,69 @@ def test_cameras_pixels_and_depth_are_those_recorded(dataset, tmp_path, capsys, 
         assert np.allclose(one.camera.world_to_camera, other.camera.world_to_camera, atol=1e-6)
         assert np.allclose(one.camera.K, other.camera.K, atol=1e-9)
         assert np.array_equal(one.rgb(), other.rgb())
-        if kind != "Metashape":
+        if [*WRITERS].index(kind) < [*WRITERS].index("Metashape"):
             assert np.abs(one.depth() - other.depth()).max() < 6e-4
+
+
+def opensfm_pixels(root: Path, points: np.ndarray) -> np.ndarray:
+    """Pixels of points [N,3] in the first image by OpenSfM's formulas of the brown camera, after
+    the lens was made one."""
+    c = {"focal_x": 1.2, "focal_y": 1.1, "c_x": 0.03, "c_y": -0.05}
+    c |= {"k1": -0.1, "k2": 0.03, "k3": 0.01, "p1": 0.004, "p2": -0.006}
+    path = root / "opensfm/reconstruction.json"
+    data = json.loads(path.read_text())
+    lens, shot = data[0]["cameras"]["c"], data[0]["shots"]["kf_0000.png"]
+    lens.update(c, projection_type="brown")
+    path.write_text(json.dumps(data))
+    x, y, z = (Rotation.from_rotvec(shot["rotation"]).apply(points) + shot["translation"]).T
+    u, v = x / z, y / z
+    r2 = u * u + v * v
+    radial = 1 + r2 * (c["k1"] + r2 * (c["k2"] + r2 * c["k3"]))
+    across = u * radial + 2 * c["p1"] * u * v + c["p2"] * (r2 + 2 * u * u)
+    down = v * radial + 2 * c["p2"] * u * v + c["p1"] * (r2 + 2 * v * v)
+    normalised = np.column_stack([c["focal_x"] * across + c["c_x"], c["focal_y"] * down + c["c_y"]])
+    size = np.array([lens["width"], lens["height"]])
+    return normalised * size.max() + (size - 1) / 2 + 0.5  # its first pixel's centre is 0
+
+
+def bundler_pixels(root: Path, points: np.ndarray) -> np.ndarray:
+    """By the formulas of Bundler's manual, y up from the middle of the image."""
+    path = root / "bundle/bundle.out"
+    lines = path.read_text().splitlines()
+    f, k1, k2 = 60.0, -0.1, 0.03
+    lines[2] = f"{f} {k1} {k2}"
+    path.write_text("\n".join(lines))
+    *R, t = (np.array(line.split(), float) for line in lines[3:7])
+    P = points @ np.array(R).T + t
+    p = -P[:, :2] / P[:, 2:]
+    r2 = (p * p).sum(1, keepdims=True)
+    return [32, 24] + f * (1 + k1 * r2 + k2 * r2**2) * p * [1, -1]
+
+
+def mvsnet_pixels(root: Path, points: np.ndarray) -> np.ndarray:
+    path = root / "cams/kf_0000_cam.txt"
+    rows = [line.split() for line in path.read_text().splitlines()]
+    pose, K = np.array(rows[1:5], float), np.array([[70.0, 0, 30], [0, 71, 27], [0, 0, 1]])
+    rows[7:10] = K.astype(str).tolist()
+    path.write_text("\n".join(" ".join(row) for row in rows))
+    x = (points @ pose[:3, :3].T + pose[:3, 3]) @ K.T
+    return x[:, :2] / x[:, 2:]
+
+
+@pytest.mark.parametrize(
+    ("kind", "pixels_of"),
+    [("OpenSfM", opensfm_pixels), ("Bundler", bundler_pixels), ("MVSNet", mvsnet_pixels)],
+)
+def test_lenses_and_centres_are_those_of_the_programs(dataset, tmp_path, kind, pixels_of):
+    source, points = WRITERS[kind](tmp_path, dataset), synthetic.rock_mesh().vertices[::20]
+    expected = pixels_of(source, points)
+    shot = read_source(source).shots[0]
+    pixels = shot.camera.project(points)[0]
+    if shot.lens is not None:
+        pose = shot.camera.world_to_camera
+        lens = shot.lens.camera(shot.camera.width, shot.camera.height)
+        pixels = lens.img_from_cam(points @ pose[:3, :3].T + pose[:3, 3])
+    np.testing.assert_allclose(pixels, expected, atol=1e-6)
 
 
 def test_keyframes_by_distance(dataset, tmp_path):
@@ -353,6 +492,10 @@ def b2(path: Path) -> None:
     path.write_text(path.read_text().replace("</f>", "</f><b2>1</b2>"))
 
 
+def pickled(path: Path) -> None:
+    np.save(path, np.array([{}]), allow_pickle=True)
+
+
 @pytest.mark.parametrize(
     ("kind", "name", "damage", "message"),
     [
@@ -363,6 +506,14 @@ def b2(path: Path) -> None:
         ("Metashape", "cameras.xml", halved, "not valid XML"),
         ("Metashape", "cameras.xml", b2, "b2 or k4"),
         ("RTAB-Map", "3.yaml", halved, "camera_matrix"),
+        ("OpenSfM", "reconstruction.json", halved, "not valid JSON"),
+        ("Bundler", "bundle.out", halved, "9 cameras and 1 points of 9 listed images"),
+        ("Bundler", "list.txt", Path.unlink, "list.txt: no such file"),
+        ("LLFF", "poses_bounds.npy", halved, "not a readable file of LLFF"),
+        ("LLFF", "kf_0003.png", Path.unlink, "(8, 17) for 7 images"),
+        ("LLFF", "poses_bounds.npy", pickled, "allow_pickle=False"),
+        ("MVSNet", "kf_0000_cam.txt", halved, "not a readable file of MVSNet"),
+        ("3D Gaussian Splatting", "cameras.json", nonsense, "not valid JSON"),
     ],
 )
 def test_damaged_recordings_are_one_line(dataset, tmp_path, capsys, kind, name, damage, message):

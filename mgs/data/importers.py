@@ -20,8 +20,7 @@ from mgs.data.frames import Frame
 from mgs.data.lens import Undo, read_fitting, shrunk, undistorter
 from mgs.data.meshes import Mesh, read_mesh
 from mgs.data.rock_image import premultiplied, write_rock_image
-from mgs.data.shots import Shot, Source
-from mgs.data.sources import find_image
+from mgs.data.shots import Shot, Source, find_image
 from mgs.data.world import PLUS_Z, Vector, World
 from mgs.errors import InputError, Notice
 from mgs.files import copy_file, fingerprint, folder_locked, remove_file, write_json

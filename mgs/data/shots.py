@@ -20,6 +20,8 @@ from mgs.images import exif_orientation, image_size
 
 LEVELLED = 10.0  # angle from +Z, degrees, up to which cameras' common up vector counts as +Z
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+# NeRF-synthetic names images without a suffix.
+SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
 FAR = 1000.0  # distance from the origin over the cameras' extent, beyond which the origin is moved
 HELD = {  # EXIF orientation -> axes of the camera of the turned picture, in those of the stored one
     3: [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
@@ -171,6 +173,12 @@ def frame_name(path: str) -> str:
     if parts and Path(parts[-1]).suffix.lower() in PICTURE_SUFFIXES:
         parts[-1] = Path(parts[-1]).stem
     return "_".join(part for part in parts if part not in (".", "..", "/", "images"))
+
+
+def find_image(folder: Path, name: str) -> Path | None:
+    """The file of this name in a folder, with one of SUFFIXES, or None."""
+    paths = (folder / f"{name}{suffix}" for suffix in SUFFIXES)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def checked(path: Path, source: Source) -> Source:

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -18,10 +19,19 @@ from mgs.data.colmap import models_in, read_colmap
 from mgs.data.dataset import finite_number, posed_camera, read_records, timestamp_of, unit_of
 from mgs.data.lens import Lens
 from mgs.data.metashape import is_metashape, read_metashape
+from mgs.data.peers import PEERS, is_peer, read_peer
 from mgs.data.photographs import KIND as PHOTOGRAPHS
 from mgs.data.photographs import UNREAD, photographs_in, read_photographs
 from mgs.data.rgbd_folders import is_open3d, is_rtabmap, is_tum, read_open3d, read_rtabmap, read_tum
-from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, checked, frame_name, turned_by_exif
+from mgs.data.shots import (
+    PICTURE_SUFFIXES,
+    Shot,
+    Source,
+    checked,
+    find_image,
+    frame_name,
+    turned_by_exif,
+)
 from mgs.data.tracks import ROUNDED, Spacing, orthonormal
 from mgs.data.video import VIDEO_SUFFIXES, sharpest_frames
 from mgs.data.world import unit_up
@@ -33,8 +43,6 @@ COEFFICIENTS = (  # keys of transforms.json that COLMAP's camera models name ali
     *("p1", "p2", "sx1", "sy1", "omega", "k", "k0", "alpha", "beta"),
 )
 
-# NeRF-synthetic names images without a suffix.
-SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists of images
 SHRUNK = (2, 4, 8)  # factors by which images may be smaller than transforms.json says
 
@@ -42,7 +50,7 @@ Reader = Callable[[Path, Path | None, Spacing, Path, str | None], Source]
 """(path, images, spacing of keyframes, folder to unpack into, topic of poses) -> source. images:
 folder of the images, or of a bag their topic."""
 
-# Recordings of robots: kind -> (whether a path is one, its reader).
+# Recordings of robots and cameras of other programs: kind -> (whether a path is one, its reader).
 RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
     "ROS bag": (
         is_bag,
@@ -57,6 +65,7 @@ RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
         is_metashape,
         lambda path, images, *_: read_metashape(path, images or path.parent / "images"),
     ),
+    **{kind: (partial(is_peer, kind), partial(read_peer, kind)) for kind in PEERS},
 }
 
 
@@ -153,12 +162,6 @@ def _split_apart(source: Path, images: Path | None, test_split: str) -> Source:
         fault = "is the training split" if path.name == TRAINING else f"there is no {path}"
         raise InputError(f"--test-split {test_split}: {fault}; give another, or --test-every N")
     return _read_transforms(path, images)
-
-
-def find_image(folder: Path, name: str) -> Path | None:
-    """The file of this name in a folder, with one of SUFFIXES, or None."""
-    paths = (folder / f"{name}{suffix}" for suffix in SUFFIXES)
-    return next((path for path in paths if path.is_file()), None)
 
 
 def _named(folder: Path, images: Path | None, name: str) -> Path | None:
