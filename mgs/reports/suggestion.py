@@ -123,9 +123,13 @@ def _from_above(axis: Any, run: Run, suggestion: Suggestion) -> None:
 
     frames = taken_in_order(run)
     images = level([frame.camera.position for frame in frames])
+    stops = [level(view.camera.position) for view in suggestion.plan]
     for frame, place in zip(frames, images, strict=True):
         if any(frame.name in view.way for view in suggestion.plan[:MOST_PICTURES]):
-            axis.text(*place, frame.name, fontsize=7)
+            x, y = place - min(np.concatenate(stops), key=lambda stop: np.linalg.norm(stop - place))
+            side = {"ha": "left" if x > 0 else "right", "va": "bottom" if y > 0 else "top"}
+            apart = (7 if x > 0 else -7, 5 if y > 0 else -5)  # from its mark and the nearest stop
+            axis.annotate(frame.name, place, apart, textcoords="offset points", fontsize=7, **side)
     ranked = level([view.camera.position for view in suggestion.ranking])
     gains, label = [view.information_gain for view in suggestion.ranking], f"gain ({GAIN_UNIT})"
     if suggestion.certificate:
@@ -134,7 +138,6 @@ def _from_above(axis: Any, run: Run, suggestion: Suggestion) -> None:
     axis.scatter(*level(run.prior.points[::7]).T, s=0.5, color="#b0a898", rasterized=True)
     axis.scatter(*images.T, marker="^", s=26, color="black", label="images so far")
     dots = axis.scatter(*ranked.T, c=gains, s=18, cmap="viridis", label="candidates")
-    stops = [level(view.camera.position) for view in suggestion.plan]
     way = [images[:1]]
     for corners, stop in zip(suggestion.corners, [*stops, images[:1]], strict=True):
         way += [level(corners)] * (len(corners) > 0) + [stop]
