@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from mgs.camera import Camera
 from mgs.data import tracks
 from mgs.data.dataset import load_dataset
+from mgs.data.peers import is_peer
 from mgs.data.sources import read_source
 from mgs.errors import InputError
 
@@ -434,6 +435,15 @@ def test_lenses_and_centres_are_those_of_the_programs(dataset, tmp_path, kind, p
         lens = shot.lens.camera(shot.camera.width, shot.camera.height)
         pixels = lens.img_from_cam(points @ pose[:3, :3].T + pose[:3, 3])
     np.testing.assert_allclose(pixels, expected, atol=1e-6)
+
+
+def test_an_object_named_as_another_programs_list_is_no_source_of_it(dataset, tmp_path):
+    """ODM writes an object of lenses as cameras.json; a transforms.json may have any name."""
+    shutil.copytree(dataset.root / "images", tmp_path / "images")
+    path = tmp_path / "cameras.json"
+    shutil.copy(dataset.root / "transforms.json", path)
+    assert not is_peer("3D Gaussian Splatting", tmp_path)
+    assert len(read_source(path).shots) == len(dataset)
 
 
 def test_keyframes_by_distance(dataset, tmp_path):

@@ -184,11 +184,21 @@ def _file_of(kind: str, source: Path) -> Path | None:
     """File of cameras that a path names, or that its folder holds beside no other poses."""
     names = PEERS[kind][0]
     if source.is_file():
-        return source if "." in names[0] and source.name.endswith(names[0]) else None
+        fits = "." in names[0] and source.name.endswith(names[0]) and not _is_object(source)
+        return source if fits else None
     if any(source.glob("transforms*.json")) or models_in(source):
         return None
-    there = (source / name for name in names)
-    return next((one for one in there if one.is_file() or any(one.glob("*_cam.txt"))), None)
+    for path in (source / name for name in names):
+        if any(path.glob("*_cam.txt")) or (path.is_file() and not _is_object(path)):
+            return path
+    return None
+
+
+def _is_object(path: Path) -> bool:
+    """Whether a JSON file has an object, as a transforms.json and the cameras.json of ODM, and no
+    list of cameras or parts."""
+    with path.open("rb") as file:
+        return path.suffix == ".json" and file.read(64).lstrip().startswith(b"{")
 
 
 def is_peer(kind: str, source: Path) -> bool:
