@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
-from io import BytesIO, StringIO
+from io import BytesIO
 from pathlib import Path
-from threading import Lock
+from threading import Lock, get_ident
 from typing import Any
 
 import numpy as np
@@ -148,7 +149,8 @@ def read_values(path: str | Path) -> np.ndarray:
     path = Path(path)
     image, _ = _open_image(path)
     if image.mode not in ("L", "I;16", "I", "F"):
-        raise InputError(f"{path}: not a depth image ({image.mode}); give one channel of 16 bits")
+        cure = "give one channel of 16 bits, or EXR"
+        raise InputError(f"{path}: not a depth image, pixels of kind {image.mode}; {cure}")
     return np.asarray(image)
 
 
@@ -164,7 +166,8 @@ def read_depth(path: str | Path, unit: float = 1e-3, float_unit: float = 1.0) ->
     else:
         values = read_values(path)
         if values.dtype == np.uint8:
-            raise InputError(f"{path}: a picture of 8 bits is no depth; give 16 bits, TIFF or EXR")
+            cure = "give 16 bits, TIFF of float32, or EXR"
+            raise InputError(f"{path}: a picture of 8 bits is no depth; {cure}")
         depth = values.astype(np.float32) * (unit if values.dtype.kind in "ui" else float_unit)
         if values.dtype == np.uint16:
             depth[values == UNKNOWN_DEPTH] = 0
@@ -182,7 +185,7 @@ def _depth_channel(path: Path) -> np.ndarray:
         return channels["Z"]
     colours = [channels[name] for name in "RGB" if name in channels]
     grey = all(np.array_equal(one, colours[0], equal_nan=True) for one in colours)
-    if set(channels) <= set("RGBA") and grey:
+    if colours and set(channels) <= set("RGBA") and grey:
         return colours[0]
     names = ", ".join(channels)
     raise InputError(f"{path}: which of {names} is the depth is not plain; write one channel, Z")
@@ -308,14 +311,30 @@ def _reading_exr(path: Path) -> Iterator[None]:
 _redirecting = Lock()  # held while output is redirected: two threads would not restore it
 
 
+class _OtherThreads:
+    """A stream without what the thread that made this writes; progress in others goes on."""
+
+    def __init__(self, stream: Any) -> None:
+        self.stream, self.thread = stream, get_ident()
+
+    def write(self, text: str) -> int:
+        return len(text) if get_ident() == self.thread else self.stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Context manager: drops what libraries print to the standard error, and from Python."""
-    with _redirecting, open(os.devnull, "wb") as nowhere, redirect_stdout(StringIO()):
+    """Context manager: drops what libraries print to the standard error, and in this thread to
+    Python's standard output."""
+    with _redirecting, open(os.devnull, "wb") as nowhere:
+        others: Any = _OtherThreads(sys.stdout)
         stderr = os.dup(2)
         try:
             os.dup2(nowhere.fileno(), 2)
-            yield
+            with redirect_stdout(others):
+                yield
         finally:
             os.dup2(stderr, 2)
             os.close(stderr)

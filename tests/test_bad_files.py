@@ -7,6 +7,7 @@ import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import OpenEXR
@@ -18,6 +19,7 @@ from test_meshes import Made, coloured, glb, parts_of
 from test_meshes import plain as square
 from test_render_command import foreign_ply, gaussians
 
+from mgs import images
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_cameras
 from mgs.data.meshes import load_mesh, read_mesh
@@ -338,6 +340,15 @@ def test_a_file_that_cannot_be_read_is_one_line(tmp_path, capfd, read, name, wor
     assert words in line
     assert str(tmp_path) in line
     assert capfd.readouterr() == ("", "")
+
+
+def test_what_is_hidden_in_one_thread_is_not_in_others(capsys):
+    with images._silent():
+        other = Thread(target=print, args=("progress",))
+        other.start()
+        other.join()
+        print("noise of a library")
+    assert capsys.readouterr().out == "progress\n"
 
 
 def test_samples_finer_than_single_precision_are_refused(tmp_path):
