@@ -89,6 +89,8 @@ def test_the_image_is_that_of_the_inner_integrator_and_the_rock_a_part_of_it(bal
         assert not rock[share == 0].any()
         assert (share == 1).sum() > 100
         assert set(np.unique(np.round(share * spp, 4))) == set(range(spp + 1))
+    seven = render_layers(scene.scene, scene.guides, 7, seed=4)[0]
+    np.testing.assert_array_equal(seven, image)  # rounded up to 8
 
 
 def test_the_image_does_not_depend_on_the_number_of_threads(ball):

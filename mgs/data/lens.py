@@ -171,11 +171,10 @@ def shrunk(
     on the right are cut off. Raises InputError if no block is left."""
     if factor == 1:
         return camera, undo
+    if not 1 <= factor <= min(camera.width, camera.height):
+        size, most = f"{camera.width}x{camera.height}", min(camera.width, camera.height)
+        raise InputError(f"import: downscale {factor} leaves nothing of {size}; give 1 to {most}")
     width, height = camera.width // factor, camera.height // factor
-    if factor < 1 or not width or not height:
-        raise InputError(
-            f"import: downscale {factor} leaves nothing of {camera.width}x{camera.height}; lower it"
-        )
 
     def smaller(pixels: np.ndarray, smooth: bool) -> np.ndarray:
         pixels = undo(pixels, smooth)[: height * factor, : width * factor]

@@ -83,9 +83,10 @@ def render_layers(
     share of samples [H,W]."""
     sensor = scene.sensors()[0]
     sampler, (width, height) = sensor.sampler().clone(), sensor.film().size()
+    sampler.set_sample_count(spp)
+    spp = sampler.sample_count()  # rounded up, where the sampler has a grid
     most = max(RAYS // (width * height), 1)
     each = next(n for n in range(min(spp, most), 0, -1) if spp % n == 0)
-    sampler.set_sample_count(spp)
     sampler.set_samples_per_wavefront(each)
     sampler.seed(seed, width * height * each)
     image = np.zeros((height, width, 1), np.float32)
