@@ -228,6 +228,6 @@ def test_each_diff_touches_one_file_and_what_they_add_works(tmp_path):
     shutil.copytree(ROOT / "mgs", tmp_path / "mgs", ignore=shutil.ignore_patterns("__pycache__"))
     for diff in diffs:
         assert diff.count("\n+++ ") == 1
-        command = ["git", "apply", "--unidiff-zero", "-"]
+        command = ["git", "apply", "-"]
         subprocess.run(command, input=diff, text=True, cwd=tmp_path, check=True)
     subprocess.run([sys.executable, "-c", USE], cwd=tmp_path, check=True)
