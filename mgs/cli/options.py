@@ -163,7 +163,8 @@ def parse_up(text: str) -> tuple[float, float, float] | None:
     try:
         return unit_up([float(part) for part in text.split(",")])
     except (ValueError, InputError):
-        raise InputError(f"up {text!r}: expected auto, or three numbers, as in 0,0,1") from None
+        form = "auto, or three numbers that are not all zero, as in 0,0,1"
+        raise InputError(f"up {text!r}: expected {form}") from None
 
 
 def parse_gaussians(text: str | None, key: str = "gaussians") -> int | Literal["auto"] | None:

@@ -16,7 +16,7 @@ NBV = ["nearest", "travel", "stop_gain", "stop_uncertainty", "stop_psnr", "train
 NBV += ["warm_passes", "train.means", "sh", "exposure=true", "estimator", "lam", "evaluate_every"]
 NBV += ["capture.timeout", "capture.tries", "capture.failure", "capture.distance"]
 SUGGEST = ["ring", "grid", "radius", "elevations", "safe_distance"]
-"""Settings that were options. Ends with a dot: took KIND=NUMBER. With a value: took none."""
+"""Settings that were options. One with a dot at its end took KIND=NUMBER, one with a value none."""
 
 OTHERS = {
     "flight.length": "--flight-length",

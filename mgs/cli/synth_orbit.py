@@ -114,5 +114,6 @@ def _parse_size(size: str | None) -> tuple[int, int] | None:
     sides = re.fullmatch(r"(\d{1,9})x(\d{1,9})", size.lower(), re.ASCII)
     width, height = (int(side) for side in sides.groups()) if sides else (0, 0)
     if not 0 < width * height <= MAX_PIXELS:
-        raise InputError(f"--size {size!r}: expected 320x240 or so, at most {MAX_PIXELS:,} pixels")
+        form = f"WIDTHxHEIGHT, at most {MAX_PIXELS:,} pixels in all, as in 320x240"
+        raise InputError(f"--size {size!r}: expected {form}")
     return width, height

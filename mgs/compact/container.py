@@ -106,9 +106,8 @@ def split(data: bytes, path: Path) -> tuple[Header, dict[Key, bytes]]:
     _, version, *numbers = HEAD.unpack_from(data)
     flags, degree, cut, layers, n, tiles, packets, *reals, digest = numbers
     if version != VERSION:
-        raise InputError(
-            f"{path}: is of version {version}, and this mgs reads {VERSION}; update mgs"
-        )
+        other = f"is of version {version}, and this mgs reads {VERSION}"
+        raise InputError(f"{path}: {other}; use the mgs that made it")
     if degree > MAX_SH_DEGREE:
         raise InputError(f"{path}: has SH degree {degree}, and {MAX_SH_DEGREE} is the most{again}")
     columns = 3 * (degree + 1) ** 2 + 7

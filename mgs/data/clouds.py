@@ -85,9 +85,8 @@ def read_cloud(path: str | Path) -> SparseCloud:
     )
     parts = [column for column in (points, views, track, error_px) if column is not None]
     if len(points) < 2 or not all(np.isfinite(column).all() for column in parts):
-        raise InputError(
-            f"{path}: has values that are not finite, or fewer than two points; make it again"
-        )
+        wrong = "has values that are not finite, or fewer than two different points"
+        raise InputError(f"{path}: {wrong}; make it again")
     if views is not None and not np.linalg.norm(views, axis=1).all():
         views = None  # some programs write zeros for normals
     return SparseCloud(points, views, track, error_px)

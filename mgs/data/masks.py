@@ -32,9 +32,8 @@ def make_masks(
 
     for frame in dataset.frames:
         if frame.mask_path is not None or frame.rock_path is not None:
-            raise InputError(
-                f"frame {frame.name}: has a mask already; import the data without to make others"
-            )
+            cure = "import the data without masks to make others"
+            raise InputError(f"frame {frame.name}: has a mask already; {cure}")
     tests = dataset.test_views()
     if tests is not None and not has_masks(tests.frames):
         make_masks(tests, mesh, progress)

@@ -39,6 +39,7 @@ class Visibility:
     Attributes:
     - positions: camera centres [V,3], metres.
     - seen(frame): squared blending weights in one view [N]. information(frame): `exact` of it.
+    - pool, dome: `Views` of all cameras of the run, and of a dome around the rock.
     - planned(taken, candidates, count, model): at most `count` views to take next, as a set
       (`planned_views`); all candidates where there are no `plan_gains`.
     - path(taken, candidates, count, nearest, model): the same in order, each among the `nearest`

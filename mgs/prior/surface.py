@@ -210,9 +210,8 @@ def _checked_count(samples: float) -> int:
         )
     count = round(samples)
     if count < 2:
-        raise InputError(
-            f"prior: {count} samples are too few for a model; ask for more, or less `spacing`"
-        )
+        few = f"{count} samples are too few for a model"
+        raise InputError(f"prior: {few}; ask for more Gaussians (or a smaller `spacing`)")
     return count
 
 

@@ -23,7 +23,7 @@ class Directional:
 
     degree: of the spherical harmonics. tau: share of the prior's standard deviation that degrees
     above 0 have. over_dome: I-optimality over a dome of poses; else D-optimality, nats. tour: the
-    same for the plan of a flight. Chosen on rocks that judge nothing."""
+    same three for the plan of a flight. Defaults were chosen on rocks that judge nothing."""
 
     degree: int = 2
     tau: float = 0.2

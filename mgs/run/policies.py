@@ -139,9 +139,9 @@ class Cover:
     """COVER ("Coverage Optimization for Camera View Selection", 2026): new viewing directions.
 
     For each Gaussian (1 - cos)/2 of the angle between the candidate's direction and the nearest one
-    from which it was observed, or 1; then the mean over the candidate's view, weighted by squared
-    blending weights. The paper counts all Gaussians in the frustum, and rounds directions to
-    bins."""
+    from which it was observed, or 1 if it never was; then the mean over the candidate's view,
+    weighted by squared blending weights, 0 to 1. The paper counts all Gaussians in the frustum,
+    hidden or not, and rounds directions to bins."""
 
     name: ClassVar[str] = "cover"
     needs_fit: ClassVar[bool] = False

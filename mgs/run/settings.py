@@ -115,7 +115,8 @@ class NbvSettings(ModelSettings, Mission):
         fixed = [f"estimator {self.estimator}"] if self.estimator != "exact" else []
         fixed += ["policy paper"] if self.policy == "paper" else []
         if means != "frozen" and fixed:
-            raise ValueError(f"train.means {means}: {fixed[0]} knows no means; leave out either")
+            lacks = f"{fixed[0]} has no information about means"
+            raise ValueError(f"train.means {means}: {lacks}; leave out either")
         if density != "fixed" and (means != "free" or self.budget > 0):
             needs = "needs free means and all images at once; give `mgs fit --means free`"
             raise ValueError(f"train.density {density}: {needs}")

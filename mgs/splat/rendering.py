@@ -111,7 +111,7 @@ class ListCache:
     def _build(
         self, key: bytes, splats: Splats, camera: Camera, older: BlockLists | None = None
     ) -> BlockLists:
-        """New lists, held. Then those used longest ago are dropped, or the new ones (the class)."""
+        """New lists, kept; over budget those used longest ago go, or these (see the class)."""
         lists = self._lists[key] = blocks.build(splats, camera, older)
         self.builds += 1
         clock, uses = self._clock, self._used

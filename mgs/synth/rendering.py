@@ -335,9 +335,8 @@ def _meter(
             )
         means.append(float(rgb[mask].mean()))
         if not np.isfinite(means[-1]):
-            raise InputError(
-                f"scene: the rock is NaN or infinite in frame {index}; repair its mesh"
-            )
+            bad = f"the rock has pixels that are NaN or infinite in frame {index}"
+            raise InputError(f"scene: {bad}; repair its mesh")
         values.append(rgb.max(-1)[depth > 0])
     target = ROCK_EXPOSURE / float(np.mean(means))
     if np.quantile(np.concatenate(values), 1 - MAX_CLIPPED) * target <= 1:

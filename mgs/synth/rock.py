@@ -101,9 +101,8 @@ def _body(settings: Rock, noise: Noise) -> trimesh.Trimesh:
     origin = low - 0.15 * extent
     shape = np.ceil((high - low + 0.3 * extent) / step) + 1
     if shape.prod() > MAX_GRID:
-        raise InputError(
-            f"scene: rock.detail {settings.detail} m is too fine for {settings.size} m; raise it"
-        )
+        fine = f"rock.detail {settings.detail} m is too fine for a rock of {settings.size} m"
+        raise InputError(f"scene: {fine}; raise it")
     shape = shape.astype(int)
     nodes = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
     points = (origin + step * nodes).astype(np.float32)
@@ -119,9 +118,8 @@ def _body(settings: Rock, noise: Noise) -> trimesh.Trimesh:
         distance = -_smooth_max(-distance, -inside * min(lobe.radii), 0.12)
     distance = gaussian_filter(distance, 0.7)
     if distance.min() >= 0:  # nothing is inside
-        raise InputError(
-            f"scene: rock.detail {settings.detail} m is too coarse for {settings.size} m; lower it"
-        )
+        coarse = f"rock.detail {settings.detail} m is too coarse for a rock of {settings.size} m"
+        raise InputError(f"scene: {coarse}; lower it")
     vertices, faces, _, _ = marching_cubes(distance, 0.0, spacing=(step,) * 3)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh = max(mesh.split(only_watertight=False), key=lambda part: len(part.faces))
