@@ -376,6 +376,8 @@ def test_a_scene_is_exported_without_what_no_view_shows(
         run.gaussians[[*range(len(run.gaussians)), 0]],
     )
     model.means[-1, 2] = 1e3
+    black = int(run.state.H[:, -1].argmax())
+    model.sh[black] = -10  # black, which hides what is behind it, but has no information on colour
     H = sum(mgs.fisher(model, camera) for camera in cameras)
     write_checkpoint(run.folder, replace(run.state, gaussians=model, H=H))
     for of_scene in (False, True):
@@ -384,6 +386,7 @@ def test_a_scene_is_exported_without_what_no_view_shows(
         said, left = capsys.readouterr().out, read_ply(tmp_path / "x.ply")
         assert ("no view taken shows" in said) is of_scene
         assert (left.means[:, 2].max() > 100) is not of_scene
+        assert left.sh.min() == -10
         for camera in cameras:
             rgb = [np.asarray(render(one, camera).rgb) for one in (model, left)]
             np.testing.assert_allclose(*rgb, atol=0.02)

@@ -112,11 +112,14 @@ class Run:
     @property
     def shown(self) -> np.ndarray:
         """Mask [N] of the Gaussians to show and to export: in a whole scene those about which the
-        views taken say more than a colour's prior (`mgs.policy.criteria.observed`). The surface of
-        an object is the prior's where no view saw it, and all of it is shown."""
+        views taken say more than a colour's prior (`mgs.policy.criteria.observed`), and black
+        ones that they see. The surface of an object is the prior's where no view saw it, and all of
+        it is shown."""
         if not self.of_scene:
             return np.ones(len(self.gaussians), bool)
-        return observed(self.state.H, regularisation({"colour": slice(3)}))
+        H = self.state.H
+        black = ~H[:, :3].any(axis=1) & H.any(axis=1)  # clamped at 0, with information on the rest
+        return black | observed(H, regularisation({"colour": slice(3)}))
 
     @property
     def planned(self) -> int:
