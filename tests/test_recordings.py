@@ -502,6 +502,13 @@ def b2(path: Path) -> None:
     path.write_text(path.read_text().replace("</f>", "</f><b2>1</b2>"))
 
 
+def skewed(path: Path) -> None:
+    lines = path.read_text().split("\n")
+    row = lines.index("intrinsic") + 1
+    lines[row] = lines[row].replace(" 0.0 ", " 9.0 ", 1)
+    path.write_text("\n".join(lines))
+
+
 def pickled(path: Path) -> None:
     np.save(path, np.array([{}]), allow_pickle=True)
 
@@ -521,8 +528,10 @@ def pickled(path: Path) -> None:
         ("Bundler", "list.txt", Path.unlink, "list.txt: no such file"),
         ("LLFF", "poses_bounds.npy", halved, "not a readable file of LLFF"),
         ("LLFF", "kf_0003.png", Path.unlink, "(8, 17) for 7 images"),
+        ("LLFF", "images", shutil.rmtree, "has no pictures; give their folder as `images`"),
         ("LLFF", "poses_bounds.npy", pickled, "allow_pickle=False"),
         ("MVSNet", "kf_0000_cam.txt", halved, "not a readable file of MVSNet"),
+        ("MVSNet", "kf_0000_cam.txt", skewed, "has skew, 9; resample the images"),
         ("3D Gaussian Splatting", "cameras.json", nonsense, "not valid JSON"),
     ],
 )

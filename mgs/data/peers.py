@@ -128,6 +128,8 @@ def _llff(path: Path, folders: list[Path]) -> Contents:
     table = np.load(io.BytesIO(read_bytes(path)), allow_pickle=False)
     folder = next((one for one in folders if one.is_dir()), path.parent)
     names = sorted(one.name for one in folder.iterdir() if one.suffix.lower() in PICTURE_SUFFIXES)
+    if not names:
+        raise InputError(f"{path}: {folder} has no pictures; give their folder as `images`")
     if table.shape != (len(names), 17):
         raise ValueError(f"an array of {table.shape} for {len(names)} images, not [N,17]")
     views = []
@@ -151,6 +153,8 @@ def _mvsnet(path: Path, folders: list[Path]) -> Contents:
                 (words.index("intrinsic") + 1, 3),
             )
         )
+        if K[0, 1]:
+            raise InputError(f"{file}: has skew, {K[0, 1]:g}; resample the images without it")
         focal, centre = (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2])
         views.append(View(file.name.removesuffix("_cam.txt"), pose, focal, None, centre))
     return Contents(views)
