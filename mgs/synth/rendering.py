@@ -44,7 +44,7 @@ NOISY_FACTOR = 8  # factor on the samples per pixel if pyoidn, the denoiser, is 
 ROCK_EXPOSURE = 0.2  # mean linear value of the rock over the orbit, which is metered once
 # A dark rock must not blow out bright ground; the scenes of mgs clip at most 0.04.
 MAX_CLIPPED = 0.2  # largest share of rock and ground pixels that the exposure may clip
-MOST_SAMPLES = 2**32  # samples that Mitsuba cannot render at once
+MOST_SAMPLES = 2**32  # in a view; a slip, which would take hours
 PIXEL_BYTES, VIEW_BYTES, IMAGE_BYTES = 4, 2_000, 200  # on disk; in memory
 SHEET_COLUMNS, SHEET_WIDTH, SHEET_FRAMES = 8, 160, 32  # pictures in a row, pixels, most pictures
 

@@ -121,7 +121,7 @@ def _read_run(run: Run, follow: bool) -> Subject:
         return waiting
     early = run.state.steps[-1].get("ended", {}).get("reason", RunEnd.BUDGET) != RunEnd.BUDGET
     planned = "" if early else f" of {run.planned}"
-    count = f"{len(run.indices)}{planned} views, {len(run.gaussians):,} Gaussians"
+    count = f"{len(run.indices)}{planned} views, {run.shown.sum():,} Gaussians"
     scalars = run_scalars(run)
     return replace(
         waiting,
