@@ -57,7 +57,7 @@ def test_setups_are_made_once_and_compare_a_policy_of_ones_own(tmp_path, capsys,
     before = {path.name: path.read_bytes() for path in out.glob("setups*")}
     assert set(before) == {f"setups{end}" for end in (".csv", ".json", ".md", ".png", "-leads.csv")}
     rows = rows_of(out / "setups.csv")
-    assert {row["command"] for row in rows} == {f"python -m studies.setups {out} --rocks 1"}
+    assert {row["command"] for row in rows} == {"python -m studies.setups OUT --rocks 1"}
     assert len(rows) == 2 * 2
     orbits = {path.name for path in out.glob("cells/dataset/boulder-11/*")}
     assert orbits == {"circle-1", "hemisphere-1", "spiral-1.25-2"}

@@ -112,7 +112,8 @@ def write_table(work: Work, name: str, rows: Sequence[Row], text: str, **more: A
     record = {"command": command, "machine": processor(), "versions": versions(), **more}
     write_json(out / f"{name}.json", record | {"rows": rows, "markdown": text})
     write_text(out / f"{name}.md", f"{text}\n`{command}`\n")
-    origin = {"command": command, "commit": versions().get("commit", "")}
+    anywhere = command.replace(str(work.options.out), "OUT")  # names no folder of this machine
+    origin = {"command": anywhere, "commit": versions().get("commit", "")}
     paths = [out / f"{name}{end}" for end in (".csv", ".json", ".md")]
     write_csv(paths[0], [row | origin | row for row in rows])
     return paths
