@@ -21,7 +21,7 @@ from mgs.gaussians import LEARNED
 from mgs.run.policies import Policy
 from studies.frame.case import ROCKS
 from studies.frame.claim import Row
-from studies.frame.output import grouped, scene_mean, table, write_table
+from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
 from studies.frame.program import WORKERS, Study, Work, study_of
 from studies.frame.sweep import Cell
 from studies.setups import SETUPS, SIZES, SetupSize, case_of, shared_scene, sized
@@ -171,9 +171,12 @@ def tables(rows: Sequence[Row]) -> str:
 
 
 def write(work: Work) -> list[Path]:
-    """Write paper.csv, paper.json and paper.md."""
+    """Write paper.csv, paper.json, paper.md and paper.png."""
     rows = rows_of(work)
-    return write_table(work, "paper", rows, tables(rows))
+    changed = [row for row in rows if row["variant"] != LETTER]
+    path, label = work.out / "paper.png", "PSNR on test views over the paper's letter (dB)"
+    draw_panels(path, [Panel("variant", "test_change", "", label)], changed)
+    return [*write_table(work, "paper", rows, tables(rows)), path]
 
 
 STUDY = Study(
