@@ -68,9 +68,10 @@ class Letter:
 
     @staticmethod
     def squares(scene: mgs.Scene, state: mgs.State, view: int) -> np.ndarray:
-        """Squared gradient of the mean squared error of a view taken [N,P]."""
+        """Squared gradient of the mean squared error of a view taken [N,P], in the space in which
+        the model is blended."""
         frame = state.frames[view]
-        image = scene.image(frame)[..., :3].astype(np.float32)
+        image = state.gaussians.blended(scene.image(frame)[..., :3]).astype(np.float32)
         shown = np.asarray(mgs.render(state.gaussians, frame.camera).rgb)
         slope = (shown - image) * (2 / image.size)
         gradient = mgs.vjp(state.gaussians, slope, frame.camera, by=LEARNED)

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from splat.scenes import make_camera, make_gaussians
 
 import mgs
-from mgs.colour import SH_C0
+from mgs.colour import SH_C0, srgb_from_linear
 from mgs.policy import criteria
 from mgs.policy import poses as pose_policies
 from mgs.run.policies import POLICIES
@@ -183,11 +183,13 @@ def test_fisherrf_code_squares_the_gradient_of_each_pixel():
     assert found == pytest.approx(scores, rel=1e-3)
 
 
-def test_the_papers_h_squares_the_gradient_of_the_training_loss():
+@pytest.mark.parametrize("linear", [True, False])
+def test_the_papers_h_squares_the_gradient_of_the_training_loss(linear):
     """Against central differences of the float64 renderer's mean squared error."""
-    model, camera = make_gaussians(6, 3), make_camera()
+    model, camera = replace(make_gaussians(6, 3), linear=linear), make_camera()
     image = np.random.default_rng(0).random((camera.height, camera.width, 3)).astype(np.float32)
     scene = SimpleNamespace(image=lambda frame: image)
+    target = image if linear else srgb_from_linear(image)
     state = SimpleNamespace(frames=[SimpleNamespace(camera=camera)], gaussians=model)
     found = Letter.squares(scene, state, 0)
 
@@ -195,7 +197,7 @@ def test_the_papers_h_squares_the_gradient_of_the_training_loss():
         values = getattr(model, array).astype(np.float64)
         values.reshape(6, -1)[row, column] += step
         moved = replace(model, **{array: values})
-        return np.square(reference.render(moved, camera)["rgb"] - image).mean()
+        return np.square(reference.render(moved, camera)["rgb"] - target).mean()
 
     for column, (array, k) in enumerate((("sh", 0), ("sh", 1), ("sh", 2), ("log_scales", 0))):
         for row in range(6):

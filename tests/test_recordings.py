@@ -355,7 +355,7 @@ OPTIONS = {
     "ROS bag MCAP": ("--pose", "/slam/pose"),
     **dict.fromkeys([*WRITERS][-4:], ("--unit", 1, "--up", "0,0,1")),
 }
-"""What the files of these programs do not say."""
+"""Options for facts that the files of these programs lack."""
 
 
 @pytest.mark.parametrize("kind", WRITERS)

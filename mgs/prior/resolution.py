@@ -23,7 +23,7 @@ MOST_GAUSSIANS = 200_000  # most that cameras decide: close-ups ask for millions
 
 @dataclass(frozen=True)
 class Resolution:
-    """What the closest camera resolves."""
+    """Resolution of the closest camera on the surface."""
 
     pixel: float  # on the surface, metres, rms over the area
     spacing: float  # of the samples, metres

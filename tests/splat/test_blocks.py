@@ -251,7 +251,7 @@ def test_what_drjit_keeps_for_later_is_given_back_before_anything_is_refused(mon
     monkeypatch.setattr(memory, "_spare", lambda: 3e9 if given_back else 1e9)
     memory.check_room(2e9, "much", "take less")
     assert given_back == [True]
-    with pytest.raises(InputError, match=r"more may take 3\.7 GiB, 2\.8 GiB are free"):
+    with pytest.raises(InputError, match=r"more may take 3\.7 GiB, 2\.8 GiB are free; take"):
         memory.check_room(4e9, "more", "take less")
 
 

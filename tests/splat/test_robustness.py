@@ -223,7 +223,7 @@ def test_colours_beyond_measure_are_an_error():
     g = scene()
     g.sh[5, 0, 1] = -1.01 * SH_MAX
     for call in (render, fisher):
-        with pytest.raises(InputError, match="sh is beyond 1,000,000, first at Gaussian 5"):
+        with pytest.raises(InputError, match="sh is beyond 1,000,000, first at Gaussian 5; repair"):
             call(g, CAMERA)
     with pytest.raises(InputError, match="one or three numbers, linear RGB, up to 1,000,000"):
         fisher(scene(), CAMERA, background=(0, -1.01 * SH_MAX, 0))
