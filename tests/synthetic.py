@@ -9,14 +9,11 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from mgs.camera import Camera, look_at
+from mgs import Camera, Frame, PriorSettings, look_at, prior_from_mesh, save_prior
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
-from mgs.data.frames import Frame
 from mgs.data.meshes import to_glb
 from mgs.files import read_json
 from mgs.images import write_exr, write_png
-from mgs.prior.build import prior_from_mesh, save_prior
-from mgs.prior.settings import PriorSettings
 
 CENTRE = np.array([0.1, -0.05, 0.2])
 AXES = np.array([0.6, 0.5, 0.45])

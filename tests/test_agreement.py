@@ -9,11 +9,10 @@ import pytest
 import synthetic
 from program import command, said
 
-from mgs.camera import Camera, look_at
+from mgs import Camera, Frame, look_at
 from mgs.data import agreement as poses
 from mgs.data.agreement import BODY, FLIP, observed
 from mgs.data.dataset import write_transforms
-from mgs.data.frames import Frame
 from mgs.data.structure import Matcher
 from mgs.images import write_exr, write_png
 

@@ -19,16 +19,12 @@ from test_meshes import Made, coloured, glb, parts_of
 from test_meshes import plain as square
 from test_render_command import foreign_ply, gaussians
 
-from mgs import images
+from mgs import InputError, PriorSettings, images, load_cameras, load_prior, prior_from_mesh
 from mgs.data.clouds import read_cloud
-from mgs.data.dataset import load_cameras
 from mgs.data.meshes import load_mesh, read_mesh
 from mgs.data.sources import read_source
-from mgs.errors import InputError
 from mgs.files import read_csv, read_json, read_toml, read_xml
 from mgs.images import read_exr, write_exr
-from mgs.prior.build import load_prior, prior_from_mesh
-from mgs.prior.settings import PriorSettings
 from mgs.splat_files import load_gaussians, write_gaussians
 from mgs.splat_ply import read_ply, write_compressed_ply
 from mgs.synth.rock import load_rock

@@ -14,8 +14,7 @@ from PIL import Image
 from program import command, said
 from test_recordings import MOUNT, OPTICAL, Bag, quaternion
 
-from mgs.camera import look_at
-from mgs.data.dataset import load_dataset
+from mgs import load_dataset, look_at
 from mgs.images import read_depth
 
 RADIUS = 0.09

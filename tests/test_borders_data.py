@@ -12,12 +12,11 @@ from program import command, said
 from refusals import refused
 from test_recordings import write_bag, write_open3d, write_rtabmap
 
-from mgs.camera import Camera
+from mgs import Camera, InputError
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.lens import Lens
 from mgs.data.sources import read_source
-from mgs.errors import InputError
 from mgs.images import read_depth, read_mask
 
 

@@ -13,11 +13,9 @@ import pytest
 from program import command, steps, table_numbers
 from refusals import listing, refused
 
+from mgs import InputError, PriorSettings, build_prior, prior_from_mesh, save_prior
 from mgs.data.check import check_dataset
 from mgs.data.dataset import FILES, load_dataset
-from mgs.errors import InputError
-from mgs.prior.build import build_prior, prior_from_mesh, save_prior
-from mgs.prior.settings import PriorSettings
 from mgs.reports.tables import table_columns
 from mgs.run.inputs import prior_digest
 from mgs.synth import arena, rendering

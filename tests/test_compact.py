@@ -15,16 +15,14 @@ from refusals import refused
 from test_render_command import CAMERAS, gaussians
 
 import mgs
+from mgs import jvp, load_prior, open_run, render, vjp
 from mgs.compact import allocate, coder, container, decode
 from mgs.compact.columns import columns_of, gaussians_of, gradient_of, start_of
 from mgs.compact.encode import Encoder
 from mgs.compact.tree import DEPTH, cells_of, code_descendants, codes_of, tree_of
 from mgs.data.world import PLUS_Z
 from mgs.errors import InputError, Notice
-from mgs.prior.build import load_prior
 from mgs.rotation import rotmat_from_quat
-from mgs.run.folder import open_run
-from mgs.splat import jvp, render, vjp
 from mgs.splat_files import load_gaussians, upward
 
 pytest.importorskip("constriction")

@@ -11,16 +11,15 @@ import synthetic
 import tiny
 from PIL import Image
 
+from mgs import InputError, as_drjit
 from mgs.camera import Camera, look_at, opencv_from_opengl
 from mgs.colour import linear_from_srgb
 from mgs.data.check import check_dataset
 from mgs.data.dataset import Dataset, load_dataset, target_of, write_transforms
 from mgs.data.rock_image import boundary, write_rock_image
-from mgs.errors import InputError
 from mgs.gaussians import ARRAYS
 from mgs.images import write_exr, write_png
 from mgs.prior.exposure import without_gain
-from mgs.splat import as_drjit
 
 W, H = 64, 48
 K = synthetic.orbit_cameras(1, W, H)[0].K

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mgs.errors import InputError
+from mgs import InputError, fit_gaussians
 from mgs.fit import density, fitting
 from mgs.fit.density import Slopes, adapt, split
-from mgs.fit.fitting import fit_gaussians
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.rotation import rotmat_from_quat
 from mgs.splat import reference, render

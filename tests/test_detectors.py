@@ -10,6 +10,7 @@ import tiny
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
+from mgs import as_drjit, run_nbv
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset, target_of, write_transforms
 from mgs.evaluation import evaluate_model, render_view
@@ -18,8 +19,6 @@ from mgs.run import detectors
 from mgs.run.checks import predicted_psnr
 from mgs.run.detectors import DETECTORS, ViewIndicators, alarms, step_indicators, view_indicators
 from mgs.run.ending import why_ended
-from mgs.run.nbv import run_nbv
-from mgs.splat import as_drjit
 
 FITS = detectors.Before(outline=0.001, offset=0.01)
 GOOD = ViewIndicators(FITS, 0.05, 0.02, 1e-3, ratios=(-0.08, 0.0, 0.08), pixels=2000)

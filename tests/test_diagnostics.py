@@ -7,17 +7,13 @@ import tiny
 from PIL import Image
 from plyfile import PlyData
 
-from mgs.camera import Camera, look_at
-from mgs.data.dataset import load_dataset
-from mgs.errors import InputError
+from mgs import Camera, Checkpoint, InputError, Run, groups, load_dataset, look_at
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import read_exr
 from mgs.policy import criteria
 from mgs.reports import diagnostics
 from mgs.run import folder as run_folder
-from mgs.run.folder import Checkpoint, Run
 from mgs.run.settings import NbvSettings
-from mgs.splat import groups
 
 CHANNELS = {
     "R", "G", "B", "A", "Z", "fisher.colour", "fisher.scale", "fisher.rotation", "fisher.opacity",

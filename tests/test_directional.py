@@ -11,15 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from program import steps
 
+from mgs import choose, learn
 from mgs.colour import SH_C0
-from mgs.learning import learn
 from mgs.policy import criteria, directional, pool_gains, visibility
 from mgs.policy.directional import Views, gains
 from mgs.policy.pool_gains import PoolGains
 from mgs.policy.visibility import Visibility, planned_path, planned_views
 from mgs.run import flight
 from mgs.run import folder as run_folder
-from mgs.run.choosing import choose
 from mgs.run.policies import POLICIES
 from mgs.splat import reference
 

@@ -17,10 +17,10 @@ import typer
 from markdown_it import MarkdownIt
 
 import mgs
+from mgs import InputError, write_ply
 from mgs.cli.app import app
 from mgs.colour import SH_C0
 from mgs.data.sources import RECORDINGS
-from mgs.errors import InputError
 from mgs.fit.stopping import StopReason
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.rotation import QUAT_MIN
@@ -28,7 +28,6 @@ from mgs.run.ending import RunEnd
 from mgs.run.policies import POLICIES
 from mgs.splat import ESTIMATORS, constants
 from mgs.splat.blocks import BLOCK_X, BLOCK_Y, TILE
-from mgs.splat_ply import write_ply
 from mgs.synth.scene_file import SceneFile
 from studies.frame.program import study_of
 

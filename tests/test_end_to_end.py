@@ -10,15 +10,11 @@ import pytest
 import synthetic
 from program import command, said, steps, timeless
 
+from mgs import ListCache, initial_gaussians, load_dataset, load_prior, read_ply
 from mgs.cli import app, demo, progress
 from mgs.cli.app import COMMANDS, main
-from mgs.data.dataset import load_dataset
 from mgs.evaluation import psnr_measure
-from mgs.prior.build import load_prior
-from mgs.prior.initial import initial_gaussians
 from mgs.run.policies import POLICIES
-from mgs.splat import ListCache
-from mgs.splat_ply import read_ply
 from mgs.synth.rendering import write_contact_sheet
 
 pytestmark = pytest.mark.usefixtures("coarse_priors")

@@ -16,17 +16,13 @@ from PIL import Image
 from refusals import listing
 from synthetic import orbit_cameras, write_dataset
 
-from mgs import evaluation
+from mgs import Gaussians, InputError, evaluate_run, evaluation, sh_from_rgb, write_ply
 from mgs.colour import linear_from_srgb, srgb_from_linear
-from mgs.errors import InputError
 from mgs.evaluation import evaluate_model, write_comparison
-from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr, write_png
 from mgs.metrics import METRICS, OPAQUE, PSNR_LIMIT, SURFACE_METRICS, compare_surface, psnr, ssim
 from mgs.reports import evaluation as measuring
-from mgs.reports.evaluation import evaluate_run
 from mgs.run.folder import read_checkpoint
-from mgs.splat_ply import write_ply
 
 
 @pytest.fixture

@@ -19,10 +19,9 @@ from test_render_command import CAMERAS, gaussians
 from test_splat_ply import assert_close
 
 import mgs
+from mgs import Gaussians, load_cameras, load_dataset, read_ply, write_ply
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import load_cameras, load_dataset
 from mgs.errors import InputError, Notice
-from mgs.gaussians import Gaussians
 from mgs.images import read_mask
 from mgs.reports.evaluation import compare_models, evaluate
 from mgs.reports.exporting import in_srgb, to_y_up
@@ -32,7 +31,6 @@ from mgs.splat import reference, render
 from mgs.splat.reference import sh_basis
 from mgs.splat_files import FORMATS, load_gaussians, upward, write_gaussians
 from mgs.splat_places import mirrored
-from mgs.splat_ply import read_ply, write_ply
 
 TOLERANCES = {
     "ply": (0, 0, 0, 0, 0),

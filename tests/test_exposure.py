@@ -12,15 +12,14 @@ from hypothesis import strategies as st
 from PIL import ExifTags, Image
 from program import command, said, table_numbers
 
+from mgs import evaluate_run, resume_nbv, run_nbv
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.files import read_json
 from mgs.images import exif_exposure, write_png
 from mgs.metrics import colour_corrected
 from mgs.prior.exposure import DARK, GAIN_STD, RATIO_STD, SATURATED, solve_gains
-from mgs.reports.evaluation import evaluate_run
 from mgs.reports.tables import markdown_table
 from mgs.run.folder import Checkpoint, read_checkpoint
-from mgs.run.nbv import resume_nbv, run_nbv
 
 
 def normalised(gains: np.ndarray) -> np.ndarray:

@@ -15,10 +15,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mgs import files
+from mgs import InputError, files
 from mgs.colour import linear_from_srgb
 from mgs.data.meshes import load_mesh
-from mgs.errors import InputError
 from mgs.files import TOKEN, atomic_folder, atomic_path, copy_file, locked, read_json, write_json
 from mgs.images import read_exr, read_mask, read_png, read_rgba, read_values, write_exr, write_png
 from studies.frame.output import write_csv

@@ -26,21 +26,15 @@ import trimesh
 from PIL import Image
 from test_recordings import WRITERS
 
-from mgs import images
+from mgs import InputError, evaluate_run, images, load_dataset, load_prior, open_run, write_page
 from mgs.cli.app import CURES
 from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
-from mgs.data.dataset import load_dataset
 from mgs.data.meshes import load_mesh
 from mgs.data.sources import read_source
-from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.images import exif_exposure, image_size, read_mask, read_values, write_exr, write_png
-from mgs.prior.build import load_prior
-from mgs.reports.evaluation import evaluate_run
-from mgs.reports.page import write_page
 from mgs.reports.runs import compare_runs
 from mgs.run.candidates import Site, read_poses, refusals
-from mgs.run.folder import open_run
 from mgs.splat_files import load_gaussians
 from mgs.splat_ply import read_ply, write_ply
 from mgs.synth.scene_file import load_scene_file

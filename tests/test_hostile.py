@@ -19,10 +19,8 @@ import tiny
 from program import command, said
 from refusals import listing, refused
 
-from mgs import files
+from mgs import InputError, files, load_dataset, write_ply
 from mgs.cli.printing import step_lines
-from mgs.data.dataset import load_dataset
-from mgs.errors import InputError
 from mgs.files import atomic_folder, atomic_path, below, folder_locked, locked, scratch_folder
 from mgs.images import image_size
 from mgs.reports.page_plots import curve_plot
@@ -30,7 +28,6 @@ from mgs.run.checks import predicted_psnr
 from mgs.run.detectors import alarms
 from mgs.run.folder import open_run, text_of
 from mgs.run.records import Record, checked
-from mgs.splat_ply import write_ply
 from mgs.view.subject import read_subject
 from studies.frame.output import write_csv
 

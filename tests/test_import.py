@@ -20,17 +20,16 @@ from PIL import Image
 from program import command, exit_code, said
 from refusals import listing, refused
 
+from mgs import Frame, InputError
 from mgs.camera import Camera, look_at, opengl_from_opencv
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data import importers
 from mgs.data.check import check_dataset
 from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
-from mgs.data.frames import Frame
 from mgs.data.importers import import_source
 from mgs.data.lens import Lens, undistorter
 from mgs.data.sources import read_source
-from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.images import read_depth, write_png
 

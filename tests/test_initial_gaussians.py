@@ -9,17 +9,13 @@ import synthetic
 from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
-from mgs.camera import Camera, look_at
-from mgs.data.dataset import Dataset
-from mgs.errors import InputError
+from mgs import Camera, Dataset, InputError, PriorSettings, look_at, render
 from mgs.images import write_png
 from mgs.prior import initial
 from mgs.prior.build import Prior, build_prior, load_prior, prior_from_mesh, save_prior
 from mgs.prior.initial import GREY, IN_PLANE_SCALE, THICKNESS, initial_gaussians, pixel_on
-from mgs.prior.settings import PriorSettings
 from mgs.rotation import rotmat_from_quat
 from mgs.run.inputs import prior_digest
-from mgs.splat import render
 
 
 @pytest.fixture(scope="module")

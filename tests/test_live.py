@@ -18,12 +18,11 @@ from refusals import refused
 from scipy.ndimage import gaussian_filter
 
 import mgs
+from mgs import load_dataset, load_prior
 from mgs.camera import look_at, opengl_from_opencv
-from mgs.data.dataset import load_dataset
 from mgs.data.world import unit_up
 from mgs.errors import InputError, Notice
 from mgs.images import read_exr, read_rgba, write_png
-from mgs.prior.build import load_prior
 from mgs.run import live, transports
 from mgs.run.ending import why_ended
 from mgs.run.live import check_photograph

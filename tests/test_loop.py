@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 import mgs
+from mgs import initial_gaussians, read_ply
 from mgs.evaluation import render_view
-from mgs.prior.initial import initial_gaussians
-from mgs.splat_ply import read_ply
 
 
 @pytest.mark.parametrize("policy", [mgs.DOptimal(), mgs.Directional()], ids=lambda p: p.name)

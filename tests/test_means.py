@@ -8,16 +8,11 @@ import tiny
 from program import change_settings
 from refusals import refused
 
-from mgs.camera import Camera, look_at
-from mgs.data.dataset import load_dataset
-from mgs.errors import InputError
-from mgs.fit.fitting import fit_gaussians
+from mgs import Camera, InputError, diagnose, fit_gaussians, load_dataset, load_prior, look_at
 from mgs.fit.objective import objective
 from mgs.fit.settings import MEAN_RATE, TrainSettings
 from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
 from mgs.policy.criteria import DIRECTIONAL_STD, MEAN_STD
-from mgs.prior.build import load_prior
-from mgs.reports.diagnostics import diagnose
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
 from mgs.run.nbv import run_nbv, start_run

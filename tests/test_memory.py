@@ -13,18 +13,13 @@ import pytest
 import synthetic
 
 import mgs
-from mgs import evaluation, scene
+from mgs import Dataset, Frame, PriorSettings, build_prior, evaluation, load_dataset, run_nbv, scene
 from mgs.data import importers
-from mgs.data.dataset import Dataset, load_dataset
-from mgs.data.frames import Frame
 from mgs.data.masks import make_masks
 from mgs.data.meshes import read_mesh
 from mgs.data.sources import read_source
 from mgs.fit import objective
 from mgs.memory import PADDING, adopted, kept_within, padded
-from mgs.prior.build import build_prior
-from mgs.prior.settings import PriorSettings
-from mgs.run.nbv import run_nbv
 
 
 def test_results_are_kept_within_the_budget():

@@ -11,13 +11,10 @@ import trimesh
 from PIL import Image
 from program import command, said
 
+from mgs import Dataset, InputError, PriorSettings, load_prior, prior_from_mesh
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data import meshes
-from mgs.data.dataset import Dataset
 from mgs.data.meshes import Mesh, load_mesh, read_mesh, to_glb
-from mgs.errors import InputError
-from mgs.prior.build import load_prior, prior_from_mesh
-from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import sample_surface
 
 

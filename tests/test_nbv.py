@@ -20,13 +20,11 @@ from hypothesis.extra.numpy import arrays
 from program import change_settings, steps, timeless
 from tiny import resume, run
 
-from mgs.data.dataset import load_dataset
-from mgs.errors import InputError
+from mgs import InputError, load_dataset, read_ply
 from mgs.fit.stopping import StopReason
 from mgs.policy import criteria, poses
 from mgs.run import folder as run_folder
 from mgs.run import policies
-from mgs.splat_ply import read_ply
 
 OF_A_FIT = {"uncertainty", "iterations", "loss", "stop_reason"}
 

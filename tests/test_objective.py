@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import correlate1d
 
-from mgs.camera import Camera, look_at
+from mgs import Camera, InputError, TrainSettings, fit_gaussians, look_at
 from mgs.colour import srgb_from_linear
-from mgs.errors import InputError
-from mgs.fit.fitting import fit_gaussians
 from mgs.fit.losses import LOSSES, similarity
 from mgs.fit.objective import objective
-from mgs.fit.settings import TrainSettings
 from mgs.gaussians import Gaussians, learned
 from mgs.memory import padded
 from mgs.metrics import _similarity

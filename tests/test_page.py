@@ -17,14 +17,10 @@ from program import change_settings, change_steps, command
 from program import steps as read_steps
 from refusals import refused
 
-from mgs.camera import Camera
-from mgs.data.dataset import load_dataset
+from mgs import Camera, evaluate_run, load_dataset, open_run, write_page
 from mgs.files import read_json, write_json
 from mgs.reports import page_pictures
-from mgs.reports.evaluation import evaluate_run
-from mgs.reports.page import write_page
 from mgs.reports.page_plots import corners_at
-from mgs.run.folder import open_run
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,11 @@ import synthetic
 import trimesh
 from program import command, study
 
-from mgs.camera import Camera, look_at
+from mgs import Camera, InputError, PriorSettings, look_at
 from mgs.data.meshes import Mesh
-from mgs.errors import InputError
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.prior.build import _samples, build_prior, prior_from_mesh
 from mgs.prior.resolution import PIXELS_OF_PHOTOGRAPHS, PIXELS_PER_SAMPLE, resolution
-from mgs.prior.settings import PriorSettings
 from studies import parsimony
 from studies.frame.case import Size
 from studies.frame.claim import judged

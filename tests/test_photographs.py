@@ -20,11 +20,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from test_bad_input import bare
 
-from mgs.camera import Camera, look_at
+from mgs import Camera, Frame, PriorSettings, initial_gaussians, look_at
 from mgs.data.check import check_dataset
 from mgs.data.clouds import SparseCloud, read_cloud, views_of, write_cloud
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
-from mgs.data.frames import Frame
 from mgs.data.importers import import_source
 from mgs.data.masks import make_masks
 from mgs.data.meshes import Mesh, distances_to_mesh
@@ -38,10 +37,8 @@ from mgs.images import write_png
 from mgs.prior import hull
 from mgs.prior.build import build_prior, load_prior, prior_and_cloud
 from mgs.prior.hull import visual_hull
-from mgs.prior.initial import initial_gaussians
 from mgs.prior.points import _grown, main_cluster, on_surface, reliable
 from mgs.prior.scattered import scattered
-from mgs.prior.settings import PriorSettings
 from mgs.splat_files import load_gaussians
 from mgs.synth.orbit import perturb
 

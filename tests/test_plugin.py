@@ -13,12 +13,10 @@ from splat.scenes import gradients_of, relative_error, with_gradients
 from test_render_command import gaussians as any_gaussians
 
 import mgs.splat.plugins  # noqa: F401  registers mgs_splat
-from mgs.camera import Camera
+from mgs import Camera, InputError, read_ply, write_ply
 from mgs.colour import linear_from_srgb
-from mgs.errors import InputError
 from mgs.gaussians import ARRAYS, Gaussians
 from mgs.splat import camera_from_sensor, jvp, moved, render
-from mgs.splat_ply import read_ply, write_ply
 
 WIDTH, HEIGHT, FOV = 70, 46, 38.0
 EYE, TARGET = (0.3, -2.0, 0.9), (0.05, 0.0, 0.0)

@@ -7,10 +7,7 @@ import tiny
 from refusals import refused
 
 import mgs
-from mgs.data.dataset import load_dataset
-from mgs.errors import InputError
-from mgs.run.folder import open_run
-from mgs.run.nbv import start_run
+from mgs import InputError, load_dataset, open_run, start_run
 from mgs.run.policy_file import check_policy, policy_of
 
 FUNCTIONS = """

@@ -8,15 +8,12 @@ import synthetic
 import trimesh
 from scipy.spatial import cKDTree
 
-from mgs.camera import Camera, look_at
-from mgs.data.dataset import Dataset
+from mgs import Camera, Dataset, InputError, PriorSettings, look_at
 from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.raycast import mesh_depth
 from mgs.data.visibility import visible
-from mgs.errors import InputError
 from mgs.prior.build import build_prior, load_prior, outline_error, prior_and_cloud, save_prior
 from mgs.prior.segmentation import Plane, ground_plane, rock_cluster
-from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import poisson_mesh, sample_surface
 from mgs.prior.truth import error_to_truth
 from mgs.survey.fusion import Cloud, focus

@@ -16,25 +16,20 @@ from program import change_settings, command
 from refusals import refused
 
 import mgs
+from mgs import InputError, ListCache, fisher, load_dataset, load_prior, nbv, read_ply, save_prior
 from mgs.cli import nbv as nbv_command
 from mgs.cli.app import COMMANDS, _hint, app
 from mgs.cli.options import keys_of, parse_settings
 from mgs.cli.renamed import OPTIONS, renewed
-from mgs.data.dataset import load_dataset
-from mgs.errors import InputError
 from mgs.evaluation import psnr_measure
 from mgs.files import write_json
 from mgs.fit.settings import ALPHA_WEIGHT
 from mgs.images import write_png
 from mgs.policy import criteria
-from mgs.prior.build import load_prior, save_prior
 from mgs.run import folder as run_folder
-from mgs.run import nbv
 from mgs.run.folder import read_checkpoint
 from mgs.run.inputs import prior_digest
 from mgs.run.settings import NbvSettings
-from mgs.splat import ListCache, fisher
-from mgs.splat_ply import read_ply
 
 INTERRUPTED = """
 import builtins

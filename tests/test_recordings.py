@@ -14,12 +14,10 @@ from program import command, said
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from mgs.camera import Camera
+from mgs import Camera, InputError, load_dataset
 from mgs.data import tracks
-from mgs.data.dataset import load_dataset
 from mgs.data.peers import is_peer
 from mgs.data.sources import read_source
-from mgs.errors import InputError
 
 MOUNT = tracks.rigid((0.1, -0.2, 0.3), (0.5, -0.5, 0.5, -0.5))
 """Camera to body of the robot."""

@@ -14,23 +14,16 @@ from program import change_settings, command
 from refusals import refused
 from scipy.stats import multivariate_normal
 
-from mgs import learning
+from mgs import InputError, Scene, evaluate_run, learning, open_run, read_ply, render, run_nbv
 from mgs.camera import Camera, look_at
-from mgs.errors import InputError
 from mgs.fit import evidence
 from mgs.fit.evidence import BLOCKS, DIRECTIONAL, Worth, kinds, lean_fit, paying, worth
 from mgs.fit.fitting import fit_gaussians
 from mgs.fit.settings import TrainSettings
 from mgs.gaussians import LEARNED
 from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD
-from mgs.reports.evaluation import evaluate_run
 from mgs.reports.simplify import REFITTED, refit_run
-from mgs.run.folder import open_run
-from mgs.run.nbv import run_nbv
 from mgs.run.settings import NbvSettings
-from mgs.scene import Scene
-from mgs.splat import render
-from mgs.splat_ply import read_ply
 from studies.bench import surface_camera, surface_gaussians
 
 VIEWS = 8

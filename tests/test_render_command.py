@@ -10,12 +10,10 @@ import pytest
 from PIL import Image
 from program import command
 
+from mgs import Gaussians, render, write_ply
 from mgs.camera import Camera, look_at, opengl_from_opencv
 from mgs.colour import linear_from_srgb, srgb_from_linear
-from mgs.gaussians import Gaussians
 from mgs.images import read_exr
-from mgs.splat import render
-from mgs.splat_ply import write_ply
 
 WIDTH, HEIGHT = 48, 32
 EYES = [(0.0, -2.0, 0.5), (1.6, 1.2, 0.4)]

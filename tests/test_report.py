@@ -13,19 +13,16 @@ from matplotlib import rc_context
 from PIL import Image
 from program import change_settings, change_steps, command, table_numbers
 
-from mgs import plotting
+from mgs import InputError, load_dataset, open_run, plotting
 from mgs.cli import printing
 from mgs.cli.terminal import Terminal
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import load_dataset
-from mgs.errors import InputError
 from mgs.evaluation import render_view
 from mgs.files import read_json, write_json
 from mgs.reports import figures, tables, writing
 from mgs.reports.figures import POLICY_STYLE
 from mgs.reports.page_plots import SYMBOLS
 from mgs.reports.runs import compare_runs
-from mgs.run.folder import open_run
 from mgs.run.policies import POLICIES
 
 FIGURES = ("orbit", "gain", "coverage", "comparison", "psnr")

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from program import change_settings
 from tiny import resume, run
 
-from mgs.data.dataset import load_dataset
-from mgs.errors import InputError
+from mgs import InputError, load_dataset
 from mgs.policy import criteria
 from mgs.run import folder as run_folder
 from mgs.run.ending import run_end

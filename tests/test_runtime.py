@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mgs import runtime
-from mgs.errors import InputError
+from mgs import InputError, runtime
 from mgs.runtime import MIN_LLVM, Libllvm
 
 OLD = [path for path in runtime._candidates() if runtime.load_libllvm(path).version[0] < MIN_LLVM]

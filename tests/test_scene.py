@@ -9,9 +9,8 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from mgs.camera import Camera, look_at
+from mgs import Camera, InputError, look_at
 from mgs.colour import linear_from_srgb
-from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.seeds import generator
 from mgs.synth.arena import make_ground, make_stones

@@ -8,8 +8,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 from test_render_command import foreign_ply, gaussians
 
-from mgs.errors import InputError
-from mgs.gaussians import Gaussians
+from mgs import Gaussians, InputError
 from mgs.splat_ply import read_ply, write_compressed_ply, write_ply
 
 C0 = 0.28209479177387814

@@ -13,18 +13,15 @@ from program import command, exit_code, said
 from refusals import refused
 from scipy.ndimage import map_coordinates
 
-from mgs.camera import Camera, look_at
+from mgs import Camera, Frame, InputError, build_prior, look_at
 from mgs.cli.suggest import _place
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset, write_transforms
-from mgs.data.frames import Frame
 from mgs.data.importers import import_source
 from mgs.data.sources import read_source
-from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.fit.poses import displaced, motion_between
 from mgs.images import write_png
-from mgs.prior.build import build_prior
 from mgs.prior.photographs import check_photographs
 
 WIDTH, HEIGHT = 320, 240

@@ -14,15 +14,13 @@ from pymavlink import mavutil, mavwp
 from refusals import refused
 
 import mgs
+from mgs import Prior, load_cameras, load_dataset, open_run
 from mgs.camera import Camera, heading_and_pitch, look_at
 from mgs.data import flight_plan
-from mgs.data.dataset import load_cameras, load_dataset
 from mgs.data.meshes import distances_to_mesh
 from mgs.data.world import World, unit_up
-from mgs.prior.build import Prior
 from mgs.reports.suggestion import write_suggestion
 from mgs.run.candidates import Site, inside, place_poses, read_poses
-from mgs.run.folder import open_run
 from mgs.run.suggest import coarse_prior, suggest
 
 

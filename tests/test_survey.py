@@ -8,13 +8,11 @@ import synthetic
 from program import command, said
 from scipy.spatial.transform import Rotation
 
-from mgs.camera import Camera, look_at
+from mgs import Camera, PriorSettings, build_prior, look_at
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, write_transforms
 from mgs.data.rock_image import write_rock_image
 from mgs.files import read_json, write_json
 from mgs.images import write_png
-from mgs.prior.build import build_prior
-from mgs.prior.settings import PriorSettings
 from mgs.survey import depth_sensor
 from mgs.survey.depth_sensor import AXIAL_GROWTH, QUANTUM, depth_noise, filter_depth, noisy_depth
 from mgs.survey.flight import SurveySettings, fly, survey_numbers, trajectory_error

@@ -6,14 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mgs.camera import Camera, look_at
-from mgs.errors import InputError
+from mgs import Camera, InputError, ListCache, TrainSettings, fisher, look_at, render
 from mgs.fit.fitting import COLOUR_MIN, fit_gaussians
 from mgs.fit.optimisers import ADAM_EPSILON
-from mgs.fit.settings import TrainSettings
 from mgs.fit.stopping import LOSS_FLOOR, StopReason, stop_reason
 from mgs.gaussians import LEARNED, Gaussians
-from mgs.splat import ListCache, fisher, render
 from studies.bench import surface_camera, surface_gaussians
 
 

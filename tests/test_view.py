@@ -22,13 +22,8 @@ from PIL import Image
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from mgs.camera import Camera, look_at
+from mgs import Camera, Run, evaluate_run, load_dataset, look_at, open_run, render, write_ply
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import load_dataset
-from mgs.reports.evaluation import evaluate_run
-from mgs.run.folder import Run, open_run
-from mgs.splat import render
-from mgs.splat_ply import write_ply
 from mgs.view import layers
 from mgs.view.server import FILLED, Viewer, window_camera
 from mgs.view.subject import read_subject, scaled

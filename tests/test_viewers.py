@@ -18,12 +18,11 @@ from browser import opened
 from PIL import Image
 from program import command
 
+from mgs import open_run, psnr
 from mgs.camera import opengl_from_opencv
 from mgs.colour import srgb_from_linear
 from mgs.evaluation import render_view
-from mgs.metrics import psnr
 from mgs.reports.exporting import to_y_up
-from mgs.run.folder import open_run
 from mgs.splat_files import FORMATS, load_gaussians
 
 pytestmark = pytest.mark.slow

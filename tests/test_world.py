@@ -14,16 +14,12 @@ from matplotlib.text import Text
 from program import command
 
 import mgs
-from mgs import plotting
+from mgs import InputError, Run, open_run, plotting, report, write_page
 from mgs.camera import opencv_from_opengl
 from mgs.data.dataset import load_cameras, load_dataset, write_transforms
 from mgs.data.world import UPRIGHT, World, unit_up
-from mgs.errors import InputError
 from mgs.files import write_json
 from mgs.reports import diagnostics
-from mgs.reports.page import write_page
-from mgs.reports.writing import report
-from mgs.run.folder import Run, open_run
 from mgs.splat_files import load_gaussians
 from mgs.view import layers
 from mgs.view.subject import read_subject

@@ -14,14 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from mgs.camera import Camera, look_at
+from mgs import Camera, Checkpoint, Frame, Gaussians, Scene, TrainSettings, look_at, sh_from_rgb
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
-from mgs.data.frames import Frame
 from mgs.data.meshes import Mesh
 from mgs.files import write_json
-from mgs.fit.settings import TrainSettings
 from mgs.fit.stopping import StopReason
-from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr, write_png
 from mgs.memory import VIEW_BYTES
 from mgs.prior.build import Prior, load_prior, save_prior
@@ -29,9 +26,7 @@ from mgs.progress import Stage, report
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
 from mgs.run import recording
-from mgs.run.folder import Checkpoint
 from mgs.run.settings import NbvSettings
-from mgs.scene import Scene
 
 FRAMES, POINTS, WIDTH, HEIGHT = 12, 40, 16, 12
 GROUPS = {

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mgs import memory
+from mgs import InputError, memory
 from mgs.camera import MAX_PIXELS, MAX_SIDE
-from mgs.errors import InputError
 from mgs.gaussians import ARRAYS, MAX_GAUSSIANS
 from mgs.splat import (
     ListCache,

@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mgs import splat
-from mgs.errors import InputError
+from mgs import InputError, splat
 from mgs.gaussians import ARRAYS
 from mgs.splat import as_drjit, fisher, fisher_derivatives, groups, jvp, moved, reference, render
 

@@ -9,9 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mgs import runtime
+from mgs import ListCache, fisher, jvp, render, runtime
 from mgs.gaussians import ARRAYS
-from mgs.splat import ListCache, fisher, jvp, render
 
 from . import scenes
 from .scenes import gradients_of, in_own_process, make_camera, make_gaussians, thread_count

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import mgs.splat
-from mgs.camera import Camera
-from mgs.errors import InputError
+from mgs import Camera, InputError
 from mgs.gaussians import ARRAYS, SH_MAX, Gaussians
 from mgs.splat import ESTIMATORS, ListCache, fisher, jvp, reference, render
 from mgs.splat.constants import NEAR
