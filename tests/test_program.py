@@ -16,7 +16,7 @@ from program import change_settings, command
 from refusals import refused
 
 import mgs
-from mgs import InputError, ListCache, fisher, load_dataset, load_prior, nbv, read_ply, save_prior
+from mgs import InputError, ListCache, fisher, load_dataset, load_prior, read_ply, save_prior
 from mgs.cli import nbv as nbv_command
 from mgs.cli.app import COMMANDS, _hint, app
 from mgs.cli.options import keys_of, parse_settings
@@ -137,7 +137,7 @@ KINDS = "must be a number for each of colour, scale, rotation, opacity"
 
 def started(dataset: Path, out: Path, prior: Path | None = None, **values) -> NbvSettings:
     """Start a run; the settings in its config.json."""
-    nbv.start_run(dataset, out, prior=prior, **values)
+    mgs.start_run(dataset, out, prior=prior, **values)
     return run_folder.open_run(out).settings
 
 
