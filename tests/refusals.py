@@ -1,9 +1,11 @@
 """Checks of every refusal, and places that a command must keep out of."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from mgs import InputError
 from mgs.cli.app import main
 from studies.frame.program import study_of
 
@@ -30,6 +32,13 @@ def refused(capsys, arguments: list, out: Path | None = None, study: str = "") -
     if out:
         assert listing(out) == before, "something was left behind"
     return lines[0]
+
+
+def fails(words: str, call: Callable[..., object], *arguments, **options) -> None:
+    """Check that a call raises an InputError of one line in which this pattern is found."""
+    with pytest.raises(InputError, match=words) as error:
+        call(*arguments, **options)
+    assert "\n" not in str(error.value)
 
 
 def occupied(path: Path) -> Path:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tiny
 import trimesh
-from refusals import refused
+from refusals import fails, refused
 
 import mgs
 
@@ -64,8 +64,7 @@ def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
     taken = [frame.name for frame in run.taken]
     same = mgs.evaluate(run.gaussians, loaded, trained=taken)
     files = [mgs.evaluate(tmp_path / "run/gaussians.ply", given) for given in (None, dataset)]
-    with pytest.raises(mgs.InputError, match="has no frame typo"):
-        mgs.evaluate(run.gaussians, loaded, trained=[*taken, "typo"])
+    fails("has no frame typo", mgs.evaluate, run.gaussians, loaded, trained=[*taken, "typo"])
     for found in (same, *files):
         assert found["held_out"].items() <= metrics["held_out"].items()
     information = mgs.fisher(run.gaussians, loaded.frames[0].camera)
@@ -93,10 +92,8 @@ def test_a_function_is_a_policy_that_a_resumed_run_asks_for(dataset, prior, tmp_
     with pytest.raises(KeyboardInterrupt):
         mgs.run_nbv(dataset, out, policy=highest, budget=1, on_step=stop, **given)
     assert (out / "policy.py").read_text().startswith("def highest(candidates):")
-    with pytest.raises(mgs.InputError, match=r"in Python: mgs\.resume_nbv\(.*policy=highest\)"):
-        mgs.resume_nbv(out)
-    with pytest.raises(mgs.InputError, match="is not the policy of"):
-        mgs.resume_nbv(out, policy=lambda candidates: candidates[:, 0])
+    fails(r"in Python: mgs\.resume_nbv\(.*policy=highest\)", mgs.resume_nbv, out)
+    fails("is not the policy of", mgs.resume_nbv, out, policy=lambda candidates: candidates[:, 0])
     assert "its policy is a Python function" in refused(capsys, ["nbv", "--resume", out], out)
     run = mgs.resume_nbv(out, policy=highest)
     places = np.array([frame.camera.position for frame in run.dataset.frames])
@@ -106,8 +103,7 @@ def test_a_function_is_a_policy_that_a_resumed_run_asks_for(dataset, prior, tmp_
     with pytest.raises(mgs.InputError, match="unknown parameter view"):
         mgs.start_run(dataset, tmp_path / "wrong", policy=lambda view: 0, **given)
     (out / "policy.py").write_text("def highest(candidates): ...")
-    with pytest.raises(mgs.InputError, match="policy highest: is not as"):
-        mgs.resume_nbv(out, policy=highest)
+    fails("policy highest: is not as", mgs.resume_nbv, out, policy=highest)
 
 
 def test_objects_are_short_in_text_and_have_pictures_in_notebooks(dataset, prior, tmp_path):
@@ -164,5 +160,4 @@ def test_a_fit_takes_a_loss_of_its_own_and_says_what_is_wrong_with_images(datase
     np.testing.assert_allclose(doubled.losses[0], 2 * usual.losses[0], rtol=1e-5)
     with pytest.raises(mgs.InputError, match=r"target: has shape \[2, 2, 3\], expected \[12,16"):
         mgs.fit_gaussians(model, cameras[:1], [np.ones((2, 2, 3))])
-    with pytest.raises(mgs.InputError, match="there are 2 cameras, but 1 targets"):
-        mgs.fit_gaussians(model, cameras, images[:1])
+    fails("there are 2 cameras, but 1 targets", mgs.fit_gaussians, model, cameras, images[:1])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tiny
 from program import study
+from refusals import fails
 
 import mgs
 from mgs.camera import opengl_from_opencv
@@ -68,8 +69,7 @@ def test_a_run_from_random_points_reads_no_candidate(scenes, tmp_path, monkeypat
     assert run.settings.policy == "farthest", "the default where there is no surface"
     assert run.settings.train.means == "free"
     assert set(read) == {data.frames[i].name for i in run.state.taken}
-    with pytest.raises(mgs.InputError, match="need a surface"):
-        mgs.run_nbv(data.root, tmp_path / "other", flight={"length": 9}, **how)
+    fails("need a surface", mgs.run_nbv, data.root, tmp_path / "other", flight={"length": 9}, **how)
     with pytest.raises(mgs.InputError, match="leave out `prior`"):
         mgs.run_nbv(data.root, tmp_path / "other", prior=tmp_path / "run/prior", source="random")
 
@@ -89,5 +89,4 @@ def test_a_split_becomes_test_views(scenes):
     assert (len(train.shots), len(tests.shots)) == (12, 3)
     assert {shot.name for shot in tests.shots} == {f"test_r_{i}" for i in range(3)}
     for split, fault in (("train", "training split"), ("val", "transforms_val.json")):
-        with pytest.raises(mgs.InputError, match=fault):
-            read_source(scenes / "ball", test_split=split)
+        fails(fault, read_source, scenes / "ball", test_split=split)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from program import command, steps, table_numbers
-from refusals import listing, refused
+from refusals import fails, listing, refused
 
 from mgs import InputError, PriorSettings, build_prior, prior_from_mesh, save_prior
 from mgs.data.check import check_dataset
@@ -128,8 +128,7 @@ def test_an_interrupted_dataset_goes_on_only_as_on_demand(poses, tmp_path):
     given, out = (SCENE, TINY), tmp_path / "again"
     with pytest.raises(KeyboardInterrupt):
         synth_orbit(out, *given, seed=3, test_views=2, on_demand=True, progress=stop)
-    with pytest.raises(InputError, match="unfinished dataset of other settings"):
-        synth_orbit(out, *given, seed=3, test_views=2)
+    fails("unfinished dataset of other settings", synth_orbit, out, *given, seed=3, test_views=2)
     synth_orbit(out, *given, seed=3, test_views=2, on_demand=True)
     ours, theirs = listing(out), listing(poses.root)
     assert ours == theirs
@@ -172,8 +171,7 @@ def test_a_mesh_with_noisy_poses_is_captured_from_the_true_ones(full, tmp_path):
     with pytest.raises(InputError, match=r"rock\.glb: has changed since .*poses was made of it"):
         capture_of(poses)(poses.frames[3])
     (tmp_path / "rock.glb").unlink()
-    with pytest.raises(InputError, match=r"rock\.glb: no such mesh"):
-        capture_of(poses)(poses.frames[3])
+    fails(r"rock\.glb: no such mesh", capture_of(poses), poses.frames[3])
 
 
 def test_the_survey_gives_the_prior_of_the_whole_dataset(full, poses):
@@ -208,8 +206,7 @@ def test_a_frame_that_was_never_chosen_has_no_image(captured):
     never = next(frame for frame in dataset.frames if frame.name not in taken(captured))
     message = rf"does not exist, since no run has taken frame {never.name} .* `mgs nbv`"
     for read in (never.rgb, never.mask, never.depth, never.target):
-        with pytest.raises(InputError, match=message):
-            read()
+        fails(message, read)
 
 
 def test_killed_while_it_captures_and_resumed(captured, prior, fresh, tmp_path):
@@ -290,19 +287,15 @@ def test_a_frame_that_cannot_be_rendered_is_refused(fresh):
     pose[0, 3] += 1e-3
     moved = replace(first.camera, world_to_camera=pose)
     for frame in (replace(first, name="kf_9"), replace(first, camera=moved)):
-        with pytest.raises(InputError, match=f"{frame.name} is not one of the scene's orbit"):
-            capture_of(fresh)(frame)
+        fails(f"{frame.name} is not one of the scene's orbit", capture_of(fresh), frame)
     (fresh.root / "config.json").write_text("{}")
-    with pytest.raises(InputError, match="is not of `mgs synth-orbit --on-demand`"):
-        capture_of(fresh)(first)
+    fails("is not of `mgs synth-orbit --on-demand`", capture_of(fresh), first)
     (fresh.root / "config.json").unlink()
-    with pytest.raises(InputError, match=r"config\.json: no such file"):
-        capture_of(fresh)(first)
+    fails(r"config\.json: no such file", capture_of(fresh), first)
 
 
 def test_the_denoiser_that_other_images_have_must_be_there(fresh, monkeypatch):
     config = json.loads((fresh.root / "config.json").read_text())
     (fresh.root / "config.json").write_text(json.dumps(config | {"denoise": True}))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match="denoised by pyoidn, which is not installed"):
-        capture_of(fresh)(fresh.frames[0])
+    fails("denoised by pyoidn, which is not installed", capture_of(fresh), fresh.frames[0])

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from program import command
-from refusals import refused
+from refusals import fails, refused
 from test_render_command import CAMERAS, gaussians
 
 import mgs
@@ -214,8 +214,7 @@ def test_a_file_comes_back_as_its_encoder_says(tmp_path):
             assert read == file.model
     assert upward(path) == pytest.approx(up)
     assert read.origin == (5e5, -2.0, 3.0)
-    with pytest.raises(InputError, match="needs no prior"):
-        load_gaussians(write_ply(tmp_path), tmp_path)
+    fails("needs no prior", load_gaussians, write_ply(tmp_path), tmp_path)
 
 
 def write_ply(folder: Path) -> Path:
@@ -283,9 +282,7 @@ def hostile(data: bytes, place: int, form: str, value) -> bytes:
 def test_hostile_headers_are_refused(tmp_path, place, form, value, message):
     path = tmp_path / "x.mgs"
     path.write_bytes(hostile(FILE.read_bytes(), place, form, value))
-    with pytest.raises(InputError, match=message) as error:
-        load_gaussians(path)
-    assert "\n" not in str(error.value)
+    fails(message, load_gaussians, path)
 
 
 def test_damaged_files_are_refused_or_read(tmp_path):
@@ -336,8 +333,7 @@ def test_the_command_writes_what_fits_and_programs_read_it(dataset, prior, tmp_p
     points = load_prior(prior)
     other = replace(points, points=points.points + 0.01)
     mgs.save_prior(tmp_path / "other", other)
-    with pytest.raises(InputError, match="another prior"):
-        load_gaussians(shared, tmp_path / "other")
+    fails("another prior", load_gaussians, shared, tmp_path / "other")
     for options, message in (
         (["--bytes", "x"], "expected a number of bytes"),
         (["--bytes", "9", "--psnr", "3"], "one of"),

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from refusals import fails
 
 from mgs import InputError, files
 from mgs.colour import linear_from_srgb
@@ -31,8 +32,7 @@ def test_what_the_disk_says_is_one_line(tmp_path):
             temporary.write_text("half")
             raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    with pytest.raises(InputError, match=os.strerror(errno.EROFS)):
-        write()
+    fails(os.strerror(errno.EROFS), write)
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "before"
 
@@ -57,8 +57,7 @@ WRITERS = {
 def test_a_full_disk_is_one_line(tmp_path, name):
     stem, suffix = name.split(".")
     (tmp_path / f".{stem}.{os.getpid()}-{TOKEN}.part.{suffix}").symlink_to("/dev/full")
-    with pytest.raises(InputError, match="No space left"):
-        WRITERS[name](tmp_path / name)
+    fails("No space left", WRITERS[name], tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 
@@ -248,8 +247,7 @@ NO_IMAGE = {
 def test_an_image_that_cannot_be_is_named(tmp_path, name):
     NO_IMAGE[name](tmp_path / name)
     for read in (read_png, read_rgba, read_mask):
-        with pytest.raises(InputError, match=name):
-            read(tmp_path / name)
+        fails(name, read, tmp_path / name)
     write_png(tmp_path / "rgb.png", np.zeros((3, 4, 3)))
     with pytest.raises(InputError, match=r"rgb\.png"):  # of three channels
         read_values(tmp_path / "rgb.png")

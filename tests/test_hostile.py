@@ -17,7 +17,7 @@ import pytest
 import synthetic
 import tiny
 from program import command, said
-from refusals import listing, refused
+from refusals import fails, listing, refused
 
 from mgs import InputError, files, load_dataset, write_ply
 from mgs.cli.printing import step_lines
@@ -44,14 +44,12 @@ def test_an_image_is_measured_by_its_header(capsys, dataset, tmp_path, monkeypat
     out = tmp_path / "out"
     for side in (4_000, 13_300, 200_000):
         bomb(dataset / "images/kf_0000.png", side)
-        with pytest.raises(InputError, match=f"kf_0000.png.*{side}x{side}"):
-            load_dataset(dataset).frames[0].rgb()
+        fails(f"kf_0000.png.*{side}x{side}", load_dataset(dataset).frames[0].rgb)
         line = refused(capsys, ["import", dataset, "--out", out], out)
         assert f"{side}x{side}" in line
     monkeypatch.setattr("mgs.memory.MEMORY_FILE", tmp_path / "meminfo")
     (tmp_path / "meminfo").write_text("MemAvailable: 1000 kB")
-    with pytest.raises(InputError, match="GiB are free"):
-        image_size(bomb(tmp_path / "b.png", 11_000))
+    fails("GiB are free", image_size, bomb(tmp_path / "b.png", 11_000))
 
 
 def test_a_full_disk_behind_the_standard_output():
@@ -279,8 +277,7 @@ def test_the_text_files_of_a_stranger(capsys, stranger, file):
         line = refused(capsys, ["report", stranger, "--html", stranger / "a.html"], stranger)
         assert str(stranger / file) in line
     if file == "metrics.json":
-        with pytest.raises(InputError, match=r"metrics\.json"):
-            read_subject(stranger)
+        fails(r"metrics\.json", read_subject, stranger)
 
 
 FIT = {"iterations": 6, "loss": 0.1, "stop_reason": "settled", "uncertainty": 0.1, "psnr": 30.0}
@@ -386,18 +383,15 @@ def test_nothing_below_a_locked_folder_is_written_through_a_link(outside, tmp_pa
             with pytest.raises(InputError, match="leads out of"), atomic_path(path):
                 pass
         for path in (run / "renders/a", outside / "a"):
-            with pytest.raises(InputError, match=r"leads out of|is not in"):
-                files.remove_file(run, path)
+            fails(r"leads out of|is not in", files.remove_file, run, path)
         with atomic_path(run / "b") as temporary:  # the link itself is replaced
             temporary.write_text("ours")
         files.remove_leftovers(run)
         assert (run / "b").read_text() == "ours"
         assert not (run / "b").is_symlink()
-    with pytest.raises(InputError, match="leads out of"):
-        below(run, "renders")
+    fails("leads out of", below, run, "renders")
     for name in ("../outside", str(outside)):
-        with pytest.raises(InputError, match="leads out of"):
-            below(run, name)
+        fails("leads out of", below, run, name)
 
 
 @pytest.mark.parametrize("use", [locked, folder_locked])
@@ -447,8 +441,7 @@ def test_a_device_is_not_replaced(tmp_path, make):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     for path in (pipe, Path("/dev/null"), Path("/dev/stdout")):
-        with pytest.raises(InputError, match="is a device or a pipe"):
-            files.check_writable(path)
+        fails("is a device or a pipe", files.check_writable, path)
         with pytest.raises(InputError, match="is a device or a pipe"), atomic_path(path):
             pass
     assert pipe.is_fifo()

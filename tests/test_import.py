@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from program import command, exit_code, said
-from refusals import listing, refused
+from refusals import fails, listing, refused
 
-from mgs import Frame, InputError
+from mgs import Frame
 from mgs.camera import Camera, look_at, opengl_from_opencv
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data import importers
@@ -303,8 +303,7 @@ def test_images_are_excluded_by_name(dataset, tmp_path, capsys):
     assert "left out 1 excluded" in said(capsys)[0]
     left = [frame.name for frame in load_dataset(tmp_path / "copy").frames]
     assert left == [*names[:2], *names[3:]]
-    with pytest.raises(InputError, match="exclude 'other'"):
-        read_source(dataset.root, exclude=["other"])
+    fails("exclude 'other'", read_source, dataset.root, exclude=["other"])
 
 
 def test_images_may_be_smaller_than_their_cameras(dataset, tmp_path):

@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import synthetic
+from refusals import fails
 from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
-from mgs import Camera, Dataset, InputError, PriorSettings, look_at, render
+from mgs import Camera, Dataset, PriorSettings, look_at, render
 from mgs.images import write_png
 from mgs.prior import initial
 from mgs.prior.build import Prior, build_prior, load_prior, prior_from_mesh, save_prior
@@ -179,7 +180,5 @@ def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(
     assert prior_digest(replace(loaded, backed=99)) != prior_digest(loaded)
     numbers = json.loads((tmp_path / "prior/prior.json").read_text())
     (tmp_path / "prior/prior.json").write_text(json.dumps(numbers | {"backed": 1000}))
-    with pytest.raises(InputError, match="backed must be a number of the points"):
-        load_prior(tmp_path / "prior")
-    with pytest.raises(InputError, match="0 to 1; correct `backing`"):
-        PriorSettings(gaussians=300, backing=1.5)
+    fails("backed must be a number of the points", load_prior, tmp_path / "prior")
+    fails("0 to 1; correct `backing`", PriorSettings, gaussians=300, backing=1.5)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tiny
 from program import command, steps, timeless
-from refusals import refused
+from refusals import fails, refused
 from scipy.ndimage import gaussian_filter
 
 import mgs
@@ -268,8 +268,7 @@ def test_the_pose_flown_counts_and_a_resumed_run_is_the_same(flight, other, pris
         np.testing.assert_array_equal(camera.K, before.K)
     record = flight.dataset / "captured/kf_0000.json"
     record.write_text(record.read_text().replace("16.5", "16.6"))
-    with pytest.raises(InputError, match=r"kf_0000\.json has changed since"):
-        flight.fly(copying(pristine, aside))
+    fails(r"kf_0000\.json has changed since", flight.fly, copying(pristine, aside))
 
 
 def test_depth_and_images_that_exist_are_kept(dataset, pristine, prior, tmp_path):
@@ -353,8 +352,7 @@ def test_photographs_are_checked(tmp_path, pristine, change, said):
     if said is None:
         check_photograph(frame)
         return
-    with pytest.raises(InputError, match=said):
-        check_photograph(frame)
+    fails(said, check_photograph, frame)
 
 
 def test_bad_options_are_one_line(capsys, pristine, poses, prior, tmp_path):

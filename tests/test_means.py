@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tiny
 from program import change_settings
-from refusals import refused
+from refusals import fails, refused
 
 from mgs import Camera, InputError, diagnose, fit_gaussians, load_dataset, load_prior, look_at
 from mgs.fit.objective import objective
@@ -122,8 +122,7 @@ def test_a_rate_that_is_missing_is_named(cameras, targets):
     with pytest.raises(InputError, match=r"train.rates: has no rate of mean"):
         fit_gaussians(ball(), cameras, targets, TrainSettings(means="free"))
     wanted = NbvSettings(dataset=".", prior=".", train=TrainSettings(means="free"))
-    with pytest.raises(InputError, match="prior_std: has no number for mean"):
-        wanted.regularisation(groups(0, "free"))
+    fails("prior_std: has no number for mean", wanted.regularisation, groups(0, "free"))
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import synthetic
 import trimesh
 from PIL import Image
 from program import command, said
+from refusals import fails
 
 from mgs import Dataset, InputError, PriorSettings, load_prior, prior_from_mesh
 from mgs.colour import linear_from_srgb, srgb_from_linear
@@ -39,14 +40,11 @@ def test_a_plain_ply_is_read_as_trimesh_reads_it(tmp_path, monkeypatch):
     for name in ("vertices", "faces", "seen"):
         assert np.array_equal(getattr(fast, name), getattr(slow, name))
     write(vertices, faces + 1)
-    with pytest.raises(InputError, match="names vertex"):
-        read_mesh(path)
+    fails("names vertex", read_mesh, path)
     write(np.where(vertices > 1, np.nan, vertices), faces)
-    with pytest.raises(InputError, match="is NaN"):
-        read_mesh(path)
+    fails("is NaN", read_mesh, path)
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(InputError, match="not a readable mesh"):
-        read_mesh(path)
+    fails("not a readable mesh", read_mesh, path)
 
 
 def test_the_prior_of_a_glb_stands_upright(dataset, tmp_path, capsys):

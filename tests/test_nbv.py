@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from program import change_settings, steps, timeless
+from refusals import fails
 from tiny import resume, run
 
 from mgs import InputError, load_dataset, read_ply
@@ -229,8 +230,7 @@ def test_a_run_of_other_frames_or_without_settings_is_named(loaded, tmp_path):
     with pytest.raises(InputError, match="frames differ"):
         run_folder.open_run(out).dataset  # noqa: B018
     (out / "config.json").write_text("{}")
-    with pytest.raises(InputError, match=r"is damaged \(settings: "):
-        run_folder.open_run(out)
+    fails(r"is damaged \(settings: ", run_folder.open_run, out)
 
 
 def test_a_step_is_a_view_and_the_last_of_a_batch_has_its_fit(loaded, tmp_path):

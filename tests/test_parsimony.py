@@ -8,6 +8,7 @@ import pytest
 import synthetic
 import trimesh
 from program import command, study
+from refusals import fails
 
 from mgs import Camera, InputError, PriorSettings, look_at
 from mgs.data.meshes import Mesh
@@ -47,8 +48,7 @@ def test_a_density_is_samples_for_each_pixel():
         len(_samples(square(), PriorSettings(density=density), None, 0.05)[0]) for density in (1, 4)
     )
     assert four / once == pytest.approx(4, rel=0.05)
-    with pytest.raises(InputError, match="density 0 must be positive"):
-        PriorSettings(density=0)
+    fails("density 0 must be positive", PriorSettings, density=0)
 
 
 def test_only_cameras_count_that_see_the_face():
@@ -59,8 +59,7 @@ def test_only_cameras_count_that_see_the_face():
     middle = resolution(mesh, [first, camera_above(0.2, focal=400)])
     whole = resolution(mesh, [camera_above(0.2, focal=400, size=4000)])
     assert alone.samples < middle.samples < whole.samples
-    with pytest.raises(InputError, match="give `gaussians`"):
-        resolution(mesh, [camera_above(-2.0)])
+    fails("give `gaussians`", resolution, mesh, [camera_above(-2.0)])
 
 
 @pytest.fixture(scope="module")

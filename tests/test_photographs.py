@@ -14,7 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from program import command, exit_code, said
-from refusals import refused
+from refusals import fails, refused
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -30,7 +30,7 @@ from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.shots import Shot, Source
 from mgs.data.sources import read_source
 from mgs.data.world import World, degrees_between, levelled, unit_up, up_of_cameras
-from mgs.errors import InputError, Notice
+from mgs.errors import Notice
 from mgs.files import read_json, write_json
 from mgs.fit import density
 from mgs.images import write_png
@@ -173,8 +173,7 @@ def test_masks_that_do_not_fit_are_one_line_that_names_a_frame(tmp_path):
     # With scattered pixels the grid reaches beyond all images, where no mask is against a point.
     for k, frame in enumerate(dataset.frames):
         write_png(frame.mask_path, np.random.default_rng(k).random((72, 96)) < 0.01)
-    with pytest.raises(InputError, match="share no point in space"):
-        visual_hull(dataset.frames)
+    fails("share no point in space", visual_hull, dataset.frames)
 
 
 # Points

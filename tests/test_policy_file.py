@@ -4,7 +4,7 @@ import json
 
 import pytest
 import tiny
-from refusals import refused
+from refusals import fails, refused
 
 import mgs
 from mgs import InputError, load_dataset, open_run, start_run
@@ -127,9 +127,7 @@ def test_a_policy_that_cannot_be_loaded_is_one_line(dataset, file, tmp_path, nam
     (tmp_path / "worse.py").write_text("\n\nimport nothing_like_it\n")
     (tmp_path / "exit.py").write_text("raise SystemExit(0)\n")
     prior, out, policy = tiny.write_prior(tmp_path / "prior"), tmp_path / "run", tmp_path / name
-    with pytest.raises(InputError, match=message) as found:
-        mgs.run_nbv(dataset, out, prior=prior, policy=str(policy))
-    assert "\n" not in str(found.value)
+    fails(message, mgs.run_nbv, dataset, out, prior=prior, policy=str(policy))
     assert not out.exists()
 
 
@@ -142,8 +140,7 @@ def test_a_policy_that_cannot_be_loaded_is_one_line(dataset, file, tmp_path, nam
     ],
 )
 def test_a_policy_that_fails_keeps_the_steps_before(loaded, file, tmp_path, function, message):
-    with pytest.raises(InputError, match=message):
-        run(tmp_path / "run", loaded, policy=f"{file}:{function}")
+    fails(message, run, tmp_path / "run", loaded, policy=f"{file}:{function}")
     assert len((tmp_path / "run/steps.jsonl").read_text().splitlines()) == 1
 
 
@@ -165,8 +162,7 @@ def test_a_run_goes_on_with_the_same_file_only(dataset, file, tmp_path, monkeypa
     settings = open_run(half).settings.model_copy(update={"budget": 2})
     further = lambda: tiny.go(half, settings, loaded)  # noqa: E731
     file.write_text(FUNCTIONS + "\n")
-    with pytest.raises(InputError, match=r"mine\.py:poses: its file has changed since .*half was"):
-        further()
+    fails(r"mine\.py:poses: its file has changed since .*half was", further)
     file.write_text(FUNCTIONS)
     assert len(further().taken) == 5
 
@@ -174,8 +170,7 @@ def test_a_run_goes_on_with_the_same_file_only(dataset, file, tmp_path, monkeypa
 def test_a_name_is_checked_without_running_its_file(tmp_path):
     (tmp_path / "loud.py").write_text("raise SystemExit\n\ndef loud(candidates): ...\n")
     check_policy(f"{tmp_path}/loud.py:loud")
-    with pytest.raises(InputError, match="unknown; choose one"):
-        check_policy("best")
+    fails("unknown; choose one", check_policy, "best")
 
 
 def test_a_file_is_executed_once_until_it_changes(tmp_path):

@@ -13,7 +13,7 @@ import pytest
 import tiny
 import typer
 from program import change_settings, command
-from refusals import refused
+from refusals import fails, refused
 
 import mgs
 from mgs import InputError, ListCache, fisher, load_dataset, load_prior, read_ply, save_prior
@@ -116,12 +116,10 @@ def test_help_ends_with_the_settings_that_have_no_option(capsys):
 def test_a_setting_has_the_same_name_in_python_and_on_the_command_line(tmp_path, capsys):
     data, prior = tiny.write_dataset(tmp_path / "data"), tiny.write_prior(tmp_path / "prior")
     wrong = "train.alpha_weight = -1: must be at least 0"
-    with pytest.raises(mgs.InputError, match=wrong):
-        mgs.run_nbv(data, tmp_path / "run", prior=prior, train={"alpha_weight": -1})
+    fails(wrong, mgs.run_nbv, data, tmp_path / "run", prior=prior, train={"alpha_weight": -1})
     words = ["nbv", data, "--prior", prior, "--out", tmp_path / "run"]
     assert wrong in refused(capsys, [*words, "--set", "train.alpha_weight=-1"], tmp_path)
-    with pytest.raises(mgs.InputError, match=r"runs/--no-such-run/data"):
-        mgs.load_dataset("runs/--no-such-run/data")
+    fails(r"runs/--no-such-run/data", mgs.load_dataset, "runs/--no-such-run/data")
 
 
 def test_no_command_has_many_options_and_each_has_its_help():

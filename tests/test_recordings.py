@@ -11,10 +11,10 @@ import pytest
 import synthetic
 from PIL import Image
 from program import command, said
-from refusals import refused
+from refusals import fails, refused
 from scipy.spatial.transform import Rotation
 
-from mgs import Camera, InputError, load_dataset
+from mgs import Camera, load_dataset
 from mgs.data import tracks
 from mgs.data.peers import is_peer
 from mgs.data.sources import read_source
@@ -470,8 +470,7 @@ def test_poses_are_interpolated():
 
 @pytest.mark.parametrize("text", ["", "0.5", "-1s", "1 km"])
 def test_bad_spacings(text):
-    with pytest.raises(InputError, match="expected seconds or metres"):
-        tracks.Spacing.parse(text)
+    fails("expected seconds or metres", tracks.Spacing.parse, text)
 
 
 LEFT_OUT = {

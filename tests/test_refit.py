@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from plyfile import PlyData
 from program import change_settings, command
-from refusals import refused
+from refusals import fails, refused
 from scipy.stats import multivariate_normal
 
-from mgs import InputError, Scene, evaluate_run, learning, open_run, read_ply, render, run_nbv
+from mgs import Scene, evaluate_run, learning, open_run, read_ply, render, run_nbv
 from mgs.camera import Camera, look_at
 from mgs.fit import evidence
 from mgs.fit.evidence import BLOCKS, DIRECTIONAL, Worth, kinds, lean_fit, paying, worth
@@ -272,10 +272,8 @@ def test_a_run_that_learns_means_is_refitted_too(run, tmp_path):
 def test_a_run_that_cannot_be_refitted_is_one_line(run, tmp_path):
     shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns(REFITTED))
     change_settings(tmp_path / "run", prior=str(tmp_path / "nowhere"))
-    with pytest.raises(InputError, match="nowhere"):
-        refit_run(tmp_path / "run")
+    fails("nowhere", refit_run, tmp_path / "run")
     train = {"density": "adaptive", "means": "free"}
     change_settings(tmp_path / "run", budget=0, train=train)
-    with pytest.raises(InputError, match="needs a run with train"):
-        refit_run(tmp_path / "run")
+    fails("needs a run with train", refit_run, tmp_path / "run")
     assert not (tmp_path / "run" / REFITTED).exists()

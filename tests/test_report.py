@@ -12,8 +12,9 @@ import tiny
 from matplotlib import rc_context
 from PIL import Image
 from program import change_settings, change_steps, command, table_numbers
+from refusals import fails
 
-from mgs import InputError, load_dataset, open_run, plotting
+from mgs import load_dataset, open_run, plotting
 from mgs.cli import printing
 from mgs.cli.terminal import Terminal
 from mgs.colour import srgb_from_linear
@@ -157,8 +158,7 @@ def test_figures_are_written_as_asked_for_and_those_left_out_are_named(runs, tmp
     assert left_out in said
     assert said.count("left out") == 1
     ending = r"gain\.eps: figures are written as png, pdf, svg; choose another ending"
-    with pytest.raises(InputError, match=ending):
-        figures.curves_figure(tmp_path / "gain.eps", "gain", {"gain": {}})
+    fails(ending, figures.curves_figure, tmp_path / "gain.eps", "gain", {"gain": {}})
 
 
 def test_table(runs):
@@ -210,8 +210,7 @@ def test_runs_of_one_policy_are_told_apart_by_their_folders(runs, tmp_path):
     labels = ["d-optimal", "random (random)", "random (again)"]
     assert list(compare_runs([*runs, other])) == labels
     assert list(compare_runs([runs[0].parent])) == ["d-optimal", "random"]
-    with pytest.raises(InputError, match="same policy and folder name"):
-        compare_runs([runs[1], runs[1]])
+    fails("same policy and folder name", compare_runs, [runs[1], runs[1]])
 
 
 def edit(name, **values):
@@ -253,8 +252,7 @@ UNFIT = {
 def test_runs_that_cannot_be_reported(runs, tmp_path, change, named):
     run = shutil.copytree(runs[1], tmp_path / "run")
     change(run)
-    with pytest.raises(InputError, match=re.escape(named)):
-        writing.report([runs[0], run], tmp_path / "report")
+    fails(re.escape(named), writing.report, [runs[0], run], tmp_path / "report")
     assert not (tmp_path / "report").exists()
 
 

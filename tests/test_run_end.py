@@ -11,6 +11,7 @@ import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from program import change_settings
+from refusals import fails
 from tiny import resume, run
 
 from mgs import InputError, load_dataset
@@ -145,8 +146,7 @@ def test_a_run_does_not_go_on_from_changed_inputs(half_done, message):
     root, out = half_done
     CHANGES[message](root)
     before = (out / "steps.jsonl").read_text()
-    with pytest.raises(InputError, match=message):
-        tiny.resume(out, load_dataset(root))
+    fails(message, tiny.resume, out, load_dataset(root))
     assert (out / "steps.jsonl").read_text() == before
 
 

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from refusals import fails
 
 from mgs import InputError, runtime
 from mgs.runtime import MIN_LLVM, Libllvm
@@ -45,19 +46,16 @@ def test_order(monkeypatch):
     assert runtime.find_libllvm().path == "good"
     fake(monkeypatch, {"old": 15, "older": 14})
     said = r"old: is version 15, older than 19; install version 19 or newer.*apt-get.*conda"
-    with pytest.raises(InputError, match=said):
-        runtime.find_libllvm()
+    fails(said, runtime.find_libllvm)
     fake(monkeypatch, {})
-    with pytest.raises(InputError, match="none found; install version 19"):
-        runtime.find_libllvm()
+    fails("none found; install version 19", runtime.find_libllvm)
 
 
 def test_an_explicit_choice_is_honoured(monkeypatch):
     fake(monkeypatch, {"good": 19, "old": 15})
     monkeypatch.setenv(runtime.LIBRARY_VARIABLE, "old")
     said = "is version 15, older than 19, but DRJIT_LIBLLVM_PATH names it"
-    with pytest.raises(InputError, match=said):
-        runtime.find_libllvm()
+    fails(said, runtime.find_libllvm)
     monkeypatch.setenv(runtime.LIBRARY_VARIABLE, "")
     assert runtime.find_libllvm().path == "good"
 

@@ -7,9 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import trimesh
+from refusals import fails
 from scipy.spatial import cKDTree
 
-from mgs import Camera, InputError, look_at
+from mgs import Camera, look_at
 from mgs.colour import linear_from_srgb
 from mgs.files import write_json
 from mgs.seeds import generator
@@ -221,5 +222,4 @@ def test_the_sensor_of_a_dataset_is_its_scenes(tmp_path):
     write_json(tmp_path / "config.json", {"scene": {"sensor": {"noise": 2.5, "drift": 0.0}}})
     assert sensor_of(tmp_path) == Sensor(noise=2.5, drift=0.0)
     write_json(tmp_path / "config.json", {"scene": {"sensor": {"noise": -1}}})
-    with pytest.raises(InputError, match=r"scene\.sensor is damaged"):
-        sensor_of(tmp_path)
+    fails(r"scene\.sensor is damaged", sensor_of, tmp_path)

@@ -10,7 +10,7 @@ import pytest
 import synthetic
 from PIL import ExifTags, Image
 from program import command, exit_code, said
-from refusals import refused
+from refusals import fails, refused
 from scipy.ndimage import map_coordinates
 
 from mgs import Camera, Frame, InputError, build_prior, look_at
@@ -206,8 +206,7 @@ def test_a_distance_gives_the_scale(placed):
     eyes = {shot.name: shot.camera.position for shot in scaled.shots}
     assert np.linalg.norm(eyes["view 00"] - eyes["view 06"]) == pytest.approx(10)
     for wrong in ("view 00.jpg,10", "view 00.jpg,other,10", "view 00.jpg,view 01.jpg,0"):
-        with pytest.raises(InputError, match="distance"):
-            placed[1].with_distance(wrong)
+        fails("distance", placed[1].with_distance, wrong)
 
 
 @pytest.mark.parametrize("case", ["one", "apart", "file", "none"])

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import fails
 
 from mgs import Camera, InputError, ListCache, TrainSettings, fisher, look_at, render
 from mgs.fit.fitting import COLOUR_MIN, fit_gaussians
@@ -237,8 +238,7 @@ def test_what_is_refused_for_another_reason_than_its_numbers_is_no_divergence(
     truth, cameras, targets, monkeypatch
 ):
     monkeypatch.setattr("mgs.splat.blocks.MAX_PAIRS", 4)
-    with pytest.raises(InputError, match="pairs"):
-        fit_gaussians(grey(truth), cameras, targets, TrainSettings(passes=1))
+    fails("pairs", fit_gaussians, grey(truth), cameras, targets, TrainSettings(passes=1))
 
 
 def test_colours_stay_above_zero_and_none_is_dead(truth, cameras, targets):
@@ -273,5 +273,4 @@ def test_a_start_of_another_shape_is_refused(truth, cameras, targets):
     ],
 )
 def test_unusable_settings_are_refused(truth, values, words):
-    with pytest.raises(InputError, match=words):
-        fit_gaussians(truth, [], [], TrainSettings(**values))
+    fails(words, fit_gaussians, truth, [], [], TrainSettings(**values))

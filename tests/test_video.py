@@ -10,9 +10,8 @@ import pytest
 import tiny
 from PIL import Image
 from program import change_settings, command
-from refusals import refused
+from refusals import fails, refused
 
-from mgs.errors import InputError
 from mgs.reports import story
 from mgs.reports.video import camera_path, path_among, write_film
 
@@ -81,8 +80,7 @@ def test_a_film_that_is_cut_off_is_refused(tmp_path):
     noise = iter(rng.integers(0, 255, (30, 64, 96, 3), np.uint8))
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
     try:
-        with pytest.raises(InputError, match="only 0 of 30 frames"):
-            write_film(tmp_path / "a.mp4", noise, [0.1] * 30)
+        fails("only 0 of 30 frames", write_film, tmp_path / "a.mp4", noise, [0.1] * 30)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []

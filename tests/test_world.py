@@ -12,6 +12,7 @@ import tiny
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from program import command
+from refusals import fails
 
 import mgs
 from mgs import InputError, Run, open_run, plotting, report, write_page
@@ -108,8 +109,7 @@ def test_the_up_of_the_prior_goes_before_that_of_the_dataset(runs, tmp_path):
 
 def test_a_scene_of_two_worlds_is_refused(runs):
     dataset = open_run(runs[1]).dataset
-    with pytest.raises(InputError, match="was built with up"):
-        mgs.Scene(dataset, tiny.prior())
+    fails("was built with up", mgs.Scene, dataset, tiny.prior())
 
 
 def test_a_tilted_run_of_an_older_version_is_refused(runs, tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import fails
 
 from mgs import InputError, memory
 from mgs.camera import MAX_PIXELS, MAX_SIDE
@@ -226,8 +227,7 @@ def test_pairs_are_counted_in_64_bits(size, n, what):
     many = one.map(lambda array: np.repeat(array, n, 0))
     many.log_scales[:], many.logit_opacities[:] = 9, 2
     said = f"^view: 4,294,967,296 pairs of a Gaussian and one of its {what} .* 512.0 GiB.*$"
-    with pytest.raises(InputError, match=said):
-        render(many, camera)
+    fails(said, render, many, camera)
 
 
 def test_what_memory_has_no_room_for_is_refused(monkeypatch, tmp_path):
@@ -235,10 +235,8 @@ def test_what_memory_has_no_room_for_is_refused(monkeypatch, tmp_path):
     monkeypatch.setattr(memory, "MEMORY_FILE", spare)
     monkeypatch.setattr(memory, "LITTLE", 0)
     spare.write_text("MemTotal:  9 kB\nMemAvailable:  20 kB\n")
-    with pytest.raises(InputError, match=r"view: [0-9,]+ pairs .* GiB are free; draw fewer"):
-        render(g, camera)
-    with pytest.raises(InputError, match="fisher: blocks of 60 G"):
-        fisher(g, camera, "block")
+    fails(r"view: [0-9,]+ pairs .* GiB are free; draw fewer", render, g, camera)
+    fails("fisher: blocks of 60 G", fisher, g, camera, "block")
     spare.unlink()  # a system that does not report it
     render(g, camera)
     fisher(g, camera, "block")
@@ -269,8 +267,7 @@ def test_places_in_buffers_stay_below_31_bits():
 
 def test_what_is_too_large_for_the_kernels_is_refused_at_once():
     for size in ((1, MAX_SIDE + 1), (MAX_SIDE + 1, 1)):
-        with pytest.raises(InputError, match="must be at most 1,048,576 pixels either way"):
-            make_camera(size)
+        fails("must be at most 1,048,576 pixels either way", make_camera, size)
     one = make_gaussians(1, 0, 3)
 
     def many(n):

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import fails
 
-from mgs import InputError, splat
+from mgs import splat
 from mgs.gaussians import ARRAYS
 from mgs.splat import as_drjit, fisher, fisher_derivatives, groups, jvp, moved, reference, render
 
@@ -254,9 +255,7 @@ def test_any_image_size(size):
 )
 def test_bad_tangents_are_one_line(tangents, message):
     gaussians, camera = case(0)
-    with pytest.raises(InputError, match=message) as error:
-        jvp(gaussians, tangents, camera)
-    assert "\n" not in str(error.value)
+    fails(message, jvp, gaussians, tangents, camera)
 
 
 @pytest.mark.parametrize(
@@ -320,13 +319,11 @@ def test_where_a_camera_has_no_derivative_a_line_says_so():
     gaussians, camera = case(0)
     motion = mi.Float64([0.0] * 6)
     dr.enable_grad(motion)
-    with pytest.raises(InputError, match="use mgs"):
-        fisher(gaussians, moved(camera, motion))
+    fails("use mgs", fisher, gaussians, moved(camera, motion))
     assert np.array_equal(
         fisher(gaussians, moved(camera, dr.detach(motion))), fisher(gaussians, camera)
     )
-    with pytest.raises(InputError, match="origin"):
-        moved(camera, motion).seen_from((1, 0, 0))
+    fails("origin", moved(camera, motion).seen_from, (1, 0, 0))
     frozen = dr.freeze(lambda x: render(gaussians, camera).rgb * x)
     with pytest.raises(RuntimeError) as error:
         frozen(mi.Float(1))

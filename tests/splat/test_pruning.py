@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import fails
 
-from mgs.errors import InputError
 from mgs.fit.pruning import NEIGHBOURS, prune, removal_cost
 from mgs.splat import reference, render
 
@@ -94,5 +94,4 @@ def test_gaussians_that_no_camera_sees_go_first_and_reruns_are_equal():
 
 
 def test_a_noise_that_is_not_positive_is_one_line():
-    with pytest.raises(InputError, match="noise"):
-        prune(wall(), [make_camera()], float("nan"))
+    fails("noise", prune, wall(), [make_camera()], float("nan"))

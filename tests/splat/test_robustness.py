@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from refusals import fails
 
 import mgs.splat
 from mgs import Camera, InputError
@@ -147,8 +148,7 @@ def test_image_sizes_may_be_numpys_integers_and_are_whole():
     camera, (width, height) = make_camera(), SIZE
     counted = Camera(camera.K, np.int64(width), np.uint16(height), camera.world_to_camera)
     np.testing.assert_array_equal(render(scene(2), counted).rgb, render(scene(2), camera).rgb)
-    with pytest.raises(InputError, match="must be whole pixels"):
-        Camera(camera.K, 45.5, 31, camera.world_to_camera)
+    fails("must be whole pixels", Camera, camera.K, 45.5, 31, camera.world_to_camera)
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -204,8 +204,7 @@ def test_not_a_number_names_the_parameter_and_the_first_gaussian(name):
         lambda: render(g, CAMERA, cache=cache),
         lambda: fisher(g, CAMERA),
     ):
-        with pytest.raises(InputError, match=f"{name} is NaN or infinite, first at Gaussian 5"):
-            call()
+        fails(f"{name} is NaN or infinite, first at Gaussian 5", call)
 
 
 def test_opacities_of_extreme_logits():
@@ -222,8 +221,7 @@ def test_colours_beyond_measure_are_an_error():
     g = scene()
     g.sh[5, 0, 1] = -1.01 * SH_MAX
     for call in (render, fisher):
-        with pytest.raises(InputError, match="sh is beyond 1,000,000, first at Gaussian 5; repair"):
-            call(g, CAMERA)
+        fails("sh is beyond 1,000,000, first at Gaussian 5; repair", call, g, CAMERA)
     with pytest.raises(InputError, match="one or three numbers, linear RGB, up to 1,000,000"):
         fisher(scene(), CAMERA, background=(0, -1.01 * SH_MAX, 0))
 
@@ -240,8 +238,7 @@ def test_the_largest_colours_have_finite_information_and_gradients(estimator):
 def test_a_bad_number_behind_the_camera_is_an_error_too():
     g = behind_camera()
     g.sh[0, 0, 1] = np.nan
-    with pytest.raises(InputError, match="sh is NaN or infinite, first at Gaussian 0"):
-        render(g, CAMERA)
+    fails("sh is NaN or infinite, first at Gaussian 0", render, g, CAMERA)
 
 
 @pytest.mark.parametrize(
@@ -256,8 +253,7 @@ def test_a_bad_number_behind_the_camera_is_an_error_too():
 )
 def test_shapes_that_do_not_fit_are_an_error(name, shape, message):
     for call in (render, fisher):
-        with pytest.raises(InputError, match=message):
-            call(changed(scene(), **{name: np.zeros(shape)}), CAMERA)
+        fails(message, call, changed(scene(), **{name: np.zeros(shape)}), CAMERA)
 
 
 def test_no_variant_is_named_in_the_code():
