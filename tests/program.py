@@ -1,6 +1,9 @@
 """Run commands of the program and studies in this process, and read the steps of a run."""
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +35,26 @@ def study(name, *arguments, exit_code=0, **changes) -> None:
     with pytest.raises(SystemExit) as stop:
         replace(study_of(name), **changes)([str(argument) for argument in arguments])
     assert stop.value.code == exit_code
+
+
+def python(program: str, *arguments, env=(), **options) -> subprocess.CompletedProcess:
+    """Run the text of a program in a new process, and capture what it prints. env: variables beside
+    those of this process."""
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    options = {"capture_output": True, "text": True, "timeout": 300} | options
+    return subprocess.run(command, env=os.environ | dict(env), **options)
+
+
+def stop_at(count: int = 1) -> Callable[..., None]:
+    """A callback that interrupts at its count-th call."""
+    calls = []
+
+    def called(*_, **__):
+        calls.append(1)
+        if len(calls) == count:
+            raise KeyboardInterrupt
+
+    return called
 
 
 def said(capsys) -> tuple[str, str]:

@@ -22,14 +22,26 @@ GROUND = 4.0
 """Half edge of the square arena, metres; beyond it there is no depth."""
 
 
+def pinhole(focal: float, width: int, height: int, eye, target=(0, 0, 0)) -> Camera:
+    """A camera at `eye` that looks at `target`, its principal point in the middle."""
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    return Camera(K, width, height, look_at(eye, target))
+
+
+def sphere(count: int) -> np.ndarray:
+    """Points [N,3] of a Fibonacci lattice on the unit sphere."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle, radius = np.pi * (1 + 5**0.5) * np.arange(count), np.sqrt(1 - z**2)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
+
+
 def orbit_cameras(
     count: int = 8, width: int = 64, height: int = 48, radius: float = 2.6, altitude: float = 1.5
 ) -> list[Camera]:
     """Cameras on a circle that look at the rock; the focal length is 1.1 image widths."""
-    K = np.array([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1]])
     angles = 2 * np.pi * np.arange(count) / count
     eyes = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(count, altitude)], 1)
-    return [Camera(K, width, height, look_at(eye, CENTRE)) for eye in eyes]
+    return [pinhole(1.1 * width, width, height, eye, CENTRE) for eye in eyes]
 
 
 def albedo(points: np.ndarray) -> np.ndarray:
@@ -94,6 +106,11 @@ def write_dataset(
         (root / "rock.glb").write_bytes(to_glb(rock_mesh(*rocks[0])))
     write_transforms(root, frames)
     return load_dataset(root)
+
+
+def orbit(root: Path, count: int = 12, width: int = 48, height: int = 36) -> Dataset:
+    """`write_dataset` with so many cameras on a circle."""
+    return write_dataset(root, orbit_cameras(count, width, height))
 
 
 def write_rock(root: Path, cameras: list[Camera], gaussians: int) -> Dataset:

@@ -9,7 +9,7 @@ import pytest
 import synthetic
 from program import command, said
 
-from mgs import Camera, Frame, look_at
+from mgs import Frame
 from mgs.data import agreement as poses
 from mgs.data.agreement import BODY, FLIP, observed
 from mgs.data.dataset import write_transforms
@@ -23,10 +23,10 @@ def frames(tmp_path_factory):
     root = tmp_path_factory.mktemp("plane")
     noise = np.random.default_rng(0).random((800, 800)).astype(np.float32)
     texture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 1, cv2.NORM_MINMAX)
-    K, made = np.array([[260.0, 0, 160], [0, 260, 120], [0, 0, 1]]), []
+    made = []
     for k in range(5):
-        eye = [np.cos(0.15 * k), np.sin(0.15 * k), 1.2]
-        camera = Camera(K, 320, 240, look_at(eye, [0.2 * (k % 2), 0.1 * (k % 3), 0]))
+        eye, target = [np.cos(0.15 * k), np.sin(0.15 * k), 1.2], [0.2 * (k % 2), 0.1 * (k % 3), 0]
+        camera = synthetic.pinhole(260.0, 320, 240, eye, target)
         rays = camera.unproject(np.ones((240, 320))) - camera.position
         at = camera.position - rays * (camera.position[2] / rays[..., 2:])
         u, v = (np.float32(200 * at[..., axis] + 400) for axis in (0, 1))
@@ -49,11 +49,8 @@ def agreement(frames, folder):
 
 def wrong(frames, change):
     """The frames with another world_to_camera."""
-    made = []
-    for frame in frames:
-        camera, pose = frame.camera, change(frame.camera.world_to_camera)
-        made.append(replace(frame, camera=Camera(camera.K, camera.width, camera.height, pose)))
-    return made
+    changed = [replace(f.camera, world_to_camera=change(f.camera.world_to_camera)) for f in frames]
+    return [replace(frame, camera=camera) for frame, camera in zip(frames, changed, strict=True)]
 
 
 def test_right_poses_fit(frames, matches):
@@ -86,9 +83,8 @@ def test_a_wrong_convention_is_named(frames, matches, tmp_path, name):
 
 def test_a_wrong_focal_length_is_named(frames, tmp_path):
     K = frames[0].camera.K * [[1.3, 1, 1], [1, 1.3, 1], [1, 1, 1]]
-    zoomed = [Camera(K, 320, 240, frame.camera.world_to_camera) for frame in frames]
-    changed = [replace(f, camera=c) for f, c in zip(frames, zoomed, strict=True)]
-    found = agreement(changed, tmp_path / "matches")
+    zoomed = [replace(frame, camera=replace(frame.camera, K=K)) for frame in frames]
+    found = agreement(zoomed, tmp_path / "matches")
     assert "fit a focal length 0.7" in found.problem
 
 
@@ -146,10 +142,7 @@ def test_points_that_pictures_show_tell(frames):
 
 
 def test_poses_of_other_pictures_are_noticed_and_said(frames, tmp_path, capsys):
-    order = [3, 0, 4, 1, 2]
-    shuffled = [
-        replace(frame, camera=frames[k].camera) for frame, k in zip(frames, order, strict=True)
-    ]
+    shuffled = [replace(frames[i], camera=frames[k].camera) for i, k in enumerate([3, 0, 4, 1, 2])]
     root = frames[0].image_path.parent.parent
     write_transforms(root, shuffled)
     command("import", root, "--out", tmp_path / "out")

@@ -1,14 +1,14 @@
 """The public names of `mgs`: present, lazy, typed, and silent."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny
 import trimesh
+from program import python, stop_at
 from refusals import fails, refused
+from synthetic import pinhole
 
 import mgs
 
@@ -27,7 +27,7 @@ def test_importing_loads_nothing_and_leaves_the_variant_alone():
         "import sys, mgs; assert not {'mitsuba', 'drjit', 'numpy'} & set(sys.modules); mgs.render\n"
         "import mitsuba as mi; assert mi.variant() is None"
     )
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+    python(program, check=True)
 
 
 def test_a_scene_needs_what_is_loaded(dataset, prior):
@@ -85,12 +85,8 @@ def highest(candidates):
 
 def test_a_function_is_a_policy_that_a_resumed_run_asks_for(dataset, prior, tmp_path, capsys):
     out, given = tmp_path / "run", {"prior": prior, "seeds": 3, "train": {"passes": 1}}
-
-    def stop(state):
-        raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        mgs.run_nbv(dataset, out, policy=highest, budget=1, on_step=stop, **given)
+        mgs.run_nbv(dataset, out, policy=highest, budget=1, on_step=stop_at(), **given)
     assert (out / "policy.py").read_text().startswith("def highest(candidates):")
     fails(r"in Python: mgs\.resume_nbv\(.*policy=highest\)", mgs.resume_nbv, out)
     fails("is not the policy of", mgs.resume_nbv, out, policy=lambda candidates: candidates[:, 0])
@@ -132,11 +128,10 @@ def test_priors_and_normals_of_arrays(tmp_path):
     known = mgs.prior_from_mesh(tmp_path / "ball.ply", settings)
     np.testing.assert_allclose(prior.points, known.points, atol=1e-6)
     model, _ = mgs.initial_gaussians(prior, [])
-    K = np.array([[60, 0, 24], [0, 60, 18], [0, 0, 1.0]])
-    camera = mgs.Camera(K, 48, 36, mgs.look_at((3, 1, 1), (0, 0, 0)))
+    camera = pinhole(60, 48, 36, (3, 1, 1))
     image, found = mgs.render(model, camera), mgs.normals(model, camera)
     pixels = np.mgrid[:36, :48][::-1] + 0.5
-    rays = (pixels - K[:2, 2, None, None]) / 60 * np.asarray(image.depth)
+    rays = (pixels - camera.K[:2, 2, None, None]) / 60 * np.asarray(image.depth)
     points = np.stack([*rays, image.depth], -1) @ camera.world_to_camera[:3, :3] + camera.position
     inside = np.asarray(image.alpha) > 0.9
     assert (found[np.asarray(image.alpha) == 0] == 0).all()

@@ -1,6 +1,5 @@
 """Policies on a NeRF-synthetic scene of a few pixels, from its split to the tables."""
 
-import csv
 import json
 from dataclasses import replace
 
@@ -16,6 +15,7 @@ from mgs.data.importers import import_source
 from mgs.data.sources import read_source
 from mgs.images import write_png
 from studies import blender
+from studies.frame.output import read_rows
 
 FEW = replace(blender.SIZES["quick"], downscale=1, gaussians=60, views=((2, 4),), passes=1, draws=1)
 
@@ -45,8 +45,7 @@ def test_every_policy_runs_and_no_candidate_is_read(scenes, tmp_path, capsys, mo
     monkeypatch.setattr(mgs.Frame, "mask", _noted(mgs.Frame.mask, read))
     out = tmp_path / "out"
     study("blender", out, "--dir", scenes, sizes={"quick": FEW})
-    with open(out / "blender.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(out / "blender.csv")
     assert {row["policy"] for row in rows} == {*blender.OURS, *blender.COMPARED}
     taken = [json.loads(row["taken"]) for row in rows]
     assert all(len(set(views)) == 4 and views[0] == 0 for views in taken)

@@ -7,15 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
 from program import command, said
 from test_recordings import MOUNT, OPTICAL, Bag, quaternion
 
-from mgs import load_dataset, look_at
-from mgs.images import read_depth
+from mgs import look_at
 
 RADIUS = 0.09
 """Radius of a ball, metres."""
@@ -282,33 +280,3 @@ def test_poses_of_other_axes_are_named_without_matches(tmp_path, axes, capsys):
     root = changed(nerfstudio(tmp_path / "source", orbit()), turned_axes)
     command("import", root, "--out", tmp_path / "out")
     assert problem in said(capsys)[1]
-
-
-DEPTHS = {
-    "quarter millimetres": ("png", lambda z: np.round(4000 * z).astype(np.uint16), 0.00025),
-    "float TIFF": ("tif", lambda z: z.astype(np.float32), 1.0),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", DEPTHS)
-def test_depth_of_balls_is_theirs(tmp_path, kind):
-    ending, encoded, step = DEPTHS[kind]
-    views = orbit(lens=BROWN)
-    root = nerfstudio(tmp_path / "source", views, depth_unit_scale_factor=step)
-    (root / "depth").mkdir()
-
-    def with_depth(record):
-        k = Path(record["file_path"]).stem
-        record["depth_file_path"] = f"depth/{k}.{ending}"
-        cv2.imwrite(str(root / f"depth/{k}.{ending}"), encoded(views[int(k)].drawn()[1]))
-
-    changed(root, with_depth)
-    command("import", root, "--out", tmp_path / "out")
-    off = []
-    for frame in load_dataset(tmp_path / "out").frames:
-        depth, camera = read_depth(frame.depth_path), frame.camera
-        (x, y), z = camera.project(BALLS)[0].astype(int).T, camera.project(BALLS)[1]
-        inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-        off += (depth[y[inside], x[inside]] - z[inside] + RADIUS).tolist()
-    assert np.median(np.abs(off)) < 0.004

@@ -12,7 +12,7 @@ from program import command, said
 from refusals import fails, refused
 from test_recordings import write_bag, write_open3d, write_rtabmap
 
-from mgs import Camera, InputError
+from mgs import InputError
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.lens import Lens
@@ -23,7 +23,7 @@ from mgs.images import read_depth, read_mask
 @pytest.fixture
 def data(tmp_path):
     """Twelve views, so that names without zeros are not in the order of text."""
-    return synthetic.write_dataset(tmp_path / "data", synthetic.orbit_cameras(12, 32, 24))
+    return synthetic.orbit(tmp_path / "data", 12, 32, 24)
 
 
 def errors(dataset, shots) -> np.ndarray:
@@ -222,8 +222,7 @@ def test_masks_in_folders_are_those_of_their_images(data, tmp_path, capsys):
     command(*asked, tmp_path / "out")
     made = load_dataset(tmp_path / "out").frames
     assert all(np.array_equal(one.mask(), mask) for one, mask in zip(made, true, strict=True))
-    for path in (tmp_path / "m/cam1").iterdir():
-        path.unlink()
+    shutil.rmtree(tmp_path / "m/cam1")
     for path in (tmp_path / "m/cam0").iterdir():
         path.rename(tmp_path / "m" / path.name)
     assert "2 images have this name" in refused(capsys, [*asked, tmp_path / "no"], tmp_path)
@@ -233,7 +232,7 @@ MASKS = {
     "labels 0 and 1": lambda mask: Image.fromarray(mask),
     "a palette": lambda mask: labelled(mask, [0, 0, 0, 128, 0, 0]),
     "alpha of one colour": lambda mask: Image.fromarray(
-        np.dstack([np.full((*mask.shape, 3), 255, np.uint8), 255 * mask])
+        np.dstack([0 * mask + 255] * 3 + [255 * mask])
     ),
     "a soft edge": lambda mask: Image.fromarray(np.where(mask, 200, 90).astype(np.uint8)),
 }
@@ -263,26 +262,19 @@ def test_masks_and_test_views_without_effect_are_noticed(data, tmp_path, capsys)
     assert "1 test views are no frame, as none" in errors
 
 
-def write_channels(path, channels):
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, channels) as file:
-        file.write(str(path))
-
-
 def test_frames_elsewhere_stay_there_when_transforms_json_is_written(data, tmp_path):
-    first = data.frames[0].image_path
-    shutil.move(first, tmp_path / "else.png")
-
-    def change(json):
-        json["frames"][0]["file_path"] = str(tmp_path / "else.png")
-
-    synthetic.edit(data.root, change)
-    moved = load_dataset(data.root)
-    write_transforms(data.root, moved.frames)
-    assert load_dataset(data.root).frames[0].image_path == tmp_path / "else.png"
+    place = shutil.move(data.frames[0].image_path, tmp_path / "else.png")
+    synthetic.edit(data.root, lambda json: json["frames"][0].update(file_path=str(place)))
+    write_transforms(data.root, load_dataset(data.root).frames)
+    assert load_dataset(data.root).frames[0].image_path == place
 
 
 def test_depth_is_right_or_refused(tmp_path):
+    def write_channels(path, channels):
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        with OpenEXR.File(header, channels) as file:
+            file.write(str(path))
+
     depth = np.linspace(1, 3, 12, dtype=np.float32).reshape(3, 4)
     grey = np.full((3, 4), 0.5, np.float32)
     exr, tiff, png = (tmp_path / f"a.{end}" for end in ("exr", "tif", "png"))
@@ -332,10 +324,7 @@ def test_dark_pictures_of_12_bits_are_noticed(data, capsys):
         pixels = np.asarray(Image.open(frame.image_path)).astype(np.uint16)
         cv2.imwrite(str(frame.image_path), pixels * 16)
     command("import", data.root, "--out", data.root.with_name("out"))
-    assert (
-        "use 12 of 16 bits, so the pictures are nearly black; multiply them by 16"
-        in said(capsys)[1]
-    )
+    assert "use 12 of 16 bits, so the pictures are nearly black" in said(capsys)[1]
 
 
 def test_cameras_of_metashape_that_are_disabled_are_left_out(data, tmp_path):
@@ -366,11 +355,3 @@ def test_cameras_of_metashape_that_are_disabled_are_left_out(data, tmp_path):
     expected = [x * radial + 0.001 * (r2 + 2 * x * x), y * radial + 2 * 0.001 * x * y]
     found = source.shots[0].lens.camera(32, 24).img_from_cam(point)[0]
     assert np.allclose(found, np.array(expected) * camera.K[0, 0] + camera.K[:2, 2], atol=1e-9)
-
-
-def test_a_moved_camera_sees_the_same():
-    camera = synthetic.orbit_cameras(3)[1]
-    points, offset = np.random.default_rng(0).normal(size=(5, 3)), np.array([1.0, -2, 3])
-    moved = camera.seen_from(np.negative(offset))
-    assert isinstance(moved, Camera)
-    assert np.allclose(moved.project(points + offset)[0], camera.project(points)[0])

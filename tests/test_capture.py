@@ -4,13 +4,11 @@ import importlib.util
 import json
 import shutil
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from program import command, steps, table_numbers
+from program import command, python, steps, stop_at, table_numbers
 from refusals import fails, listing, refused
 
 from mgs import InputError, PriorSettings, build_prior, prior_from_mesh, save_prior
@@ -122,16 +120,12 @@ def test_only_test_views_are_rendered_in_advance(full, poses):
 
 
 def test_an_interrupted_dataset_goes_on_only_as_on_demand(poses, tmp_path):
-    def stop(done, total):
-        raise KeyboardInterrupt
-
     given, out = (SCENE, TINY), tmp_path / "again"
     with pytest.raises(KeyboardInterrupt):
-        synth_orbit(out, *given, seed=3, test_views=2, on_demand=True, progress=stop)
+        synth_orbit(out, *given, seed=3, test_views=2, on_demand=True, progress=stop_at())
     fails("unfinished dataset of other settings", synth_orbit, out, *given, seed=3, test_views=2)
     synth_orbit(out, *given, seed=3, test_views=2, on_demand=True)
-    ours, theirs = listing(out), listing(poses.root)
-    assert ours == theirs
+    assert listing(out) == listing(poses.root)
 
 
 def test_the_command_renders_no_frame(tmp_path):
@@ -213,7 +207,7 @@ def test_killed_while_it_captures_and_resumed(captured, prior, fresh, tmp_path):
     """In the second PNG file of the first chosen view."""
     out, program = tmp_path / "run", KILLED.format(rows=arena.ROWS, texels=arena.TEXELS)
     arguments = ["nbv", fresh.root, "--prior", prior, "--out", out, *RUN]
-    process = subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True)
+    process = python(program, *arguments)
     assert process.returncode == -signal.SIGKILL, process.stderr
     finished = [frame for frame in fresh.frames if rendering.is_done(frame)]
     done = {path: path.stat().st_mtime_ns for frame in finished for path in files(frame)}

@@ -1,6 +1,5 @@
 """Charts: times, commands of rows, presets, a whole chart of a tiny rock; and the benchmark."""
 
-import csv
 import json
 import shlex
 import shutil
@@ -22,6 +21,7 @@ from studies import bench as core
 from studies import chart, photographs
 from studies.frame import timing
 from studies.frame.case import Size
+from studies.frame.output import read_rows
 from studies.frame.program import study_of
 
 
@@ -115,7 +115,7 @@ def test_a_chart_is_measured_once_and_written(dataset, tmp_path, capsys, monkeyp
     assert set(weights) == {0}, "studies fit colours alone"
     written = {kind: json.loads((out / f"{kind}.json").read_text()) for kind in chart.KINDS}
     for kind, record in written.items():
-        rows = list(csv.DictReader((out / f"{kind}.csv").read_text().splitlines()))
+        rows = read_rows(out / f"{kind}.csv")
         assert len(rows) == len(record["rows"])
         assert all(parsed(row["command"]) for row in rows)
         assert any(row["front"] for row in record["rows"])

@@ -2,13 +2,11 @@
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import synthetic
-from program import command, said, steps, timeless
+from program import command, python, said, steps, timeless
 
 from mgs import ListCache, initial_gaussians, load_dataset, load_prior, read_ply
 from mgs.cli import app, demo, progress
@@ -47,9 +45,7 @@ main()
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    root = tmp_path_factory.mktemp("end") / "dataset"
-    synthetic.write_dataset(root, synthetic.orbit_cameras(10, 48, 36))
-    return root
+    return synthetic.orbit(tmp_path_factory.mktemp("end") / "dataset", 10).root
 
 
 @pytest.fixture(scope="module")
@@ -91,11 +87,7 @@ def test_a_fit_shows_a_view_before_its_end(dataset, run, tmp_path, capsys, monke
 def test_interrupted_in_the_middle_of_a_step_then_resumed(dataset, run, tmp_path):
     out = tmp_path / "run"
     arguments = ["nbv", dataset, "--out", out, "--prior", run / "prior", *VIEWS]
-    process = subprocess.run(
-        [sys.executable, "-c", STRUCK, *arguments, "--set", "evaluate_every=2"],
-        capture_output=True,
-        text=True,
-    )
+    process = python(STRUCK, *arguments, "--set", "evaluate_every=2")
     assert process.returncode == 130, process.stderr
     last = process.stderr.splitlines()[-1]
     assert last == f"mgs: interrupted; continue with: mgs nbv --resume {out}"
@@ -133,9 +125,9 @@ def test_ctrl_c_inside_a_call_of_drjit_is_one_line_too(capsys, monkeypatch):
 def test_demo_shows_the_table_and_the_pictures_and_can_be_repeated(tmp_path, capsys, monkeypatch):
     """All of `mgs demo` but the rendering of its dataset; the second time it changes nothing."""
     out = tmp_path / "demo"
-    dataset = synthetic.write_dataset(out / "dataset", synthetic.orbit_cameras(13, 32, 24))
+    dataset = synthetic.orbit(out / "dataset", 13, 32, 24)
     write_contact_sheet(out / "dataset/contact_sheet.png", dataset.frames)
-    synthetic.write_dataset(out / "dataset/test", synthetic.orbit_cameras(2, 32, 24))
+    synthetic.orbit(out / "dataset/test", 2, 32, 24)
     assert set(demo.POLICIES) < set(POLICIES)
     policies = ("d-optimal", "random")
     monkeypatch.setattr("mgs.cli.demo.POLICIES", policies)

@@ -10,7 +10,7 @@ import synthetic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags, Image
-from program import command, said, table_numbers
+from program import command, said, stop_at, table_numbers
 
 from mgs import evaluate_run, resume_nbv, run_nbv
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
@@ -184,12 +184,9 @@ def test_the_alarm_of_exposure_is_silent_where_gains_explain_it(runs):
 
 
 def test_an_interrupted_run_goes_on_bit_for_bit(varied, runs, tmp_path):
-    def kill(state: Checkpoint) -> None:
-        if len(state.steps) == 2:
-            raise KeyboardInterrupt
-
+    given = {"exposure": True, "evaluate_every": 3, **RUN}
     with pytest.raises(KeyboardInterrupt):
-        run_nbv(varied, tmp_path / "run", exposure=True, evaluate_every=3, on_step=kill, **RUN)
+        run_nbv(varied, tmp_path / "run", on_step=stop_at(2), **given)
     resume_nbv(tmp_path / "run")
     one, other = read_checkpoint(runs["with"][1]), read_checkpoint(tmp_path / "run")
     assert np.array_equal(one.H, other.H)

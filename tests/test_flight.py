@@ -6,7 +6,7 @@ import tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from program import command, said, steps
+from program import command, said, steps, stop_at
 from tiny import run
 
 from mgs.policy import tour
@@ -146,13 +146,8 @@ def test_a_flight_never_exceeds_its_limits_and_resumes_the_same(loaded, tmp_path
     assert state.steps[-1]["ended"] == {
         "reason": "flight", "views": pictures - 3, "metres": pytest.approx(flown)
     }  # fmt: skip
-
-    def stop(state):
-        if len(state.taken) >= 4:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "part", loaded, on_step=stop, **given)
+        run(tmp_path / "part", loaded, on_step=stop_at(2), **given)
     assert tiny.resume(tmp_path / "part", loaded).taken == state.taken
 
 

@@ -36,7 +36,7 @@ from mgs.images import exif_exposure, image_size, read_mask, read_values, write_
 from mgs.reports.runs import compare_runs
 from mgs.run.candidates import Site, read_poses, refusals
 from mgs.splat_files import load_gaussians
-from mgs.splat_ply import read_ply, write_ply
+from mgs.splat_ply import read_ply, write_compressed_ply, write_ply
 from mgs.synth.scene_file import load_scene_file
 from mgs.view.subject import read_subject
 from studies.frame.sweep import Cell, result_of
@@ -89,37 +89,20 @@ def read_image(path: Path) -> None:
     images.read_rgba(path)
 
 
+NOISE = np.random.default_rng(0).integers(0, 65535, (24, 32, 4), np.uint16)
+
+
 def png(path: Path) -> None:
-    pixels = np.random.default_rng(0).integers(0, 255, (24, 32, 4), np.uint8)
-    Image.fromarray(pixels).save(path)
-
-
-def png16(path: Path) -> None:
-    pixels = np.random.default_rng(0).integers(0, 65535, (24, 32, 3), np.uint16)
-    cv2.imwrite(str(path), pixels)
+    Image.fromarray((NOISE >> 8).astype(np.uint8)).save(path)
 
 
 def exr(path: Path) -> None:
-    write_exr(path, {name: np.random.default_rng(0).normal(size=(24, 32)) for name in "RGZ"})
+    write_exr(path, dict.fromkeys("RGZ", NOISE[..., 0] / 65535))
 
 
 def cloud(path: Path) -> None:
     points = np.random.default_rng(0).normal(size=(20, 3))
     write_cloud(path, SparseCloud(points, points, np.ones(20)))
-
-
-def compressed(path: Path) -> None:
-    chunk = "".join(
-        f"property float {end}_{name}\n"
-        for name in ("x", "y", "z", "scale_x", "scale_y", "scale_z")
-        for end in ("min", "max")
-    )
-    words = "".join(
-        f"property uint packed_{n}\n" for n in ("position", "rotation", "scale", "color")
-    )
-    head = f"element chunk 1\n{chunk}element vertex 20\n{words}end_header\n"
-    body = np.tile([-1, 1], 6).astype("<f4").tobytes() + np.arange(80, dtype="<u4").tobytes()
-    path.write_bytes(f"ply\nformat binary_little_endian 1.0\n{head}".encode() + body)
 
 
 def mesh(path: Path, side: int = 4) -> None:
@@ -134,18 +117,12 @@ def scene(path: Path) -> None:
     path.write_text("[rock]\nsize = 2.0\nlobes = [{radii = [1, 2, 1]}]\n[orbit]\nkind = 'rings'\n")
 
 
-def transforms(path: Path) -> None:
-    tiny.write_dataset(path.parent, 3)
-
-
 def colmap(kind: str) -> Callable[[Path], None]:
     def write(path: Path) -> None:
         import pycolmap
 
-        camera = pycolmap.Camera(
-            model="OPENCV", width=32, height=24, params=[30, 30, 16, 12] + [0] * 4
-        )
-        camera.camera_id = 1
+        lens = {"model": "OPENCV", "params": [30, 30, 16, 12] + [0] * 4, "camera_id": 1}
+        camera = pycolmap.Camera(width=32, height=24, **lens)
         model = pycolmap.Reconstruction()
         model.add_camera_with_trivial_rig(camera)
         image = pycolmap.Image(name="a.png", camera_id=1, image_id=1)
@@ -157,29 +134,20 @@ def colmap(kind: str) -> Callable[[Path], None]:
     return write
 
 
-def of_folder(path: Path) -> None:
-    read_source(path.parent)
-
-
 def recording(kind: str, file: str) -> Callable[[Path], None]:
     """Writer of a recording of three frames, of which `file` is one."""
 
     def write(path: Path) -> None:
         root = path.parents[file.count("/")]
-        WRITERS[kind](
-            root, synthetic.write_dataset(root / "data", synthetic.orbit_cameras(3, 16, 12))
-        )
+        WRITERS[kind](root, synthetic.orbit(root / "data", 3, 16, 12))
 
     return write
 
 
 def of_recording(path: Path) -> None:
     """Read the recording of which a file is one, as far as the sizes of its images."""
-    alone, deep = (
-        path.suffix in (".bag", ".xml"),
-        path.parent.name in ("rtabmap_calib", "bundle", "cams"),
-    )
-    root = path if alone else path.parents[deep]
+    deep = path.parent.name in ("rtabmap_calib", "bundle", "cams")
+    root = path if path.suffix in (".bag", ".xml") else path.parents[deep]
     pose = "/slam/pose" if path.suffix == ".mcap" else None
     for shot in read_source(root, unpack=root.parent / "unpacked", pose=pose).shots:
         image_size(shot.image)
@@ -218,14 +186,6 @@ def read_all(path: Path) -> None:
     read_subject(root / "run")
 
 
-def page(path: Path) -> None:
-    write_page(path.parent.parent / "page.html", [path.parent])
-
-
-def study(path: Path) -> None:
-    write_json(path, {"task": "a:b", "arguments": {"a": 1}, "found": {"psnr": 1.5}})
-
-
 def result(path: Path) -> None:
     """Read the record of a study's cell."""
     result_of(path.parents[2], Cell(path.parent.name, "a:b", {"a": 1}))
@@ -254,6 +214,9 @@ ROBOTS = (
 """Recordings of robots, scanners and other programs, and files of theirs."""
 
 RUN = ("config.json", "steps.jsonl", "metrics.json")
+CELL = {"task": "a:b", "arguments": {"a": 1}, "found": {"psnr": 1.5}}
+TRANSFORMS = lambda path: tiny.write_dataset(path.parent, 3)  # noqa: E731
+SOURCE = lambda path: read_source(path.parent)  # noqa: E731
 
 LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]] = {
     "PNG": ("a.png", png, read_image),
@@ -261,26 +224,34 @@ LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]]
     "depth": ("d.png", lambda path: Image.new("I;16", (32, 24), 9).save(path), read_values),
     "EXR": ("a.exr", exr, images.read_exr),
     "PLY": ("a.ply", lambda path: write_ply(path, tiny.initial([])), read_ply),
-    "compressed PLY": ("c.ply", compressed, read_ply),
+    "compressed PLY": (
+        "c.ply",
+        lambda path: write_compressed_ply(path, tiny.initial([])),
+        read_ply,
+    ),
     "MGS": ("a.mgs", lambda path: shutil.copy(CORPUS / "MGS/one.mgs", path), load_gaussians),
     "cloud": ("cloud.ply", cloud, read_cloud),
     "GLB": ("a.glb", mesh, load_mesh),
     "OBJ": ("a.obj", trimesh.creation.icosphere(subdivisions=0).export, load_mesh),
     "mesh PLY": ("m.ply", trimesh.creation.icosphere(subdivisions=0).export, load_mesh),
-    "16 bits": ("a.png", png16, read_image),
+    "16 bits": ("a.png", lambda path: cv2.imwrite(str(path), NOISE[..., :3]), read_image),
     "mask": ("a.png", lambda path: write_png(path, np.eye(24, 32, dtype=bool)), read_mask),
     "checkpoint": ("run/checkpoint.npz", run, read_all),
     **{f"run {name}": (f"run/{name}", run, read_all) for name in RUN},
-    "page": ("run/metrics.json", run, page),
+    "page": (
+        "run/metrics.json",
+        run,
+        lambda path: write_page(path.parent.parent / "page.html", [path.parent]),
+    ),
     "prior.json": ("prior/prior.json", run, read_all),
     "prior points": ("prior/points.ply", run, read_all),
-    "study": ("cells/a/result.json", study, result),
+    "study": ("cells/a/result.json", lambda path: write_json(path, CELL), result),
     "JSON": ("a.json", lambda path: path.write_text('{"a": [1, 2.5, "b"]}'), read_json),
-    "transforms.json": ("transforms.json", transforms, lambda path: load_dataset(path.parent)),
-    "import": ("transforms.json", transforms, of_folder),
+    "transforms.json": ("transforms.json", TRANSFORMS, lambda path: load_dataset(path.parent)),
+    "import": ("transforms.json", TRANSFORMS, SOURCE),
     "scene": ("a.toml", scene, load_scene_file),
     **{
-        f"COLMAP {name}": (name, colmap(kind), of_folder)
+        f"COLMAP {name}": (name, colmap(kind), SOURCE)
         for kind, end in (("text", "txt"), ("binary", "bin"))
         for name in (f"{n}.{end}" for n in ("cameras", "images", "points3D", "frames", "rigs"))
     },

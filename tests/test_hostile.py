@@ -68,12 +68,9 @@ def test_a_terminal_of_ascii_and_no_home():
         "app.show = show; app.COMMANDS['show'] = ('app.show', ''); app.main(['show'])"
     )
     env = {key: value for key, value in os.environ.items() if key != "HOME"}
-    ended = subprocess.run(
-        [sys.executable, "-c", script],
-        env=env | {"PYTHONIOENCODING": "ascii"},
-        capture_output=True,
-        text=True,
-    )
+    command = [sys.executable, "-c", script]
+    env |= {"PYTHONIOENCODING": "ascii"}
+    ended = subprocess.run(command, env=env, capture_output=True, text=True)
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "1 m?\n", "")
 
 
@@ -355,11 +352,21 @@ def test_a_value_of_a_wrong_type_in_metrics(capsys, stranger, change):
     assert f"metrics.json: is damaged ({next(iter(change))}" in line
 
 
-def test_control_characters_of_a_name_do_not_reach_the_terminal(tmp_path, capsys):
+def test_no_character_of_a_name_is_markup_or_controls_the_terminal(tmp_path, dataset, capsys):
     name = tmp_path / "a\n\x1b[2J"
     line = refused(capsys, ["nbv", name, "--out", tmp_path / "run"], tmp_path / "run")
     assert "a\\n\\x1b[2J" in line
+    assert "a\\udcff: is not UTF-8" in refused(capsys, ["dataset", "check", "a\udcff"])
     assert str(InputError("\udcff ä")) == "\\udcff ä"
+    write_csv(tmp_path / "a.csv", [{"name": "a\udcff"}])
+    assert (tmp_path / "a.csv").read_bytes() == b"name\na\\udcff\n"
+    folder = tmp_path / "a[" / "b]\x1b[31m"
+    folder.parent.mkdir()
+    folder.symlink_to(dataset)
+    command("dataset", "check", folder)
+    text = "".join(capsys.readouterr())
+    assert "a[/b]\\x1b[31m: " in text.replace("\n", "")
+    assert "\x1b" not in text
 
 
 @pytest.fixture
@@ -445,25 +452,6 @@ def test_a_device_is_not_replaced(tmp_path, make):
         with pytest.raises(InputError, match="is a device or a pipe"), atomic_path(path):
             pass
     assert pipe.is_fifo()
-
-
-def test_half_characters_of_names_are_written(tmp_path):
-    write_csv(tmp_path / "a.csv", [{"name": "a\udcff"}])
-    assert (tmp_path / "a.csv").read_bytes() == b"name\na\\udcff\n"
-
-
-def test_a_name_is_no_markup_and_controls_no_terminal(tmp_path, dataset, capsys):
-    folder = tmp_path / "a[" / "b]\x1b[31m"
-    folder.parent.mkdir()
-    folder.symlink_to(dataset)
-    command("dataset", "check", folder)
-    text = "".join(capsys.readouterr())
-    assert "a[/b]\\x1b[31m: " in text.replace("\n", "")
-    assert "\x1b" not in text
-
-
-def test_a_name_that_is_not_utf_8_is_refused(capsys):
-    assert "a\\udcff: is not UTF-8" in refused(capsys, ["dataset", "check", "a\udcff"])
 
 
 def test_a_strangers_settings_name_a_program_that_is_not_run(tmp_path, dataset, capsys):

@@ -2,8 +2,6 @@
 
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +15,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from program import command, exit_code, said
+from program import command, exit_code, python, said
 from refusals import fails, listing, refused
 
 from mgs import Frame
@@ -253,15 +251,20 @@ def test_distortion_is_undone(tmp_path, model):
     assert 0.3 < copy.mask().sum() / source.mask().sum() < 3
 
 
-def test_depth_of_16_bits_is_in_millimetres(dataset, tmp_path):
+@pytest.mark.parametrize(("steps", "unit"), [(1000, None), (4000, 0.00025), (1, 1.0)])
+def test_depth_is_in_millimetres_or_the_units_that_are_named(dataset, tmp_path, steps, unit):
+    """As whole numbers of 16 bits, or floats of a TIFF."""
+    ending, kind = (".tif", np.float32) if steps == 1 else (".png", np.uint16)
     for frame in dataset.frames:
-        millimetres = np.round(frame.depth() * 1000).astype(np.uint16)
-        cv2.imwrite(str(frame.depth_path.with_suffix(".png")), millimetres)
+        depth = frame.depth() if steps == 1 else np.round(frame.depth() * steps)
+        cv2.imwrite(str(frame.depth_path.with_suffix(ending)), depth.astype(kind))
     text = (dataset.root / "transforms.json").read_text()
-    (dataset.root / "transforms.json").write_text(text.replace(".exr", ".png"))
+    (dataset.root / "transforms.json").write_text(text.replace(".exr", ending))
+    if unit:
+        synthetic.edit(dataset.root, lambda data: data.update(depth_unit_scale_factor=unit))
     copy = _import(dataset.root, tmp_path / "copy")
     for one, other in zip(dataset.frames, copy.frames, strict=True):
-        assert np.abs(one.depth() - other.depth()).max() < 5.1e-4
+        assert np.abs(one.depth() - other.depth()).max() < 0.51 / 1000
 
 
 @pytest.mark.parametrize("kind", ["plain", "alpha", "16 bit", "jpeg", "distorted"])
@@ -297,9 +300,8 @@ def test_what_is_missing_is_skipped_and_said(dataset, tmp_path, capsys):
 
 def test_images_are_excluded_by_name(dataset, tmp_path, capsys):
     names = [frame.name for frame in dataset.frames]
-    command(
-        "import", dataset.root, "--out", tmp_path / "copy", "--exclude", f"images/{names[2]}.png"
-    )
+    given = ["import", dataset.root, "--exclude", f"images/{names[2]}.png"]
+    command(*given, "--out", tmp_path / "copy")
     assert "left out 1 excluded" in said(capsys)[0]
     left = [frame.name for frame in load_dataset(tmp_path / "copy").frames]
     assert left == [*names[:2], *names[3:]]
@@ -312,9 +314,8 @@ def test_images_may_be_smaller_than_their_cameras(dataset, tmp_path):
     for frame in dataset.frames:
         with Image.open(frame.image_path) as image:
             image.resize((image.width // 4, image.height // 4)).save(frame.image_path)
-    for one, other in zip(
-        dataset.frames, _import(dataset.root, tmp_path / "c").frames, strict=True
-    ):
+    copy = _import(dataset.root, tmp_path / "c")
+    for one, other in zip(dataset.frames, copy.frames, strict=True):
         point = one.camera.camera_to_world[:3] @ [0.1, 0.2, 1, 1]
         pixels = [frame.camera.project(point[None])[0] for frame in (one, other)]
         assert np.allclose(pixels[0], 4 * pixels[1])
@@ -349,9 +350,8 @@ def test_masks_by_projecting_a_mesh_or_from_files(dataset, tmp_path, capsys):
     for k, path in enumerate(list((dataset.root / "masks").iterdir())):
         name = (path.name, f"{path.stem}_mask.png", f"{path.name}.png")[k % 3]
         path.rename(path.with_name(name))
-    true = [
-        synthetic.cast(f.camera, [(synthetic.CENTRE, synthetic.AXES)])[1] for f in dataset.frames
-    ]
+    rock = synthetic.CENTRE, synthetic.AXES
+    true = [synthetic.cast(frame.camera, [rock])[1] for frame in dataset.frames]
     mesh = ["--mesh", dataset.root / "rock.glb"]
     command("import", dataset.root, "--out", tmp_path / "mesh", *mesh)
     assert "turned from +Y up" in said(capsys)[0]
@@ -389,16 +389,15 @@ of the fourth frame but its image."""
 
 
 @pytest.fixture
-def source(tmp_path: Path) -> Path:
+def source(dataset) -> Path:
     """Eight distorted frames with depth."""
-    root = synthetic.write_dataset(tmp_path / "data").root
-    synthetic.edit(root, lambda data: data.update(k1=-0.15, k2=0.04, p1=0.002))
-    return root
+    synthetic.edit(dataset.root, lambda data: data.update(k1=-0.15, k2=0.04, p1=0.002))
+    return dataset.root
 
 
 @pytest.fixture
 def many(source: Path) -> list:
-    """Its arguments, with masks from a mesh."""
+    """Arguments that import it with masks from a mesh."""
     return ["import", source, "--mesh", source / "rock.glb", "--out"]
 
 
@@ -406,8 +405,7 @@ def many(source: Path) -> list:
 def test_ended_in_the_middle_and_given_again(many, tmp_path, monkeypatch, end, code):
     """A real process, a real signal; then no finished frame is read again."""
     out = tmp_path / "out"
-    program = [sys.executable, "-c", STRUCK, *map(str, [*many, out, int(end)])]
-    process = subprocess.run(program, capture_output=True, text=True)
+    process = python(STRUCK, *many, out, int(end))
     assert process.returncode == code, process.stderr
     assert not (out / "transforms.json").exists()
     assert len(list((out / "images").iterdir())) == 3

@@ -4,11 +4,12 @@ import shutil
 
 import numpy as np
 import pytest
+import synthetic
 import tiny
 from program import change_settings
 from refusals import fails, refused
 
-from mgs import Camera, InputError, diagnose, fit_gaussians, load_dataset, load_prior, look_at
+from mgs import Camera, InputError, diagnose, fit_gaussians, load_dataset, load_prior
 from mgs.fit.objective import objective
 from mgs.fit.settings import MEAN_RATE, TrainSettings
 from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
@@ -23,16 +24,9 @@ from mgs.view.subject import SCALARS, read_subject
 N, SPACING = 300, (4 * np.pi / 300) ** 0.5
 
 
-def normals() -> np.ndarray:
-    """Points of a Fibonacci sphere."""
-    z = 1 - (2 * np.arange(N) + 1) / N
-    angle, radius = np.pi * (1 + 5**0.5) * np.arange(N), np.sqrt(1 - z**2)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
-
-
 def ball(offsets: np.ndarray | float = 0.0) -> Gaussians:
     """A speckled unit sphere of flat, opaque Gaussians; offsets [N] from the surface, metres."""
-    n = normals()
+    n = synthetic.sphere(N)
     return Gaussians(
         means=(n * (1 + np.broadcast_to(offsets, N))[:, None]).astype(np.float32),
         log_scales=np.tile(np.log(SPACING * np.array([0.5, 0.5, 0.1])), (N, 1)).astype(np.float32),
@@ -44,10 +38,9 @@ def ball(offsets: np.ndarray | float = 0.0) -> Gaussians:
 
 @pytest.fixture(scope="module")
 def cameras() -> list[Camera]:
-    K = np.array([[60.0, 0, 24], [0, 60.0, 20], [0, 0, 1]])
     azimuths = np.arange(5) * 2 * np.pi / 5
     eyes = [(3 * np.cos(a), 3 * np.sin(a), z) for z in (-1.2, 1.2) for a in azimuths]
-    return [Camera(K, 48, 40, look_at(eye, (0, 0, 0))) for eye in eyes]
+    return [synthetic.pinhole(60.0, 48, 40, eye) for eye in eyes]
 
 
 @pytest.fixture(scope="module")

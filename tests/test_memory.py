@@ -2,8 +2,6 @@
 
 import gc
 import re
-import subprocess
-import sys
 import weakref
 from collections import Counter
 from pathlib import Path
@@ -11,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic
+from program import python
 
 import mgs
 from mgs import Dataset, Frame, PriorSettings, build_prior, evaluation, load_dataset, run_nbv, scene
@@ -136,12 +135,7 @@ print("drawn")
 
 def test_memory_that_ends_with_an_array_is_not_read_beyond():
     """In a new process, which Dr.Jit would crash: its kernels read beyond NumPy's arrays."""
-    done = subprocess.run(
-        [sys.executable, "-c", AT_THE_END],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-    )
+    done = python(AT_THE_END, cwd=Path(__file__).parent)
     assert done.stdout == "drawn\n", (done.returncode, done.stderr)
 
 

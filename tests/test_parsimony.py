@@ -1,6 +1,5 @@
 """How much model a scene needs: N from what pixels resolve, and the study of it."""
 
-import csv
 import json
 
 import numpy as np
@@ -10,7 +9,7 @@ import trimesh
 from program import command, study
 from refusals import fails
 
-from mgs import Camera, InputError, PriorSettings, look_at
+from mgs import InputError, PriorSettings
 from mgs.data.meshes import Mesh
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.prior.build import _samples, build_prior, prior_from_mesh
@@ -18,6 +17,7 @@ from mgs.prior.resolution import PIXELS_OF_PHOTOGRAPHS, PIXELS_PER_SAMPLE, resol
 from studies import parsimony
 from studies.frame.case import Size
 from studies.frame.claim import judged
+from studies.frame.output import read_rows
 
 
 def square():
@@ -30,8 +30,7 @@ def square():
 
 
 def camera_above(height, focal=100.0, size=400, x=0.0):
-    K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
-    return Camera(K, size, size, look_at((x, 1e-6, height), (x, 0, 0)))
+    return synthetic.pinhole(focal, size, size, (x, 1e-6, height), (x, 0, 0))
 
 
 @pytest.mark.parametrize(("height", "focal"), [(2, 100), (2, 200), (1, 100)])
@@ -64,12 +63,7 @@ def test_only_cameras_count_that_see_the_face():
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    return write_data(tmp_path_factory.mktemp("parsimony") / "data")
-
-
-def write_data(root):
-    synthetic.write_dataset(root / "test", synthetic.orbit_cameras(3, 48, 36, altitude=2.0))
-    return synthetic.write_dataset(root, synthetic.orbit_cameras(12, 48, 36))
+    return synthetic.orbit(tmp_path_factory.mktemp("parsimony") / "data")
 
 
 def test_a_prior_takes_its_number_from_the_pixels(data, tmp_path, capsys, monkeypatch):
@@ -151,8 +145,7 @@ def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, ellipsoids):
         study("parsimony", out, sizes={"quick": size})
     assert len(list(out.glob("cells/dataset/**/result.json"))) == 1
     record = json.loads((out / "parsimony.json").read_text())
-    with open(out / "parsimony.csv") as file:
-        assert len(list(csv.DictReader(file))) == len(record["rows"]) == 12
+    assert len(read_rows(out / "parsimony.csv")) == len(record["rows"]) == 12
     assert (out / "parsimony.png").stat().st_size > 10_000
     rows = [row for row in record["rows"] if row["choice"] != parsimony.PRUNED]
     by = {(one["asked"], one.get("learned"), one["degree"]): one for one in rows}

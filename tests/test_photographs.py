@@ -53,7 +53,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 def exact(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """An orbit with masks and depth."""
     root = tmp_path_factory.mktemp("exact") / "data"
-    return synthetic.write_dataset(root, synthetic.orbit_cameras(24, 96, 72))
+    return synthetic.orbit(root, 24, 96, 72)
 
 
 SCALE, SHIFT = 0.37, np.array([2.0, -1.0, 0.5])
@@ -106,13 +106,8 @@ def spoil_points(model, rng: np.random.Generator) -> None:
 
 def lattice(count: int, radius: float = 3.0) -> list[Camera]:
     """Cameras on a whole sphere around the rock, which floats: nothing is hidden."""
-    z = 1 - (2 * np.arange(count) + 1) / count
-    angle = np.pi * (1 + 5**0.5) * np.arange(count)
-    across = np.sqrt(1 - z**2)
-    unit = np.stack([across * np.cos(angle), across * np.sin(angle), z], 1)
-    eyes = synthetic.CENTRE + radius * unit
-    K = np.array([[90.0, 0, 48], [0, 90.0, 36], [0, 0, 1]])
-    return [Camera(K, 96, 72, look_at(eye, synthetic.CENTRE)) for eye in eyes]
+    eyes = synthetic.CENTRE + radius * synthetic.sphere(count)
+    return [synthetic.pinhole(90.0, 96, 72, eye, synthetic.CENTRE) for eye in eyes]
 
 
 def floating(root: Path, cameras: list[Camera]) -> Dataset:
@@ -214,8 +209,7 @@ def test_a_front_seen_from_one_side_is_closed_behind_and_is_no_ground(tmp_path):
     wall[:, 1] -= 0.3 * (np.abs(np.abs(wall[:, 0]) - 1) < 0.2)
     for angle in np.radians(np.linspace(-40, 40, 11)):
         eye = [6.5 * np.sin(angle), -6.5 * np.cos(angle), 1.7]
-        K = np.array([[150.0, 0, 64], [0, 150, 48], [0, 0, 1]])
-        cameras.append(Camera(K, 128, 96, look_at(eye, [0, 0, 2])))
+        cameras.append(synthetic.pinhole(150.0, 128, 96, eye, [0, 0, 2]))
     frames = [Frame(f"{k}", camera, k, tmp_path) for k, camera in enumerate(cameras)]
     write_cloud(tmp_path / "sparse.ply", SparseCloud(wall + rng.normal(0, 0.005, wall.shape)))
     dataset = Dataset(tmp_path, tuple(frames))

@@ -1,7 +1,5 @@
 """Mitsuba integrator `mgs_splat`: image and derivatives of the API, through perspective sensors."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from program import python
 from splat.scenes import gradients_of, relative_error, with_gradients
 from test_render_command import gaussians as any_gaussians
 
@@ -330,11 +329,9 @@ def test_registered_at_import(ply, tmp_path):
         f"mi.set_variant({mi.variant()!r})",
         f"print(mi.load_dict({{'type': 'mgs_splat', 'filename': {str(ply)!r}}}))",
     ]
-    command = [sys.executable, "-c", "\n".join(lines)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert done.stdout.split("\n")[:2] == ["True", "MgsSplat[60 Gaussians, SH degree 1]"], (
-        done.stderr
-    )
+    done = python("\n".join(lines), cwd=tmp_path)
+    splats = "MgsSplat[60 Gaussians, SH degree 1]"
+    assert done.stdout.split("\n")[:2] == ["True", splats], done.stderr
 
 
 def test_the_documented_example(tmp_path, monkeypatch):

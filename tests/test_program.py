@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +10,7 @@ import numpy as np
 import pytest
 import tiny
 import typer
-from program import change_settings, command
+from program import change_settings, command, python
 from refusals import fails, refused
 
 import mgs
@@ -48,8 +46,7 @@ main()
 
 def test_ctrl_c_while_modules_are_imported_is_one_line():
     for module, arguments in {"typer": [], "mgs.cli.app": [], "mgs.resources": ["doctor"]}.items():
-        code = [sys.executable, "-c", INTERRUPTED.format(module=module), *arguments]
-        ended = subprocess.run(code, capture_output=True, text=True)
+        ended = python(INTERRUPTED.format(module=module), *arguments)
         assert (ended.returncode, ended.stderr) == (130, "mgs: interrupted\n")
 
 

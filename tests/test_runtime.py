@@ -1,11 +1,9 @@
 """Choice of libLLVM and variant, and one line for those that do not work."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from program import python
 from refusals import fails
 
 from mgs import InputError, runtime
@@ -85,17 +83,11 @@ def test_a_bad_library_is_named(monkeypatch, library, message):
 
 def test_the_doctor_names_a_bad_library_in_one_line_and_exits_with_2():
     code = "from mgs.cli.app import main; main(['doctor'])"
-    result = python(code, **{runtime.LIBRARY_VARIABLE: "/nowhere.so", "COLUMNS": "400"})
+    result = python(code, env={runtime.LIBRARY_VARIABLE: "/nowhere.so", "COLUMNS": "400"})
     assert result.returncode == 2, result.stderr
     (line,) = [line for line in result.stdout.splitlines() if line.startswith("wrong:")]
     assert "no such file" in line
     assert runtime.LIBRARY_VARIABLE in line
-
-
-def python(program: str, **environment: str) -> subprocess.CompletedProcess:
-    """Run a program in a new process."""
-    command, env = [sys.executable, "-c", program], os.environ | environment
-    return subprocess.run(command, env=env, capture_output=True, text=True, timeout=120)
 
 
 PREPARE = """
@@ -128,7 +120,7 @@ said(lambda: render(one, camera))
     ],
 )
 def test_a_variant_that_cannot_run_is_one_line(variant, message):
-    done = python(PREPARE, MGS_VARIANT=variant, CUDA_VISIBLE_DEVICES="")
+    done = python(PREPARE, env={"MGS_VARIANT": variant, "CUDA_VISIBLE_DEVICES": ""})
     assert message in done.stdout, done.stderr
 
 

@@ -1,6 +1,5 @@
 """Table I, set-ups, flights and certificates on ellipsoids of 200 Gaussians; and bad input."""
 
-import csv
 import json
 import os
 import subprocess
@@ -21,6 +20,7 @@ from mgs.survey.flight import SurveySettings, fly
 from studies import certificate, fits, flights, setups, table1
 from studies.frame import case
 from studies.frame.case import Case, Rock, Size
+from studies.frame.output import read_rows
 from studies.frame.sweep import cell_folder, run_cells
 from studies.setups import SETUPS, SetupSize
 
@@ -44,11 +44,6 @@ def done(capsys, *arguments, **changes):
     return capsys.readouterr().out
 
 
-def rows_of(path):
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_setups_are_made_once_and_compare_a_policy_of_ones_own(tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     with monkeypatch.context() as patched:
@@ -56,12 +51,12 @@ def test_setups_are_made_once_and_compare_a_policy_of_ones_own(tmp_path, capsys,
         assert "dataset/boulder-11" in done(capsys, "setups", out, "--rocks", 1)
     before = {path.name: path.read_bytes() for path in out.glob("setups*")}
     assert set(before) == {f"setups{end}" for end in (".csv", ".json", ".md", ".png", "-leads.csv")}
-    rows = rows_of(out / "setups.csv")
+    rows = read_rows(out / "setups.csv")
     assert {row["command"] for row in rows} == {"python -m studies.setups OUT --rocks 1"}
     assert len(rows) == 2 * 2
     orbits = {path.name for path in out.glob("cells/dataset/boulder-11/*")}
     assert orbits == {"circle-1", "hemisphere-1", "spiral-1.25-2"}
-    assert [float(row["test_gain"]) for row in rows if row["policy"] == "random"] == [0] * 2
+    assert [row["test_gain"] for row in rows if row["policy"] == "random"] == [0] * 2
     cells = [json.loads(path.read_text()) for path in out.glob("cells/setup/**/result.json")]
     assert len(cells) >= 4
     assert {len(set(cell["found"]["taken"])) for cell in cells} == {6}
@@ -74,7 +69,7 @@ def test_setups_are_made_once_and_compare_a_policy_of_ones_own(tmp_path, capsys,
     told = done(capsys, *one)
     assert "/mine.py:first" in told
     assert "/directional-d" not in told, "the other policies are not run again"
-    policies = {row["policy"] for row in rows_of(out / "setups.csv")}
+    policies = {row["policy"] for row in read_rows(out / "setups.csv")}
     assert policies == {"directional-d", "random", "mine.py:first"}
     mine.write_text("def first(candidates):\n    return candidates[:, 0]\n")
     assert "/mine.py:first" in done(capsys, *one), "another file is another policy"
@@ -87,15 +82,15 @@ def test_no_set_of_a_study_is_above_its_bound(tmp_path, capsys):
     )  # fmt: skip
     out = tmp_path / "out"
     done(capsys, "certificate", out, "--rocks", 1, sizes={"quick": size})
-    rows = rows_of(out / "certificate.csv")
+    rows = read_rows(out / "certificate.csv")
     assert [row["policy"] for row in rows] == [*certificate.POLICIES]
     for row in rows:
         kinds = ("plan", "greedy", "farthest", "random", "random_best", "best")
-        shares = {key: float(row[key]) for key in kinds}
+        shares = {key: row[key] for key in kinds}
         assert max(shares.values()) <= 1 + 1e-9
         assert shares["best"] >= shares["plan"] >= shares["random"] > 0
-    curve = rows_of(out / "certificate-curve.csv")
-    at = {(row["rock"], row["views"], row["kind"]): float(row["percent"]) for row in curve}
+    curve = read_rows(out / "certificate-curve.csv")
+    at = {(row["rock"], row["views"], row["kind"]): row["percent"] for row in curve}
     assert all(0 < value <= at[(*key[:2], "bound")] <= 100.1 for key, value in at.items())
     assert (out / "certificate.png").is_file()
 
@@ -103,7 +98,7 @@ def test_no_set_of_a_study_is_above_its_bound(tmp_path, capsys):
 def test_flights_keep_their_length_and_are_compared_with_even_spacing(tmp_path, capsys):
     out = tmp_path / "out"
     done(capsys, "flights", out, "--rocks", 1, sizes={"quick": replace(FEW, passes=1)})
-    rows = rows_of(out / "flights.csv")
+    rows = read_rows(out / "flights.csv")
     even = [row for row in rows if row["policy"] == flights.EVEN]
     kinds = len(flights.FLIERS) * len(flights.LENGTHS)
     assert len(rows) - len(even) == kinds * len(flights.POOLS)
@@ -123,11 +118,11 @@ def test_a_fit_with_changed_settings_is_compared_with_the_default(tmp_path, caps
         patched.setattr(fits, "VARIANTS", chosen)
         patched.setattr(fits, "POOLS", {"hemisphere": (4,)})
         done(capsys, "fits", tmp_path, "--rocks", 1, sizes={"quick": replace(FEW, tests=4)})
-    rows = {row["variant"]: row for row in rows_of(tmp_path / "fits.csv")}
+    rows = {row["variant"]: row for row in read_rows(tmp_path / "fits.csv")}
     assert tuple(rows) == variants
-    assert float(rows["default"]["test_change"]) == 0
-    assert all(float(rows[name]["test_change"]) != 0 for name in variants[1:])
-    assert float(rows["poses wrong"]["test"]) < float(rows["default"]["test"])
+    assert rows["default"]["test_change"] == 0
+    assert all(rows[name]["test_change"] != 0 for name in variants[1:])
+    assert rows["poses wrong"]["test"] < rows["default"]["test"]
 
 
 def test_metres_are_compared_at_the_same_psnr():
@@ -155,9 +150,9 @@ def test_a_survey_without_errors_changes_nothing(tmp_path, capsys, monkeypatch):
     done(capsys, "setups", out, "--rocks", 1)
     done(capsys, "survey", out, "--rocks", 1)
     assert len(surveyed) == 1
-    rows, without = (rows_of(out / f"{name}.csv") for name in ("survey", "setups"))
-    ring = {row["policy"]: float(row["test"]) for row in without if row["setup"] == "ring"}
-    assert {row["policy"]: float(row["test"]) for row in rows} == pytest.approx(ring)
+    rows, without = (read_rows(out / f"{name}.csv") for name in ("survey", "setups"))
+    ring = {row["policy"]: row["test"] for row in without if row["setup"] == "ring"}
+    assert {row["policy"]: row["test"] for row in rows} == pytest.approx(ring)
 
 
 @pytest.mark.slow
@@ -176,7 +171,7 @@ def test_rocks_of_ones_own_take_the_place_of_the_others(tmp_path, capsys, monkey
     few = {"sizes": {"quick": replace(FEW, policies=("uniform", "random"))}}
     assert "dataset/one-" in done(capsys, "setups", out, *options, **few)
     assert set(rendered) == {("boulder", "one.ply"), ("boulder", "two.glb")}
-    assert {row["scene"] for row in rows_of(out / "setups.csv")} == {"one", "two"}
+    assert {row["scene"] for row in read_rows(out / "setups.csv")} == {"one", "two"}
     twice = ["--mesh", meshes[0], "--mesh", tmp_path / "out/../one.ply"]
     many = [part for _ in range(21) for part in ("--mesh", meshes[0])]
     for bad, named in ((["--rocks", 3, *options], "--rocks"), (many, "--mesh"), (twice, "one.ply")):
@@ -223,7 +218,7 @@ def test_a_case_is_the_scene_with_some_keys_changed(tmp_path, monkeypatch):
 
 def test_a_prior_is_built_once_and_whole(tmp_path, monkeypatch):
     dataset, out = tmp_path / "dataset", tmp_path / "cell"
-    synthetic.write_dataset(dataset, synthetic.orbit_cameras(8, 48, 36))
+    synthetic.orbit(dataset, 8)
 
     def struck(folder, prior):
         (folder / "mesh.ply").write_text("half of a mesh")
@@ -317,7 +312,7 @@ def test_table_1_has_equal_counts_and_the_papers_rows(tmp_path, capsys, monkeypa
     out, table, sizes = tmp_path / "out", tmp_path / "out/table1.md", {"quick": TABLE}
 
     def rows():
-        return {row["row"]: row for row in rows_of(out / "table1.csv")}
+        return {row["row"]: row for row in read_rows(out / "table1.csv")}
 
     study("table1", out, exit_code=130, sizes=sizes)
     assert "run the same command again to continue" in capsys.readouterr().err
@@ -328,7 +323,7 @@ def test_table_1_has_equal_counts_and_the_papers_rows(tmp_path, capsys, monkeypa
     done(capsys, "table1", out, sizes=sizes)
     images = {"d-optimal": 6, "random, draw 1": 6, "random, draw 2": 6, "coverage, fewer images": 5}
     images |= dict.fromkeys(("all views", "3DGS", "3DGS, random points"), 8)
-    assert {name: int(row["images"]) for name, row in rows().items()} == images
+    assert {name: row["images"] for name, row in rows().items()} == images
     text = table.read_text()
     theirs = "| the paper's D-Optimal NBV, on its rock | 54 | – | – | 25.97 | 0.9654 |"
     ours = "22.00 | {0} | 0.9000 | 0.50 |"

@@ -1,6 +1,5 @@
 """Stress tests on small ellipsoids."""
 
-import csv
 import json
 from dataclasses import replace
 
@@ -12,7 +11,7 @@ from program import study
 from mgs.data.dataset import load_dataset
 from studies import faults, stress
 from studies.frame.claim import Claim
-from studies.frame.output import Panel
+from studies.frame.output import Panel, read_rows
 from studies.frame.sweep import Cell
 from studies.stress import Experiment, open_lab
 
@@ -139,7 +138,6 @@ def test_a_run_writes_its_files_continues_and_keeps_earlier_experiments(tmp_path
     assert "| It is so. | **holds** | 2.05 (" in capsys.readouterr().out
     assert verdicts() == [("one", "holds"), ("two", "fails")]
     assert CALLS == ["a", "b", "a", "b"]
-    with open(tmp_path / "out/stability.csv") as file:
-        assert len(list(csv.DictReader(file))) == 8
+    assert len(read_rows(tmp_path / "out/stability.csv")) == 8
     assert "| It is so. | **holds** | 2.05 (" in (tmp_path / "out/stability.md").read_text()
     assert (tmp_path / "out/one.png").is_file()

@@ -17,6 +17,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
+from program import python
 from refusals import refused
 
 from mgs import provenance
@@ -157,9 +158,7 @@ def test_every_extra_names_its_packages_and_all_has_them():
 
 @pytest.mark.slow
 def test_the_core_chooses_measures_and_reports_without_extras(dataset, prior, tmp_path):
-    program = CORE.format(blocked=[*EXTRAS])
-    command = [sys.executable, "-c", program, dataset, prior, tmp_path / "run"]
-    said = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    said = python(CORE.format(blocked=[*EXTRAS]), dataset, prior, tmp_path / "run")
     assert said.stdout == "4 (12, 16, 3)\n", said.stderr
 
 
@@ -230,4 +229,4 @@ def test_each_diff_touches_one_file_and_what_they_add_works(tmp_path):
         assert diff.count("\n+++ ") == 1
         command = ["git", "apply", "-"]
         subprocess.run(command, input=diff, text=True, cwd=tmp_path, check=True)
-    subprocess.run([sys.executable, "-c", USE], cwd=tmp_path, check=True)
+    python(USE, cwd=tmp_path, check=True)

@@ -9,11 +9,11 @@ import pycolmap
 import pytest
 import synthetic
 from PIL import ExifTags, Image
-from program import command, exit_code, said
+from program import command, exit_code, said, stop_at
 from refusals import fails, refused
 from scipy.ndimage import map_coordinates
 
-from mgs import Camera, Frame, InputError, build_prior, look_at
+from mgs import Camera, Frame, InputError, build_prior
 from mgs.cli.suggest import _place
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset, write_transforms
@@ -46,10 +46,10 @@ def views(root, cameras, seed=0):
 
 def arc(count, step=8.0):
     """Cameras on an arc about the rock, `step` degrees apart, at two heights."""
-    K = np.array([[1.1 * WIDTH, 0, WIDTH / 2], [0, 1.1 * WIDTH, HEIGHT / 2], [0, 0, 1]])
     angles = np.radians(step * np.arange(count))
     eyes = [[2.6 * np.cos(a), 2.6 * np.sin(a), 1.2 + 0.4 * (k % 2)] for k, a in enumerate(angles)]
-    return [Camera(K, WIDTH, HEIGHT, look_at(eye, synthetic.CENTRE)) for eye in eyes]
+    lens = 1.1 * WIDTH, WIDTH, HEIGHT
+    return [synthetic.pinhole(*lens, eye, synthetic.CENTRE) for eye in eyes]
 
 
 @pytest.fixture(scope="module")
@@ -230,16 +230,12 @@ def test_photographs_that_cannot_be_placed_are_refused(case, frames, tmp_path, c
 def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, monkeypatch):
     root = frames[0].image_path.parent
     out, matches = tmp_path / "d", tmp_path / "d.unpacked/matches/database.db"
-
-    def stop(*_, **__):
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patched:
-        patched.setattr("pycolmap.incremental_mapping", stop)
+        patched.setattr("pycolmap.incremental_mapping", stop_at())
         assert exit_code("import", root, "--out", out) == 130
     written = matches.stat().st_size
     assert written > 100_000
-    monkeypatch.setattr("pycolmap.extract_features", stop)
+    monkeypatch.setattr("pycolmap.extract_features", stop_at())
     command("import", root, "--out", out)
     assert len(load_dataset(out)) == len(frames)
     assert not (tmp_path / "d.unpacked").exists()

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from program import stop_at
 from refusals import fails
 
 from mgs.camera import opencv_from_opengl
@@ -23,16 +24,6 @@ from mgs.synth.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_sce
 TINY = RenderPreset(width=64, height=48, frames=5, spp=2)
 ONE = RenderPreset(width=32, height=24, frames=1, spp=1)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=20))
-
-
-def stop_at(view: int):
-    """A progress callback that interrupts the rendering after so many views."""
-
-    def progress(done, total):
-        if done == view:
-            raise KeyboardInterrupt
-
-    return progress
 
 
 pytestmark = pytest.mark.usefixtures("coarse_arena")
@@ -75,9 +66,9 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise_and_test_views(dataset, 
     are a dataset of their own, with exact poses."""
     out, made = tmp_path / "again", {"scene": SCENE, "preset": TINY, "seed": 3, "test_views": 4}
     made |= {"pose_noise": PoseNoise(0.01, 0.1)}
-    for views, unwritten in ((2, "transforms.json"), (7, "test/transforms.json")):
+    for call, unwritten in ((3, "transforms.json"), (8, "test/transforms.json")):
         with pytest.raises(KeyboardInterrupt):
-            synth_orbit(out, **made, progress=stop_at(views))
+            synth_orbit(out, **made, progress=stop_at(call))
         assert not (out / unwritten).exists()
     written = {path: path.stat().st_mtime_ns for path in out.rglob("*_0*.*")}
     assert len(written) == 4 * 7
@@ -129,7 +120,7 @@ def test_another_mesh_of_the_same_name_is_not_gone_on_with(tmp_path):
     made = {"scene": SCENE, "preset": ONE, "mesh": path}
     trimesh.creation.icosphere(subdivisions=2).export(path)
     with pytest.raises(KeyboardInterrupt):
-        synth_orbit(tmp_path / "out", **made, progress=stop_at(1))
+        synth_orbit(tmp_path / "out", **made, progress=stop_at(2))
     trimesh.creation.icosphere(subdivisions=3).export(path)
     fails("other settings", synth_orbit, tmp_path / "out", **made)
     trimesh.creation.icosphere(subdivisions=2).export(path)

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from synthetic import pinhole, sphere
 
-from mgs import Camera, Checkpoint, Frame, Gaussians, Scene, TrainSettings, look_at, sh_from_rgb
+from mgs import Camera, Checkpoint, Frame, Gaussians, Scene, TrainSettings, sh_from_rgb
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.data.meshes import Mesh
 from mgs.files import write_json
@@ -39,10 +40,9 @@ GROUPS = {
 
 def orbit(frames: int = FRAMES) -> list[Camera]:
     """Cameras on a circle of 3 m at 1.5 m around a unit sphere at the origin."""
-    K = np.array([[16.0, 0, WIDTH / 2], [0, 16.0, HEIGHT / 2], [0, 0, 1]])
     angles = 2 * np.pi * np.arange(frames) / frames
     eyes = [(3 * np.cos(a), 3 * np.sin(a), 1.5) for a in angles]
-    return [Camera(K, WIDTH, HEIGHT, look_at(eye, (0, 0, 0))) for eye in eyes]
+    return [pinhole(16.0, WIDTH, HEIGHT, eye) for eye in eyes]
 
 
 def write_dataset(root: Path, frames: int = FRAMES) -> Path:
@@ -77,17 +77,9 @@ class Fit:
     stop_reason: StopReason = StopReason.SETTLED
 
 
-def _normals() -> np.ndarray:
-    """Points of a Fibonacci sphere."""
-    z = 1 - (2 * np.arange(POINTS) + 1) / POINTS
-    angle = np.pi * (1 + 5**0.5) * np.arange(POINTS)
-    radius = np.sqrt(1 - z**2)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
-
-
 def initial(seed_frames: list[Frame]) -> Gaussians:
     """Grey discs on the sphere."""
-    n = _normals()
+    n = sphere(POINTS)
     means, quats = n.astype(np.float32), quat_from_normals(n).astype(np.float32)
     scales, opacities = np.full((POINTS, 3), -1.5, np.float32), np.zeros(POINTS, np.float32)
     return Gaussians(means, scales, quats, opacities, sh_from_rgb(np.full((POINTS, 3), 0.5)))
@@ -176,7 +168,7 @@ class TinyScene(Scene):
 
 def prior(up=(0, 0, 1)) -> Prior:
     """The sphere's points. up: of the world of its files."""
-    n = _normals()
+    n = sphere(POINTS)
     mesh = Mesh(n[:3], np.array([[0, 1, 2]]), np.zeros(1, bool))
     numbers = {"spacing": 0.5, "depth_tolerance": 0.2, "n": POINTS, "backed": 0, "up": list(up)}
     return Prior(mesh, n, n, 0.5, 0.2, numbers)
