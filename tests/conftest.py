@@ -59,6 +59,14 @@ def loaded(pristine):
     return load_dataset(pristine)
 
 
+@pytest.fixture(scope="session")
+def whole(loaded, tmp_path_factory):
+    """The folder of a run of three seeds and five views of it, to which tests only add files."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    tiny.run(out, loaded)
+    return out
+
+
 @pytest.fixture
 def dataset(pristine, tmp_path):
     """A copy of a tiny dataset, for this test alone."""

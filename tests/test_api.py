@@ -70,10 +70,8 @@ def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
     information = mgs.fisher(run.gaussians, loaded.frames[0].camera)
     assert information.shape == (tiny.POINTS, 11)
     assert isinstance(information, np.ndarray)
-    with pytest.raises(
-        mgs.InputError, match=r"run is there already; .* with `force`; `mgs nbv --resume "
-    ):
-        mgs.run_nbv(dataset, tmp_path / "run", prior=prior)
+    already = r"run is there already; .* with `force`; `mgs nbv --resume "
+    fails(already, mgs.run_nbv, dataset, tmp_path / "run", prior=prior)
     with pytest.raises(mgs.InputError, match=r"^seeds = 0: must be at least 1"):
         mgs.run_nbv(dataset, tmp_path / "other", prior=prior, seeds=0)
 

@@ -133,8 +133,7 @@ def corner(mode: int, **more: object) -> Write:
 
     def make(path: Path) -> None:
         made = Made()
-        primitive = {"attributes": {"POSITION": made.add(np.eye(4, 3))}, "mode": mode}
-        made.write(path, primitive, **more)
+        made.write(path, made.shape(np.eye(4, 3), mode), **more)
 
     return make
 
@@ -320,7 +319,6 @@ FILES: dict[tuple[Callable[[Path], object], str], list[tuple[str, Write]]] = {
 }
 """Reader and name of a file -> words of the line, and how the file is made."""
 ROWS = [(*to, *row) for to, rows in FILES.items() for row in rows]
-IDS = [f"{name} {words}" for _, name, words, _ in ROWS]
 
 
 @pytest.mark.parametrize(

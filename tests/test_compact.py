@@ -214,12 +214,8 @@ def test_a_file_comes_back_as_its_encoder_says(tmp_path):
             assert read == file.model
     assert upward(path) == pytest.approx(up)
     assert read.origin == (5e5, -2.0, 3.0)
-    fails("needs no prior", load_gaussians, write_ply(tmp_path), tmp_path)
-
-
-def write_ply(folder: Path) -> Path:
-    mgs.write_ply(folder / "x.ply", gaussians(0))
-    return folder / "x.ply"
+    mgs.write_ply(tmp_path / "x.ply", gaussians(0))
+    fails("needs no prior", load_gaussians, tmp_path / "x.ply", tmp_path)
 
 
 def test_more_bytes_are_better_and_each_packet_improves(tmp_path):

@@ -16,7 +16,7 @@ from mgs import as_drjit
 from mgs.camera import Camera, look_at, opencv_from_opengl
 from mgs.colour import linear_from_srgb
 from mgs.data.check import check_dataset
-from mgs.data.dataset import Dataset, load_dataset, target_of, write_transforms
+from mgs.data.dataset import load_dataset, target_of, write_transforms
 from mgs.data.rock_image import boundary, write_rock_image
 from mgs.gaussians import ARRAYS
 from mgs.images import write_exr, write_png
@@ -26,13 +26,9 @@ W, H = 64, 48
 K = synthetic.orbit_cameras(1, W, H)[0].K
 
 
-def _write(root, count=6) -> Dataset:
-    return synthetic.write_dataset(root, synthetic.orbit_cameras(count, W, H))
-
-
 @pytest.fixture
 def folder(tmp_path):
-    return _write(tmp_path / "data").root
+    return synthetic.orbit(tmp_path / "data", 6, W, H).root
 
 
 def test_round_trip_keeps_cameras_and_pixels(folder):
@@ -152,18 +148,18 @@ def test_cameras_that_differ_in_the_sign_of_zero_are_equal():
 
 
 def test_check_passes_a_sound_dataset(tmp_path):
-    check = check_dataset(_write(tmp_path, count=12))
+    check = check_dataset(synthetic.orbit(tmp_path, 12, W, H))
     assert check.problems == []
     assert check.seen_through < 0.05
     assert 2 < check.depth_range[0] < check.depth_range[1] < 3.5
 
 
 def test_check_finds_wrong_depth_units_and_wrong_axes(tmp_path):
-    dataset = _write(tmp_path / "far", count=12)
+    dataset = synthetic.orbit(tmp_path / "far", 12, W, H)
     for frame in dataset.frames:
         write_exr(frame.depth_path, {"Z": 1.3 * frame.depth()})
     assert any("see through" in problem for problem in check_dataset(dataset).problems)
-    folder = _write(tmp_path / "axes", count=12).root
+    folder = synthetic.orbit(tmp_path / "axes", 12, W, H).root
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
 
     def change(data):

@@ -162,18 +162,9 @@ def test_a_fit_of_changing_number_repeats_bitwise(scene, monkeypatch, optimiser)
     monkeypatch.setattr(density, "LEAST_GRADIENT", 1e-5)
     monkeypatch.setattr(density, "RESET_STEPS", 5)
     start = replace(truth, sh=np.zeros_like(truth.sh)).with_degree(1)
-    train = TrainSettings(
-        means="free",
-        density="adaptive",
-        loss="l1-dssim",
-        optimiser=optimiser,
-        passes=14,
-        rates=RATES | {"mean": 0.01},
-        most_gaussians=420,
-        sh_steps=2,
-        steady_rates=("colour",),
-        directional_rate=0.5,
-    )
+    kinds = {"means": "free", "density": "adaptive", "loss": "l1-dssim", "optimiser": optimiser}
+    rates = {"rates": RATES | {"mean": 0.01}, "steady_rates": ("colour",), "directional_rate": 0.5}
+    train = TrainSettings(**kinds, **rates, passes=14, most_gaussians=420, sh_steps=2)
     prior = {"scale": 1.0, "colour": np.full((1, 4, 1), 0.1)}
     one, two = (fit_gaussians(start, [camera], [target], train, lam=prior) for _ in range(2))
     assert one.gaussians == two.gaussians

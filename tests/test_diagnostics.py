@@ -7,6 +7,7 @@ import tiny
 from PIL import Image
 from plyfile import PlyData
 from refusals import fails
+from synthetic import pinhole
 
 from mgs import Camera, Checkpoint, Run, groups, load_dataset, look_at
 from mgs.gaussians import Gaussians, sh_from_rgb
@@ -47,16 +48,9 @@ def test_scalars_follow_their_formulas(tmp_path):
 def two_in_a_row() -> tuple[Gaussians, Camera]:
     """Two Gaussians, 20 pixels wide, one 2 m and one 3 m before the camera; the near one is half
     transparent."""
-    K = np.array([[40.0, 0, 16.5], [0, 40.0, 12.5], [0, 0, 1]])
-    camera = Camera(K, 33, 25, look_at((0, -2, 0), (0, 0, 0)))
-    parts = (
-        np.array([[0, 0, 0], [0, 1, 0]], np.float32),
-        np.zeros((2, 3), np.float32),
-        np.eye(4, dtype="f4")[[0, 0]],
-        np.array([0, 9], "f4"),
-    )
-    gaussians = Gaussians(*parts, sh_from_rgb(np.ones((2, 3))))
-    return gaussians, camera
+    means, scales, quats = [[0, 0, 0], [0, 1, 0]], np.zeros((2, 3)), np.eye(4)[[0, 0]]
+    parts = (np.array(part, np.float32) for part in (means, scales, quats, [0, 9]))
+    return Gaussians(*parts, sh_from_rgb(np.ones((2, 3)))), pinhole(40.0, 33, 25, (0, -2, 0))
 
 
 def test_maps_are_means_over_what_a_pixel_shows():
@@ -94,35 +88,28 @@ def test_maps_of_an_empty_view_are_zero(tmp_path):
     assert (tmp_path / "empty.png").is_file()
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    root = tmp_path_factory.mktemp("diagnostics")
-    tiny.run(root / "run", load_dataset(tiny.write_dataset(root / "data")))
-    return root / "run"
-
-
-def test_files(run):
-    written = diagnostics.diagnose(run, ["kf_0007"])
+def test_files(whole):
+    written = diagnostics.diagnose(whole, ["kf_0007"])
     assert [path.name for path in written] == ["information.ply", "kf_0007.exr", "kf_0007.png"]
-    channels = read_exr(run / "diagnostics/kf_0007.exr")
+    channels = read_exr(whole / "diagnostics/kf_0007.exr")
     assert set(channels) == CHANNELS
     assert {values.shape for values in channels.values()} == {(tiny.HEIGHT, tiny.WIDTH)}
     assert channels["A"].max() > 0.3
     assert channels["information"].max() > 0
-    with Image.open(run / "diagnostics/kf_0007.png") as picture:
+    with Image.open(whole / "diagnostics/kf_0007.png") as picture:
         picture.load()
-    assert (run / "diagnostics/kf_0007.png").stat().st_size < 400_000
-    vertices = PlyData.read(str(run / "diagnostics/information.ply"))["vertex"]
-    state = run_folder.read_checkpoint(run)
+    assert (whole / "diagnostics/kf_0007.png").stat().st_size < 400_000
+    vertices = PlyData.read(str(whole / "diagnostics/information.ply"))["vertex"]
+    state = run_folder.read_checkpoint(whole)
     assert len(vertices.data) == tiny.POINTS
     assert vertices["red"].dtype == np.uint8
     np.testing.assert_allclose(vertices["fisher_opacity"], state.H[:, 10], rtol=1e-6)
     np.testing.assert_allclose(np.stack([vertices[a] for a in "xyz"], 1), state.gaussians.means)
 
 
-def test_views(run):
-    frames = load_dataset(run_folder.open_run(run).settings.dataset).frames
-    state = run_folder.read_checkpoint(run)
+def test_views(whole):
+    frames = load_dataset(run_folder.open_run(whole).settings.dataset).frames
+    state = run_folder.read_checkpoint(whole)
     trained = [frames[i].name for i in state.taken]
     chosen = diagnostics.choose_views(frames, trained, None)
     assert len(chosen) == diagnostics.VIEWS
@@ -130,4 +117,4 @@ def test_views(run):
     everything = [frame.name for frame in frames]
     assert len(diagnostics.choose_views(frames, everything, None)) == diagnostics.VIEWS
     named = "kf_9999: no such frame; the dataset has kf_0000 to kf_0011"
-    fails(named, diagnostics.diagnose, run, ["kf_9999"])
+    fails(named, diagnostics.diagnose, whole, ["kf_9999"])

@@ -115,15 +115,9 @@ def test_evaluate(tmp_path):
     out what was trained on. Test views may have names of training views."""
     dataset, calls = write_dataset(tmp_path / "data", orbit_cameras(4)), []
     tests = write_dataset(tmp_path / "test", orbit_cameras(3, 40, 30)).frames
-    result = evaluate_model(
-        grey(),
-        dataset.frames,
-        {"kf_0001"},
-        test_frames=tests,
-        renderer=flat,
-        pictures=tmp_path / "renders",
-        progress=lambda done, total: calls.append((done, total)),
-    )
+    options = {"test_frames": tests, "renderer": flat, "pictures": tmp_path / "renders"}
+    options["progress"] = lambda done, total: calls.append((done, total))
+    result = evaluate_model(grey(), dataset.frames, {"kf_0001"}, **options)
     assert [view["name"] for view in result["views"]] == [f"kf_000{i}" for i in range(4)]
     assert [view["trained"] for view in result["views"]] == [False, True, False, False]
     assert [view["trained"] for view in result["test_views"]] == [False] * 3
@@ -168,9 +162,8 @@ def random_view(rng):
 @given(seed=st.integers(0, 10_000))
 def test_surface_metrics_follow_their_definitions(seed):
     truth, weight, mask, true_depth, alpha, depth = random_view(np.random.default_rng(seed))
-    found = compare_surface(
-        truth, alpha, depth, mask, weight, fractional=True, true_depth=true_depth
-    )
+    options = {"fractional": True, "true_depth": true_depth}
+    found = compare_surface(truth, alpha, depth, mask, weight, **options)
     assert tuple(found) == SURFACE_METRICS
     errors, see_through, behind = [], [], []
     for at in np.ndindex(mask.shape):

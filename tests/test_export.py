@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny
 from program import command
 from refusals import fails, refused
 from test_meshes import glb, parts_of
@@ -406,12 +405,9 @@ def test_spz_without_its_package(tmp_path, monkeypatch, capsys):
 
 
 @pytest.fixture(scope="module")
-def chosen(tmp_path_factory):
+def chosen(whole):
     """A run of a dataset with masks and depth."""
-    root = tmp_path_factory.mktemp("chosen")
-    tiny.write_dataset(root / "data")
-    tiny.run(root / "run", load_dataset(root / "data"))
-    return open_run(root / "run")
+    return open_run(whole)
 
 
 def test_the_views_taken_as_colmap_reads_them(chosen, tmp_path):

@@ -10,7 +10,7 @@ from refusals import fails
 from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
-from mgs import Camera, Dataset, PriorSettings, look_at, render
+from mgs import Dataset, PriorSettings, render
 from mgs.images import write_png
 from mgs.prior import initial
 from mgs.prior.build import Prior, build_prior, load_prior, prior_from_mesh, save_prior
@@ -21,8 +21,7 @@ from mgs.run.inputs import prior_digest
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    cameras = synthetic.orbit_cameras(12, 96, 72)
-    return synthetic.write_dataset(tmp_path_factory.mktemp("orbit"), cameras)
+    return synthetic.orbit(tmp_path_factory.mktemp("orbit"), 12, 96, 72)
 
 
 @pytest.fixture(scope="module")
@@ -67,10 +66,9 @@ def test_a_warm_start_gives_new_images_to_what_none_saw_before(prior, dataset):
 
 def test_a_pixel_on_the_surface(prior):
     """depth / focal length; of several cameras about the closest, of none in front 0."""
-    K = np.array([[100.0, 0, 20], [0, 100.0, 15], [0, 0, 1]])
     centre, x = np.median(prior.points, axis=0), np.array([1.0, 0, 0])
     near, far, turned = (
-        Camera(K, 40, 30, look_at(centre + d * x, centre + (d - sign) * x))
+        synthetic.pinhole(100.0, 40, 30, centre + d * x, centre + (d - sign) * x)
         for d, sign in ((5, 1), (10, 1), (10, -1))
     )
     assert pixel_on(prior, [near]) == pytest.approx(0.05, rel=0.01)
@@ -155,9 +153,8 @@ def test_behind_the_surface_lies_an_opaque_backing(dataset, backed):
     inward = np.einsum("nk,nk->n", surface.means[over] - backing.means, prior.normals[over])
     np.testing.assert_allclose(inward, prior.spacing, rtol=1e-3)
     np.testing.assert_array_equal(backing.sh, surface.sh[over])
-    apart = [
-        cKDTree(points).query(points, 2)[0][:, 1] for points in (prior.points, prior.points[over])
-    ]
+    both = prior.points, prior.points[over]
+    apart = [cKDTree(points).query(points, 2)[0][:, 1] for points in both]
     assert apart[1].min() > 1.1 * apart[0].mean()  # a random subset would have nearer neighbours
 
     opacities = np.full(800, -3, np.float32)

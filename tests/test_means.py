@@ -52,13 +52,8 @@ def settings(means: str, passes: int, rate: float = MEAN_RATE * SPACING) -> Trai
     return TrainSettings(means=means, rates={"mean": rate}, passes=passes, tolerance=0.0)
 
 
-LAM = {
-    "colour": 4e-4,
-    "scale": 1.6e-3,
-    "rotation": 1.6e-3,
-    "opacity": 1e-4,
-    "mean": (0.02 / (MEAN_STD * SPACING)) ** 2,
-}
+LAM = {"colour": 4e-4, "scale": 1.6e-3, "rotation": 1.6e-3, "opacity": 1e-4}
+LAM["mean"] = (0.02 / (MEAN_STD * SPACING)) ** 2
 
 
 def fitted(begun, cameras, targets, train, start=None):
@@ -171,9 +166,8 @@ def test_criteria_see_the_means_and_coverage_does_not(files, whole):
 
 @pytest.mark.parametrize("policy", ["d-optimal", "coverage", "directional-d"])
 def test_policies_choose_with_learned_means(files, tmp_path, policy):
-    state = run_nbv(
-        files[0], tmp_path / "run", **options(files, "free", budget=1, policy=policy)
-    ).state
+    given = options(files, "free", budget=1, policy=policy)
+    state = run_nbv(files[0], tmp_path / "run", **given).state
     assert len(state.taken) == 4
     assert np.isfinite(state.steps[1]["score"])
 

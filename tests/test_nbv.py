@@ -145,14 +145,11 @@ def test_random_depends_on_the_seed_only(loaded, tmp_path):
     assert one == same != other
 
 
-@pytest.mark.parametrize(
-    ("moment", "count"),
-    [
-        ("fisher", 40),
-        ("before the lines are written", 1),
-        ("while the checkpoint is written", 3),
-    ],
-)
+KILLS = [("fisher", 40), ("before the lines are written", 1)]
+KILLS += [("while the checkpoint is written", 3)]
+
+
+@pytest.mark.parametrize(("moment", "count"), KILLS)
 def test_a_killed_run_that_is_resumed_takes_the_same_views(
     loaded, tmp_path, uninterrupted, moment, count
 ):
@@ -309,15 +306,11 @@ def test_a_batch_ends_before_a_view_below_the_gain_limit(loaded, tmp_path):
     assert len(state.taken) < len(whole.taken)
 
 
-METRES = st.floats(-100, 100)
+def metres(*shape):
+    return arrays(np.float64, shape, elements=st.floats(-100, 100))
 
 
-@given(
-    arrays(np.float64, (4, 3), elements=METRES),
-    arrays(np.float64, 3, elements=METRES),
-    st.floats(0.1, 100),
-    st.floats(0.1, 10),
-)
+@given(metres(4, 3), metres(3), st.floats(0.1, 100), st.floats(0.1, 10))
 def test_cost_of_an_image_and_of_the_way_to_it(positions, here, travel, factor):
     cost = poses.travel_cost(positions, here, travel)
     distance = np.linalg.norm(positions - here, axis=1)
@@ -379,10 +372,7 @@ def test_moves_can_be_limited_to_the_nearest_poses(loaded, tmp_path):
     assert wide.taken == free.taken != state.taken
 
 
-@pytest.mark.parametrize(
-    ("count", "nearest"),
-    [(1, [0]), (2, [0, 2]), (3, [0, 2, 3]), (9, [0, 1, 2, 3, 4])],
-)
-def test_the_nearest_poses(count, nearest):
+def test_the_nearest_poses():
     positions = np.array([[0.0, 0, 0], [3, 0, 0], [1, 0, 0], [-1, 0, 0], [9, 0, 0]])
-    assert poses.nearest_poses(positions, np.zeros(3), count) == nearest
+    for count, nearest in ((1, [0]), (2, [0, 2]), (3, [0, 2, 3]), (9, [0, 1, 2, 3, 4])):
+        assert poses.nearest_poses(positions, np.zeros(3), count) == nearest

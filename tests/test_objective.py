@@ -23,15 +23,11 @@ N = 60
 LAM = {"colour": 0.02, "scale": 0.05, "rotation": 0.1, "opacity": 0.01, "mean": 30.0}
 
 
-@pytest.fixture(
-    scope="module",
-    params=[
-        ("frozen", 0.0, True),
-        ("free", 0.0, True),
-        ("frozen", 0.3, False),
-        ("free", 2.0, True),
-    ],
-)
+KINDS = ("frozen", 0.0, True), ("free", 0.0, True), ("frozen", 0.3, False), ("free", 2.0, True)
+"""Means, weight of alpha, whether colours are linear."""
+
+
+@pytest.fixture(scope="module", params=KINDS)
 def case(request):
     """Objective, model, and from the reference: Jacobian [M,P], residual [M], weights [M], lam [P]
     and offset from the start [P], parameters in the order of `learned`."""
@@ -39,25 +35,16 @@ def case(request):
     start = surface_gaussians(N)
     start.log_scales += 0.9
     rng = np.random.default_rng(5)
-    model = Gaussians(
-        start.means,
-        *(
-            (a + 0.1 * rng.standard_normal(a.shape)).astype(np.float32)
-            for a in (start.log_scales, start.quats, start.logit_opacities, start.sh)
-        ),
-        linear=linear,
-    )
+    parts = start.log_scales, start.quats, start.logit_opacities, start.sh
+    moved = ((a + 0.1 * rng.standard_normal(a.shape)).astype(np.float32) for a in parts)
+    model = Gaussians(start.means, *moved, linear=linear)
     offsets = 0.02 * rng.standard_normal((N, MEANS[means]))
     if means == "free":
         model.means = (start.means + offsets).astype(np.float32)
     first = surface_camera(start, 24, 20)
     distance = np.linalg.norm(first.position)
-    cameras = [
-        Camera(
-            first.K, 24, 20, look_at(distance * np.array([np.cos(a), np.sin(a), 0.4]), [0, 0, 0.4])
-        )
-        for a in (0.3, 2.0)
-    ]
+    eyes = [distance * np.array([np.cos(a), np.sin(a), 0.4]) for a in (0.3, 2.0)]
+    cameras = [Camera(first.K, 24, 20, look_at(eye, [0, 0, 0.4])) for eye in eyes]
     channels = 4 if alpha_weight else 3
     truths = [rng.uniform(0, 1, (20, 24, channels)).astype(np.float32) for _ in cameras]
     weights = [(rng.uniform(size=(20, 24, 1)) > 0.2).astype(np.float32) for _ in cameras]
@@ -75,12 +62,8 @@ def case(request):
     images = [reference.render(model, camera) for camera in cameras]
     images = [np.dstack([i["rgb"], i["alpha"]])[..., :channels] for i in images]
     scale = np.sqrt([1.0, 1.0, 1.0, alpha_weight])[:channels]
-    residual = np.concatenate(
-        [((i - t) * scale).ravel() for i, t in zip(images, truths, strict=True)]
-    )
-    weight = np.concatenate(
-        [np.broadcast_to(w, t.shape).ravel() for w, t in zip(weights, truths, strict=True)]
-    )
+    residual = ((np.stack(images) - truths) * scale).ravel()
+    weight = np.broadcast_to(weights, np.shape(truths)).ravel()
     changes = [(getattr(model, name) - getattr(start, name)).ravel() for name in learned()]
     changes.append(offsets.ravel())
     lam = np.repeat(list(LAM.values()), [change.size for change in changes])
@@ -114,9 +97,8 @@ def test_the_largest_diagonal_is_that_of_one_image(case):
     goal, model, J, _, _, lam, _ = case
     each = (J.reshape(2, -1, J.shape[1]) ** 2).sum(1)  # two images
     expected = each.max(0) + lam / 2
-    assert np.allclose(
-        flat(goal.largest_diagonal(model)), expected, rtol=1e-3, atol=1e-5 * expected.max()
-    )
+    found = flat(goal.largest_diagonal(model))
+    assert np.allclose(found, expected, rtol=1e-3, atol=1e-5 * expected.max())
 
 
 UNSEEN = np.zeros((20, 24, 4), np.float32)
@@ -180,9 +162,8 @@ def slow_loss(drawn, pixels, weights, linear=True):
     window /= window.sum()
 
     def blur(image):
-        return correlate1d(
-            correlate1d(image, window, 0, mode="constant"), window, 1, mode="constant"
-        )
+        rows = correlate1d(image, window, 0, mode="constant")
+        return correlate1d(rows, window, 1, mode="constant")
 
     y = np.dstack([encoded(pixels[..., :3]), pixels[..., 3:]])
     x = y + (np.dstack([encoded(drawn[..., :3]), drawn[..., 3:]]) - y) * weights
@@ -240,12 +221,10 @@ def test_a_fit_lowers_l1_and_dssim():
     rgb = np.asarray(render(model, camera).rgb)
     target = np.dstack([rgb, np.ones(rgb.shape[:2])]).astype(np.float32)
     model.sh[:] = 0
-    found = fit_gaussians(
-        model, [camera], [target], TrainSettings(loss="l1-dssim", passes=8, tolerance=0)
-    )
+    settings = TrainSettings(loss="l1-dssim", passes=8, tolerance=0)
+    found = fit_gaussians(model, [camera], [target], settings)
     grey = np.asarray(render(model, camera).rgb, np.float64)
-    assert found.losses[0] == pytest.approx(
-        slow_loss(grey, rgb, np.ones_like(rgb)).mean(), rel=1e-4
-    )
+    expected = slow_loss(grey, rgb, np.ones_like(rgb)).mean()
+    assert found.losses[0] == pytest.approx(expected, rel=1e-4)
     assert found.losses[1] == pytest.approx(found.losses[0], rel=1e-5)
     assert found.loss < 0.9 * found.losses[0]

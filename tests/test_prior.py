@@ -24,8 +24,7 @@ X, Y, Z = np.eye(3)
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    cameras = synthetic.orbit_cameras(12, 96, 72)
-    return synthetic.write_dataset(tmp_path_factory.mktemp("orbit"), cameras)
+    return synthetic.orbit(tmp_path_factory.mktemp("orbit"), 12, 96, 72)
 
 
 @pytest.fixture(scope="module")

@@ -1,12 +1,12 @@
 """Why a run ends, and what a resumed run needs: its prior, poses and files as they were."""
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import synthetic
 import tiny
 from hypothesis import given
 from hypothesis import strategies as st
@@ -22,9 +22,9 @@ from mgs.run.settings import NbvSettings
 
 
 @pytest.fixture(scope="module")
-def whole(loaded, tmp_path_factory):
-    """A run that spent its budget of 5 views."""
-    return run(tmp_path_factory.mktemp("whole") / "run", loaded)
+def spent(whole):
+    """The last state of a run that spent its budget of 5 views."""
+    return run_folder.open_run(whole).state
 
 
 def never(*arguments):
@@ -71,8 +71,8 @@ def test_uncertainty_is_the_variance_left_over_that_of_the_prior():
 
 
 @pytest.mark.parametrize("rule", ["stop_gain", "stop_uncertainty", "budget"])
-def test_a_run_that_ended_goes_on_only_when_its_rule_is_changed(loaded, whole, tmp_path, rule):
-    two, three = whole.steps[2:4]
+def test_a_run_that_ended_goes_on_only_when_its_rule_is_changed(loaded, spent, tmp_path, rule):
+    two, three = spent.steps[2:4]
     assert two["uncertainty"] > three["uncertainty"]
     limit, left = (two["information_gain"] + three["information_gain"]) / 2, two["uncertainty"]
     next_view = {"name": three["name"], "information_gain": three["information_gain"]}
@@ -83,7 +83,7 @@ def test_a_run_that_ended_goes_on_only_when_its_rule_is_changed(loaded, whole, t
     }[rule]
     out = tmp_path / "run"
     state = run(out, loaded, **{rule: value})
-    assert state.taken == whole.taken[:5]
+    assert state.taken == spent.taken[:5]
     assert "ended" not in state.steps[-2]
     assert state.steps[-1]["ended"] == {"reason": reason, "views": 2, **numbers}
     assert three["name"] not in state.inputs["files"], "the image of a view that was refused"
@@ -93,9 +93,9 @@ def test_a_run_that_ended_goes_on_only_when_its_rule_is_changed(loaded, whole, t
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     change_settings(out, **{rule: changed})
     last = resume(out, loaded)
-    assert last.taken == whole.taken
+    assert last.taken == spent.taken
     assert ["ended" in line for line in last.steps] == [False] * 5 + [True]
-    np.testing.assert_array_equal(last.gaussians.sh, whole.gaussians.sh)
+    np.testing.assert_array_equal(last.gaussians.sh, spent.gaussians.sh)
 
 
 def other_image(root: Path, name: str) -> None:
@@ -105,29 +105,22 @@ def other_image(root: Path, name: str) -> None:
 
 def edit(root: Path, name: str, x: float = 0, **values) -> None:
     """Change a frame's entries in transforms.json, and move its camera by x metres."""
-    data = json.loads((root / "transforms.json").read_text())
-    record = next(record for record in data["frames"] if name in record["file_path"])
-    record["transform_matrix"][0][3] += x
-    record.update(values)
-    (root / "transforms.json").write_text(json.dumps(data))
+
+    def change(data):
+        record = next(record for record in data["frames"] if name in record["file_path"])
+        record["transform_matrix"][0][3] += x
+        record.update(values)
+
+    synthetic.edit(root, change)
 
 
+OTHER = "images/kf_0000.png"
 CHANGES = {
-    r"images/kf_0004\.png has changed since .*run took it": (
-        lambda root: other_image(root, "kf_0004")
-    ),
-    r"depth/kf_0000\.exr has changed": (
-        lambda root: (root / "depth/kf_0000.exr").write_bytes(b"other")
-    ),
-    r"images/kf_0000\.png has changed": (
-        lambda root: edit(root, "kf_0004", rock_file_path="images/kf_0000.png")
-    ),
-    r"transforms\.json: the mask of frame kf_0000 has changed": (
-        lambda root: edit(root, "kf_0000", mask_path=None)
-    ),
-    r"transforms\.json: the camera of frame kf_0005 has changed": (
-        lambda root: edit(root, "kf_0005", x=1e-6)
-    ),
+    r"images/kf_0004\.png has changed since .*run took it": lambda d: other_image(d, "kf_0004"),
+    r"depth/kf_0000\.exr has changed": lambda d: (d / "depth/kf_0000.exr").write_bytes(b"other"),
+    r"images/kf_0000\.png has changed": lambda d: edit(d, "kf_0004", rock_file_path=OTHER),
+    "the mask of frame kf_0000 has changed": lambda d: edit(d, "kf_0000", mask_path=None),
+    "the camera of frame kf_0005 has changed": lambda d: edit(d, "kf_0005", x=1e-6),
 }
 """Message, and change of the dataset. Of 12 frames on a circle 0, 4 and 8 are the seeds."""
 

@@ -21,14 +21,8 @@ def test_gaussian_lands_on_the_pixel_of_the_camera(pixel, depth):
     camera = make_camera()
     mean = place(camera, [pixel], [depth])[0]
     np.testing.assert_allclose(camera.project([mean])[0][0], pixel, atol=1e-9)
-    white = 0.5 / SH_C0
-    g = Gaussians(
-        mean[None],
-        np.full((1, 3), -3.0),
-        np.array([[1.0, 0, 0, 0]]),
-        np.array([3.0]),
-        np.full((1, 1, 3), white),
-    )
+    white = np.full((1, 1, 3), 0.5 / SH_C0)
+    g = Gaussians(mean[None], np.full((1, 3), -3.0), np.eye(1, 4), np.array([3.0]), white)
     image = reference.render(g, camera)
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     weight = image["alpha"] / image["alpha"].sum()
@@ -55,13 +49,8 @@ def test_covariance_is_that_of_the_camera_seen_by_differences():
 def test_nearer_gaussian_hides_the_farther():
     camera = make_camera()
     means = place(camera, [(20.5, 12.5)] * 2, [3.0, 1.5])
-    g = Gaussians(
-        means,
-        np.full((2, 3), -1.0),
-        np.tile([1.0, 0, 0, 0], (2, 1)),
-        np.array([9.0, 9.0]),
-        np.array([[[1.0, -9, -9]], [[-9.0, 1, -9]]]),
-    )
+    sh = np.array([[[1.0, -9, -9]], [[-9.0, 1, -9]]])
+    g = Gaussians(means, np.full((2, 3), -1.0), np.eye(4)[[0, 0]], np.array([9.0, 9.0]), sh)
     centre = reference.render(g, camera)["rgb"][12, 20]
     assert centre[1] > 0.7
     assert centre[0] < 1e-3
@@ -98,10 +87,8 @@ def test_jacobian_against_central_differences(degree, centre, antialiased):
     if centre:
         pixels, _ = camera.project(g.means[order[alpha.any(0)]])
         assert (pixels[:, 0] > 21 * (1 + FRUSTUM_MARGIN / 2)).any()
-    frozen, free = (
-        reference.jacobian(g, camera, BACKGROUND, means=means, alpha_weight=weight)
-        for means in ("frozen", "free")
-    )
+    options = [{"means": means, "alpha_weight": weight} for means in ("frozen", "free")]
+    frozen, free = (reference.jacobian(g, camera, BACKGROUND, **how) for how in options)
     P = 3 * (degree + 1) ** 2 + 8
     assert frozen.shape[1:] == (4, 6, P)
     assert free.shape[-1] == P + 3

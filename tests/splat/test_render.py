@@ -97,25 +97,22 @@ def test_error_at_the_edge_of_a_large_image(centre):
 
 def stack(camera, opacities) -> Gaussians:
     """Round white Gaussians one behind the other, all centred on the middle of pixel (20, 12)."""
-    n = len(opacities)
-    opacities = np.asarray(opacities, np.float64)
-    return Gaussians(
-        place(camera, [(20.5, 12.5)] * n, 1.5 + 0.1 * np.arange(n)).astype(np.float32),
-        np.full((n, 3), -2.0, np.float32),
-        np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
-        np.log(opacities / (1 - opacities)).astype(np.float32),
-        np.full((n, 1, 3), 0.5 / SH_C0, np.float32),
-        antialiased=False,
-    )
+    n, opacities = len(opacities), np.asarray(opacities, np.float64)
+    means = place(camera, [(20.5, 12.5)] * n, 1.5 + 0.1 * np.arange(n))
+    logits, white = np.log(opacities / (1 - opacities)), np.full((n, 1, 3), 0.5 / SH_C0)
+    parts = means, np.full((n, 3), -2.0), np.eye(4)[[0] * n], logits, white
+    return Gaussians(*(part.astype(np.float32) for part in parts), antialiased=False)
 
 
 @pytest.mark.parametrize("above", [False, True])
-def test_threshold_of_alpha(above):
+def test_threshold_and_bound_of_alpha(above):
     camera = make_camera()
     gaussians = stack(camera, [ALPHA_MIN * (1.001 if above else 0.999)])
     alpha = np.asarray(render(gaussians, camera).alpha)
     assert alpha[12, 20] == pytest.approx(ALPHA_MIN * 1.001 if above else 0, rel=1e-4)
     np.testing.assert_allclose(alpha, reference.render(gaussians, camera)["alpha"], atol=TOLERANCE)
+    alpha = np.asarray(render(changed(stack(camera, [0.5]), logit_opacities=[20]), camera).alpha)
+    assert alpha[12, 20] == pytest.approx(ALPHA_MAX, abs=1e-6)
 
 
 @pytest.mark.parametrize("above", [False, True])
@@ -127,12 +124,6 @@ def test_threshold_of_transmittance(above):
     alpha = float(np.asarray(render(gaussians, camera).alpha)[12, 20])
     assert alpha == pytest.approx(1 - 1.001 * TRANSMITTANCE_MIN if above else 1 - 0.1**3, abs=1e-6)
     assert alpha == pytest.approx(reference.render(gaussians, camera)["alpha"][12, 20], abs=1e-6)
-
-
-def test_alpha_is_clamped():
-    camera = make_camera()
-    alpha = np.asarray(render(changed(stack(camera, [0.5]), logit_opacities=[20]), camera).alpha)
-    assert alpha[12, 20] == pytest.approx(ALPHA_MAX, abs=1e-6)
 
 
 def test_tiles_are_the_whole_bit_for_bit():

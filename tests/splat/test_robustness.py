@@ -199,12 +199,12 @@ def test_not_a_number_names_the_parameter_and_the_first_gaussian(name):
     getattr(g, name)[5], getattr(g, name)[9] = -np.inf, np.nan
     cache = ListCache()
     render(scene(), CAMERA, cache=cache)
-    for call in (
-        lambda: render(g, CAMERA),
-        lambda: render(g, CAMERA, cache=cache),
-        lambda: fisher(g, CAMERA),
-    ):
-        fails(f"{name} is NaN or infinite, first at Gaussian 5", call)
+    first = f"{name} is NaN or infinite, first at Gaussian"
+    for call, options in ((render, {}), (render, {"cache": cache}), (fisher, {})):
+        fails(f"{first} 5", call, g, CAMERA, **options)
+    hidden = behind_camera()
+    getattr(hidden, name)[0] = np.nan
+    fails(f"{first} 0", render, hidden, CAMERA)
 
 
 def test_opacities_of_extreme_logits():
@@ -235,25 +235,15 @@ def test_the_largest_colours_have_finite_information_and_gradients(estimator):
     assert all(np.isfinite(gradient).all() for gradient in gradients(g, CAMERA).values())
 
 
-def test_a_bad_number_behind_the_camera_is_an_error_too():
-    g = behind_camera()
-    g.sh[0, 0, 1] = np.nan
-    fails("sh is NaN or infinite, first at Gaussian 0", render, g, CAMERA)
+SHAPES = [("means", (N, 2)), ("quats", (N - 1, 4)), ("sh", (N, 3)), ("sh", (N, 5, 3))]
 
 
-@pytest.mark.parametrize(
-    ("name", "shape", "message"),
-    [
-        ("means", (N, 2), "means has shape"),
-        ("means", (0, 3), "log_scales has shape"),
-        ("quats", (N - 1, 4), "quats has shape"),
-        ("sh", (N, 3), "sh has shape"),
-        ("sh", (N, 5, 3), "sh has shape"),
-    ],
-)
-def test_shapes_that_do_not_fit_are_an_error(name, shape, message):
+@pytest.mark.parametrize(("name", "shape"), [*SHAPES, ("means", (0, 3))])
+def test_shapes_that_do_not_fit_are_an_error(name, shape):
+    """With no means, those of the next array do not fit."""
     for call in (render, fisher):
-        fails(message, call, changed(scene(), **{name: np.zeros(shape)}), CAMERA)
+        named = f"{name if shape[0] else 'log_scales'} has shape"
+        fails(named, call, changed(scene(), **{name: np.zeros(shape)}), CAMERA)
 
 
 def test_no_variant_is_named_in_the_code():
