@@ -23,14 +23,11 @@ def case(kind, seed=0, order=None):
     rng = np.random.default_rng(seed)
     order = np.arange(POSES) if order is None else order
     points = 0.5 * rng.normal(size=(POINTS, 3))
-    seen = rng.choice([0.0, 1.0], (POSES + 8, POINTS)) * 10 ** rng.uniform(
-        -4, 0, (POSES + 8, POINTS)
-    )
+    shape = POSES + 8, POINTS
+    seen = rng.choice([0.0, 1.0], shape) * 10 ** rng.uniform(-4, 0, shape)
     every = Views(rng.normal(size=(POSES + 8, 3)) * 3 + [0, 0, 4], seen.astype(np.float32))
-    views, taken, dome = (
-        Views(every.positions[some], every.seen[some])
-        for some in (order, slice(POSES, POSES + 2), slice(POSES + 2, None))
-    )
+    parts = order, slice(POSES, POSES + 2), slice(POSES + 2, None)
+    views, taken, dome = (Views(every.positions[some], every.seen[some]) for some in parts)
     if kind in "di":
         model, around = ((1, 0.3), None) if kind == "d" else ((2, 0.2), dome)
         made = relaxation.directional(points, LAM, *model, taken, views, around)
@@ -44,10 +41,8 @@ def case(kind, seed=0, order=None):
             return total
 
         return made, gain
-    F, lam = (
-        rng.uniform(0, 3, (POSES, POINTS, 4))[order] * (views.seen > 0)[..., None],
-        np.full(4, 1.5),
-    )
+    F = rng.uniform(0, 3, (POSES, POINTS, 4))[order] * (views.seen > 0)[..., None]
+    lam = np.full(4, 1.5)
     H = rng.choice([0.0, 1.0, 2.0], (POINTS, 4))
     if kind == "coverage":
         F, H, lam = F[..., :3], H[:, :3], lam[:3]
@@ -76,15 +71,10 @@ def test_every_set_is_below_the_bound_and_branch_and_bound_finds_the_best(kind, 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_bound_is_the_optimum_that_scipy_finds(kind):
     made, _ = case(kind)
-    found = minimize(
-        lambda x: -made.tangent(x)[0],
-        np.full(POSES, 3 / POSES),
-        jac=lambda x: -made.tangent(x)[1],
-        bounds=[(0, 1)] * POSES,
-        constraints={"type": "eq", "fun": lambda x: x.sum() - 3},
-        method="SLSQP",
-        options={"ftol": 1e-12, "maxiter": 200},
-    )
+    how = {"method": "SLSQP", "jac": True, "options": {"ftol": 1e-12, "maxiter": 200}}
+    sum_of_3 = {"type": "eq", "fun": lambda x: x.sum() - 3}
+    loss, start = lambda x: [-part for part in made.tangent(x)], np.full(POSES, 3 / POSES)
+    found = minimize(loss, start, bounds=[(0, 1)] * POSES, constraints=sum_of_3, **how)
     bound = upper_bound(made, 3, tolerance=1e-7)
     assert bound.value == pytest.approx(-found.fun, rel=1e-5)
     assert bound.stopped == "gap"
@@ -97,10 +87,9 @@ def test_gradient_and_curvature_are_those_of_differences(kind):
     x, d = np.linspace(0.1, 0.9, POSES), np.random.default_rng(1).normal(size=POSES)
     ahead, behind = (made.tangent(x + h * d) for h in (1e-4, -1e-4))
     assert made.tangent(x)[1] @ d == pytest.approx((ahead[0] - behind[0]) / 2e-4, rel=1e-5)
-    bend = -made.curvature(x) @ d
-    assert bend == pytest.approx(
-        (ahead[1] - behind[1]) / 2e-4, rel=1e-4, abs=1e-6 * abs(bend).max()
-    )
+    bend, near = -made.curvature(x) @ d, {"rel": 1e-4}
+    near["abs"] = 1e-6 * abs(bend).max()
+    assert bend == pytest.approx((ahead[1] - behind[1]) / 2e-4, **near)
 
 
 @pytest.mark.parametrize("k", [1, 3])
@@ -206,7 +195,6 @@ def test_greedy_takes_as_many_views_as_a_share_of_all_needs(kind):
     assert gain(views) >= 0.8 * every > gain(views[:-1])
     assert len(set(views)) == len(views)
     for k in range(len(views)):
-        assert gain(views[: k + 1]) == pytest.approx(
-            max(gain([*views[:k], v]) for v in range(POSES) if v not in views[:k])
-        )
+        best = max(gain([*views[:k], v]) for v in range(POSES) if v not in views[:k])
+        assert gain(views[: k + 1]) == pytest.approx(best)
     assert sorted(certificate.greedy(made, 1.0)) == list(range(POSES))

@@ -239,9 +239,8 @@ def test_the_excess_of_the_last_views_is_scaled_by_the_gains():
     assert predicted_psnr([first, entry]) == pytest.approx(-10 * np.log10(errors[0]))
     last = entry | {"left": 2.0}
     # Only the last three views count, and no excess is negative.
-    assert predicted_psnr([first, entry | {"new": 99}, entry, entry, last]) == pytest.approx(
-        -10 * np.log10(errors[1])
-    )
+    found = predicted_psnr([first, entry | {"new": 99}, entry, entry, last])
+    assert found == pytest.approx(-10 * np.log10(errors[1]))
     assert predicted_psnr([first, entry | {"new": 0.1}]) == pytest.approx(-10 * np.log10(0.9))
     assert predicted_psnr([first, {"new": 1.9, "gain": 5.0, "fitted": 0.9}]) is None
 

@@ -347,9 +347,8 @@ def test_the_export_of_a_run_fits_its_colours_again(dataset, prior, tmp_path, ca
     np.testing.assert_allclose(measured[:2], said, atol=0.006)
     assert measured[2] < measured[1], "colours that are fitted again are better"
     assert replace(fitted, sh=converted.sh) == converted, "only colours change"
-    command(
-        "export", tmp_path / "run/gaussians.ply", "--to", "ply", "--out", tmp_path / "alone.ply"
-    )
+    file = tmp_path / "run/gaussians.ply"
+    command("export", file, "--to", "ply", "--out", tmp_path / "alone.ply")
     assert "one by one" in capsys.readouterr().out
     assert read_ply(tmp_path / "alone.ply") == converted
     command("export", tmp_path / "fitted.ply", "--to", "ply", "--out", tmp_path / "same.ply")
@@ -363,10 +362,8 @@ def test_a_scene_is_exported_without_what_no_view_shows(
     """A Gaussian behind all cameras goes, and the views taken stay; of an object all stay."""
     settings = {"prior": prior, "seeds": 4, "budget": 0, "train": {"passes": 1}}
     run = mgs.run_nbv(dataset, tmp_path / "run", **settings)
-    cameras, model = (
-        [frame.camera for frame in run.taken],
-        run.gaussians[[*range(len(run.gaussians)), 0]],
-    )
+    cameras = [frame.camera for frame in run.taken]
+    model = run.gaussians[[*range(len(run.gaussians)), 0]]
     model.means[-1, 2] = 1e3
     black = int(run.state.H[:, -1].argmax())
     model.sh[black] = -10  # black, which hides what is behind it, but has no information on colour

@@ -43,9 +43,8 @@ def test_a_flat_square_asks_for_one_sample_in_so_many_pixels(height, focal):
 
 
 def test_a_density_is_samples_for_each_pixel():
-    once, four = (
-        len(_samples(square(), PriorSettings(density=density), None, 0.05)[0]) for density in (1, 4)
-    )
+    settings = (PriorSettings(density=density) for density in (1, 4))
+    once, four = (len(_samples(square(), one, None, 0.05)[0]) for one in settings)
     assert four / once == pytest.approx(4, rel=0.05)
     fails("density 0 must be positive", PriorSettings, density=0)
 

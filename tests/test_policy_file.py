@@ -103,10 +103,8 @@ def test_draws_do_not_depend_on_the_folder_of_the_file(loaded, file, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     paths = file, tmp_path / "elsewhere/mine.py"
     paths[1].write_text(FUNCTIONS)
-    runs = [
-        run(tmp_path / f"run{i}", loaded, policy=f"{path}:draw") for i, path in enumerate(paths)
-    ]
-    assert runs[0].taken == runs[1].taken
+    one, other = (run(tmp_path / str(k), loaded, policy=f"{paths[k]}:draw") for k in (0, 1))
+    assert one.taken == other.taken
 
 
 @pytest.mark.parametrize(

@@ -29,9 +29,8 @@ def test_the_jacobian_is_that_of_the_reference():
     residual, J = poses.residual_and_jacobian(goal, as_drjit(model), goal.photos[0])
     assert residual == pytest.approx((drawn(model, camera) - target).ravel(), abs=1e-5)
     for row, step in zip(J, 2e-7 * np.eye(6), strict=True):
-        ends = [
-            reference.render(model, poses.displaced(camera, way))["rgb"] for way in (step, -step)
-        ]
+        moved = [poses.displaced(camera, way) for way in (step, -step)]
+        ends = [reference.render(model, there)["rgb"] for there in moved]
         assert relative_error(row, (ends[0] - ends[1]) / 4e-7) < 1e-4
 
 
@@ -81,18 +80,15 @@ def test_the_command_refines_the_poses_of_a_run(tmp_path, coarse_priors, capsys)
     assert metrics["all"]["psnr_mask"] > given.metrics["all"]["psnr_mask"] + 1
 
     def pixels_off(dataset):
-        return np.mean(
-            [
-                np.linalg.norm(np.subtract(*(c.project(run.prior.points)[0] for c in pair)), axis=1)
-                for pair in zip(dataset.cameras, cameras, strict=True)
-            ]
-        )
+        ends = [
+            [c.project(run.prior.points)[0] for c in both] for both in (dataset.cameras, cameras)
+        ]
+        return np.linalg.norm(np.subtract(*ends), axis=-1).mean()
 
     assert pixels_off(run.dataset) < 0.5 * pixels_off(given.dataset)
     command("export", tmp_path / "run", "--to", "nerfstudio", "--out", tmp_path / "views")
-    for one, other in zip(
-        load_dataset(tmp_path / "views").cameras, run.dataset.cameras, strict=True
-    ):
+    views = load_dataset(tmp_path / "views").cameras
+    for one, other in zip(views, run.dataset.cameras, strict=True):
         assert np.allclose(one.world_to_camera, other.world_to_camera)
 
 
@@ -111,5 +107,5 @@ def test_a_refinement_with_free_means_is_bitwise_the_same_again(tmp_path, coarse
 
 
 def test_poses_are_refined_where_all_images_are_there(tmp_path):
-    data = synthetic.write_dataset(tmp_path / "data", synthetic.orbit_cameras(8, 32, 24))
+    data = synthetic.orbit(tmp_path / "data", 8, 32, 24)
     assert exit_code("nbv", data.root, "--out", tmp_path / "run", "--set", "refine_poses=true") == 2

@@ -31,10 +31,9 @@ def test_known_point_lands_on_its_pixel():
     point = np.array([0.25, -0.2, 0.45])
     light = {"type": "area", "radiance": 1.0}
     ball = {"type": "sphere", "center": point.tolist(), "radius": 0.05, "light": light}
-    integrator = {"type": "direct"}
-    scene = {"type": "scene", "integrator": integrator, "sensor": sensor_dict(camera), "ball": ball}
-    scene = mi.load_dict(scene)
-    image = np.array(mi.render(scene, spp=256)).sum(-1)
+    scene = {"type": "scene", "integrator": {"type": "direct"}, "ball": ball}
+    scene["sensor"] = sensor_dict(camera)
+    image = np.array(mi.render(mi.load_dict(scene), spp=256)).sum(-1)
     v, u = np.mgrid[:48, :64] + 0.5
     centroid = np.array([(image * u).sum(), (image * v).sum()]) / image.sum()
     np.testing.assert_allclose(centroid, camera.project(point[None])[0][0], atol=0.05)
@@ -101,8 +100,8 @@ def test_the_image_does_not_depend_on_the_number_of_threads(ball):
         dr.set_thread_count(count)
         images.append(np.dstack(render_layers(scene.scene, scene.guides, 35, seed=0)))
     dr.set_thread_count(threads)
-    np.testing.assert_array_equal(images[0], images[1])
-    np.testing.assert_array_equal(images[0], images[2])
+    assert np.array_equal(images[0], images[1])
+    assert np.array_equal(images[0], images[2])
 
 
 def test_samples_are_rounded_up_as_the_sampler_rounds_them():

@@ -200,9 +200,8 @@ def test_an_oracle_that_sees_the_truth_is_best_in_its_first_choice(tmp_path, cap
 def test_a_case_is_the_scene_with_some_keys_changed(tmp_path, monkeypatch):
     monkeypatch.undo()  # nothing is rendered here
     made = []
-    monkeypatch.setattr(
-        "mgs.synth.rendering.synth_orbit", lambda out, scene, *_, **__: made.append(scene)
-    )
+    render = lambda out, scene, *_, **__: made.append(scene)  # noqa: E731
+    monkeypatch.setattr("mgs.synth.rendering.synth_orbit", render)
     monkeypatch.setattr("mgs.load_dataset", lambda folder: ())
     changes = {"rock": {"specular": 0.0}, "orbit": {"kind": "hemisphere", "distances": [1, 2]}}
     for changed in ({}, changes):
@@ -371,20 +370,20 @@ def test_leads_are_over_scenes_and_corrected_for_all_tests():
     assert {lead["p_holm"] for lead in one} == {lead["lead_low"] for lead in one} == {None}
 
 
+BAD = {
+    "--rocks": "--rocks 13; --rocks x", "--scheduler": "--workers 2 --scheduler tcp://x:1",
+    "--policy uniform": "--policy uniform", "angle": f"--policy {OWN} --policy {OWN}",
+    "none.glb": "--mesh none.glb", "--scale": "--scale huge",
+}  # fmt: skip
+"""Word of the line -> options."""
+
+
 @pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        (["--rocks", 13], "--rocks"),
-        (["--rocks", "x"], "--rocks"),
-        (["--workers", 2, "--scheduler", "tcp://x:1"], "--scheduler"),
-        (["--policy", "uniform"], "--policy uniform"),
-        (["--policy", OWN, "--policy", OWN], "angle"),
-        (["--mesh", "none.glb"], "none.glb"),
-        (["--scale", "huge"], "--scale"),
-    ],
+    ("named", "options"), [(word, one) for word, all_ in BAD.items() for one in all_.split(";")]
 )
-def test_bad_options_are_one_line(capsys, tmp_path, options, named):
-    assert named in refused(capsys, [tmp_path / "out", *options], tmp_path, "setups")
+def test_bad_options_are_one_line(capsys, tmp_path, named, options):
+    given = [tmp_path / "out", *options.split()]
+    assert named in refused(capsys, given, tmp_path, "setups")
 
 
 def test_a_folder_of_another_scale_or_of_something_else_is_refused(capsys, tmp_path):

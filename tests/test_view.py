@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from refusals import refused
 from scipy.spatial.transform import Rotation
+from synthetic import pinhole
 
 from mgs import Camera, Run, evaluate_run, load_dataset, look_at, open_run, render, write_ply
 from mgs.colour import srgb_from_linear
@@ -118,19 +119,12 @@ def test_a_world_of_large_numbers_is_shown_smaller(run):
     subject, factor = read_subject(run), 1000
     assert scaled(subject) is subject
     g, mesh = subject.gaussians, subject.mesh
-    views = [
-        replace(view, frame=replace(view.frame, camera=view.frame.camera.scaled(factor)))
-        for view in subject.views
-    ]
-    larger = replace(
-        g, means=factor * g.means, log_scales=g.log_scales + np.float32(np.log(factor))
-    )
-    large = replace(
-        subject,
-        gaussians=larger,
-        views=views,
-        mesh=replace(mesh, vertices=factor * mesh.vertices),
-    )
+    frames = [replace(v.frame, camera=v.frame.camera.scaled(factor)) for v in subject.views]
+    views = [replace(v, frame=frame) for v, frame in zip(subject.views, frames, strict=True)]
+    scales = g.log_scales + np.float32(np.log(factor))
+    larger = replace(g, means=factor * g.means, log_scales=scales)
+    large = replace(subject, gaussians=larger, views=views)
+    large = replace(large, mesh=replace(mesh, vertices=factor * mesh.vertices))
     shown = scaled(large)
     assert np.ptp(shown.mesh.vertices) == pytest.approx(shown.scale * np.ptp(large.mesh.vertices))
     camera, shown_camera = (one.views[1].frame.camera for one in (subject, shown))
@@ -162,10 +156,8 @@ def test_the_camera_of_a_window(eye, target, fov, width, height):
         return
     pose = np.linalg.inv(look_at(eye, target))
     wxyz = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
-    handle = SimpleNamespace(
-        image_width=width, image_height=height, fov=fov, wxyz=wxyz, position=np.array(eye)
-    )
-    camera = window_camera(handle)
+    size = {"image_width": width, "image_height": height}
+    camera = window_camera(SimpleNamespace(**size, fov=fov, wxyz=wxyz, position=np.array(eye)))
     assert camera.width * camera.height <= 1e6 + camera.width + camera.height
     (pixel,), (z,) = camera.project([target])
     middle, near = camera.width / 2, {"atol": 1e-3 * camera.height}
@@ -271,12 +263,11 @@ def start_camera(subject) -> Camera:
     centre = np.median(subject.gaussians.means, axis=0).astype(float)
     offset = first.position - centre
     focal = HEIGHT * first.K[1, 1] / first.height
-    K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
     away = offset + np.linalg.norm(offset) * np.array([0, 0, 1])
     size = np.quantile(np.linalg.norm(subject.gaussians.means - centre, axis=1), 0.95)
     distance = size / (FILLED * np.tan(np.arctan(HEIGHT / 2 / focal)))
     eye = centre + distance * away / np.linalg.norm(away)
-    return Camera(K, WIDTH, HEIGHT, look_at(eye, centre))
+    return pinhole(focal, WIDTH, HEIGHT, eye, centre)
 
 
 def screenshot(tab) -> np.ndarray:

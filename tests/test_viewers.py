@@ -69,14 +69,10 @@ def run(tmp_path_factory):
 def projection(camera) -> np.ndarray:
     """OpenGL's projection [4,4] of a camera."""
     K, w, h = camera.K, camera.width, camera.height
-    return np.array(
-        [
-            [2 * K[0, 0] / w, 0, 1 - 2 * K[0, 2] / w, 0],
-            [0, 2 * K[1, 1] / h, 2 * K[1, 2] / h - 1, 0],
-            [0, 0, (NEAR + FAR) / (NEAR - FAR), 2 * NEAR * FAR / (NEAR - FAR)],
-            [0, 0, -1, 0],
-        ]
-    )
+    across = [2 * K[0, 0] / w, 0, 1 - 2 * K[0, 2] / w, 0]
+    down = [0, 2 * K[1, 1] / h, 2 * K[1, 2] / h - 1, 0]
+    depth = [0, 0, (NEAR + FAR) / (NEAR - FAR), 2 * NEAR * FAR / (NEAR - FAR)]
+    return np.array([across, down, depth, [0, 0, -1, 0]])
 
 
 @pytest.mark.parametrize(("viewer", "kind"), READ)
@@ -99,12 +95,8 @@ def test_a_viewer_shows_what_was_measured(browser, packages, run, viewer, kind):
         return route.fulfill(body=body, content_type=kind)
 
     matrices = projection(camera), turn @ opengl_from_opencv(camera.world_to_camera)
-    asked = [
-        f"/{file.name}",
-        camera.width,
-        camera.height,
-        *(m.T.ravel().tolist() for m in matrices),
-    ]
+    asked = [f"/{file.name}", camera.width, camera.height]
+    asked += [matrix.T.ravel().tolist() for matrix in matrices]
     call = f"async (asked) => (await import('/viewers.mjs')).{viewer}(...asked)"
     with opened(browser, HOST, camera.width, camera.height, serve=serve) as (tab, wrong):
         picture = tab.evaluate(call, asked)
