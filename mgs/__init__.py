@@ -11,8 +11,6 @@ Lengths are metres, the world is +Z up, cameras are OpenCV's (x right, y down, z
 are linear RGB.
 """
 
-from __future__ import annotations
-
 import lazy_loader
 
 __version__ = "0.1.0"

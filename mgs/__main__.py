@@ -1,7 +1,5 @@
 """The program `mgs`, and `python -m mgs`: end with one line where Ctrl-C comes during the start."""
 
-from __future__ import annotations
-
 import os
 import sys
 import warnings

@@ -1,7 +1,5 @@
 """Colour: linear RGB inside the program and in spherical harmonics, sRGB in PNG files."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

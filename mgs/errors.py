@@ -1,7 +1,5 @@
 """The exception for bad input: what the user can cause and can correct."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import TypeVar
 

@@ -1,8 +1,6 @@
 """Atomic reading and writing of files and folders: output gets a temporary name in the same folder
 and is renamed when complete, so a killed process leaves no incomplete file."""
 
-from __future__ import annotations
-
 import csv
 import fcntl
 import hashlib

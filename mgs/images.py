@@ -1,7 +1,5 @@
 """Images on disk: PNG and JPEG hold sRGB; OpenEXR holds linear colour, depth and other numbers."""
 
-from __future__ import annotations
-
 import math
 import os
 import sys

@@ -1,7 +1,5 @@
 """Steps of the loop at the model: capture views, fit to them, and sum their information."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Memory: checks that it suffices, bounded caches, and arrays for Dr.Jit."""
 
-from __future__ import annotations
-
 import ctypes
 import re
 import resource

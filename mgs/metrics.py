@@ -1,7 +1,5 @@
 """Quality of a rendered view as an image (PSNR, SSIM of sRGB) and as a surface (alpha, depth)."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

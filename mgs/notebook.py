@@ -1,7 +1,5 @@
 """HTML of objects for notebooks: a line of text and small pictures."""
 
-from __future__ import annotations
-
 from base64 import b64encode
 from collections.abc import Sequence
 from html import escape

@@ -1,7 +1,5 @@
 """Progress of long work: what works reports it, and what shows it listens."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar

@@ -1,7 +1,5 @@
 """Versions, which files of results record."""
 
-from __future__ import annotations
-
 import platform
 import subprocess
 from functools import cache

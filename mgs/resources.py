@@ -1,7 +1,5 @@
 """Data files that come with mgs: inside the package of a wheel, beside that of a checkout."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from mgs.errors import InputError

@@ -1,7 +1,5 @@
 """Rotations in NumPy: quaternions (w x y z), rotation matrices, glTF's axes."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

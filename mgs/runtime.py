@@ -2,8 +2,6 @@
 libLLVM older than 19 aborts the process inside a kernel without an exception, so it is checked
 before any kernel runs. tools/setup.sh uses this module before anything is installed."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import glob

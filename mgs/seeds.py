@@ -1,7 +1,5 @@
 """Random numbers: each part of the program derives its own seed from the run's, by name."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Gaussians in files: PLY, compressed PLY, binary glTF, SPZ, and what `mgs.compact` writes, told
 apart by their first bytes."""
 
-from __future__ import annotations
-
 import errno
 import gzip
 import os

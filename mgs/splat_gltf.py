@@ -5,8 +5,6 @@ in [0,1], and the coefficients of spherical harmonics: linear, activated values,
 and logits of a PLY. `colorSpace` names the space in which colours are blended.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import replace

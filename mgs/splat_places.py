@@ -1,7 +1,5 @@
 """Gaussians under a change of coordinates: axes that point elsewhere, and affine transforms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

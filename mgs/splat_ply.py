@@ -5,8 +5,6 @@ of degree 0; f_rest_*, those of higher degrees, all of red, then all of green, t
 opacity (its logit); scale_0..2 (natural logarithms); rot_0..3 (quaternion w x y z).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

@@ -23,8 +23,6 @@ Reverse and forward mode reach each parameter with enabled gradients, and the se
 `x_fov` and principal point.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

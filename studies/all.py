@@ -5,8 +5,6 @@ replaced when the study is done; pages take their tables from there when the sit
 --quick, two studies run for one rock, and their rows are compared with those of docs/results.
 """
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -5,8 +5,6 @@ memory is allocated before anything is timed: let nothing else run meanwhile. Ti
 Ratios of times are about the same on other machines; times are not.
 """
 
-from __future__ import annotations
-
 import resource
 import time
 from collections.abc import Callable

@@ -6,8 +6,6 @@ see, inside the masks of the views taken: no picture or mask of a candidate is r
 chooses one view at a time. A new fit to all views taken is judged.
 """
 
-from __future__ import annotations
-
 import time
 from argparse import Namespace
 from collections.abc import Sequence

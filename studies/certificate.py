@@ -4,8 +4,6 @@ After the seeds, plans of several sizes and other sets are compared with the bou
 `mgs.policy.certificate`. Then fits to sets show what a share of the criterion is worth in dB.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

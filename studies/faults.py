@@ -1,7 +1,5 @@
 """Faults of images and of priors: pure functions of what they spoil, with their sizes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ Fits to even views of rocks that chose nothing, judged on the test views and on 
 distances. The last rows have poses with noise, as given and refined (`mgs fit --refine-poses`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -5,8 +5,6 @@ test views. Even spacing is flown with many numbers of images. So for the PSNR o
 there are the metres with which even spacing has the same.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache

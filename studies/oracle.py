@@ -2,8 +2,6 @@
 views. It reads the images of all candidates, so it is no policy. It is greedy, so better choices
 may exist."""
 
-from __future__ import annotations
-
 from argparse import Namespace
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ images alone, without a prior, alpha or antialiasing; H sums the squared gradien
 loss. Where the paper says nothing (loss, rates, passes, scales) it is as in mgs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

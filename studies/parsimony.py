@@ -6,8 +6,6 @@ degree of `mgs refit`. A fit sees views one after the other, spread evenly aroun
 `mgs nbv`.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Fits are timed one by one: let nothing else run meanwhile.
 """
 
-from __future__ import annotations
-
 import math
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """Policies kept for comparison alone, as a user's own: `--policy studies/policies.py:NAME`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

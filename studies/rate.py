@@ -6,8 +6,6 @@ best of its files at each size. What files do not say, as the space of colours, 
 are read back, so only the coding differs.
 """
 
-from __future__ import annotations
-
 import io
 import shutil
 import subprocess

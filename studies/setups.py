@@ -6,8 +6,6 @@ no model choose without any fit. Rocks and scenes chose no setting of a policy. 
 of every test, because rocks of one scene are not independent.
 """
 
-from __future__ import annotations
-
 import time
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence

@@ -10,8 +10,6 @@ half of the steps.
 Runs are timed one by one: let nothing else run meanwhile.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

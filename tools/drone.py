@@ -7,8 +7,6 @@ It flies to the pose with an error, and writes what it saw: the picture, the pos
 mask. A share of the flights fails in one of the ways of FAILURES. Pose and try decide everything.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -3,8 +3,6 @@
 python tools/figures.py [NAME ...]     # chart, parsimony, setups, prior-faults; default: all
 """
 
-from __future__ import annotations
-
 import csv
 import sys
 from collections.abc import Callable, Mapping

@@ -8,8 +8,6 @@ name. In a block marked `sh`, each line is a command, `mgs ...` or `python FILE 
 `text` shows what the block before it prints.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -5,8 +5,6 @@ by what `mgs COMMAND --help` says and marks of tables by tables of the studies' 
 site that loads something from a network.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The program `mgs`: its commands, and how they end. A command is imported when it is used."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import io

@@ -1,7 +1,5 @@
 """`mgs dataset`: check a dataset, or make masks for one that has none."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """`mgs demo`: the other commands in a row, on a small rock."""
 
-from __future__ import annotations
-
 import shlex
 import time
 from pathlib import Path

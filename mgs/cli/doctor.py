@@ -1,7 +1,5 @@
 """`mgs doctor`: what mgs finds on this machine, what is wrong with it, and how to mend it."""
 
-from __future__ import annotations
-
 import os
 from importlib.util import find_spec
 

@@ -1,7 +1,5 @@
 """`mgs fit`: fit a model to all images of a dataset."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Options that several commands share, and settings as KEY=VALUE."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """`mgs render` and `mgs view`: pictures of a model, through given cameras or in the browser."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from functools import partial

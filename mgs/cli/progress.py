@@ -1,7 +1,5 @@
 """Progress of a command on the terminal."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Options and commands of the last release, which still work in this one and say their new form."""
 
-from __future__ import annotations
-
 import shlex
 import warnings
 from collections.abc import Iterable, Sequence

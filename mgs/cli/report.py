@@ -1,7 +1,5 @@
 """`mgs report`: compare runs by figures and a table, or by one HTML page."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """`mgs survey`: fly an orbit with a noisy depth camera and drifting odometry."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """`mgs synth-orbit`: render a dataset, an orbit around a rock."""
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from pathlib import Path

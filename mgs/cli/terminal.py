@@ -1,7 +1,5 @@
 """The terminal: text is printed as it is, without markup, and names cannot control it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from rich.console import Console

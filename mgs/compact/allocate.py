@@ -2,8 +2,6 @@
 rounding costs c^2 / 12 (reverse water-filling, Cover and Thomas 2006, 10.3.3), and order of the
 packets."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import pairwise
 

@@ -1,8 +1,6 @@
 """Integers as bytes by adaptive range coding (constriction). One function serves both directions: a
 decoder gets zeros in place of the numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -7,8 +7,6 @@ Packets: MARK, `PACKET`, the payload, CRC-32 of both. One that is damaged or los
 adds: the reader goes on at the next MARK.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterable

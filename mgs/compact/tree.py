@@ -2,8 +2,6 @@
 two children become their weighted sum, which goes on to the parent, and difference, a coefficient.
 Only +, *, / and sqrt of float64, element by element, which IEEE 754 defines to the last bit."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,8 +1,6 @@
 """ROS 1 and ROS 2 bags, read by rosbags: images, camera_info, and poses as a chain of frames of tf
 or odometry from that of the images to the root, which becomes the world. Keyframes are unpacked."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager

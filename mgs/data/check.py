@@ -1,7 +1,5 @@
 """Consistency checks of a dataset: files, colour, depth, masks and poses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

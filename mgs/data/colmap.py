@@ -1,7 +1,5 @@
 """COLMAP sparse models, text or binary, read by pycolmap."""
 
-from __future__ import annotations
-
 import codecs
 import struct
 from collections.abc import Mapping

@@ -2,8 +2,6 @@
 (common message set), and KML (OGC 2.3). The world's +Z is up; by default +X is east and +Y
 north."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

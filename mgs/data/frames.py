@@ -1,7 +1,5 @@
 """Frames of a dataset: cameras and image files, and what a live capture recorded of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

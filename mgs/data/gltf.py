@@ -1,7 +1,5 @@
 """glTF 2.0 files: JSON, the numbers of accessors, and the meshes that a scene places."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

@@ -1,7 +1,5 @@
 """Imports of a `Source` into a dataset folder, with lens distortion undone."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import warnings

@@ -1,7 +1,5 @@
 """Masks for photographs that have none: a mesh of the object is projected into them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

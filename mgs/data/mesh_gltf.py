@@ -1,7 +1,5 @@
 """Triangle meshes of glTF files, with their base colours as one texture or at the vertices."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache, partial
 from io import BytesIO

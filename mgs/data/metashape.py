@@ -1,7 +1,5 @@
 """Cameras exported by Agisoft Metashape (File, Export, Cameras: XML)."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Any

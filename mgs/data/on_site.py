@@ -1,7 +1,5 @@
 """A growing folder of photographs as a dataset (`mgs suggest FOLDER`)."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Sequence
 from pathlib import Path

@@ -2,8 +2,6 @@
 
 Each reader turns the program's axes into those of `Camera`: x right, y down, z forward."""
 
-from __future__ import annotations
-
 import io
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Photographs alone as a source: their poses by incremental structure from motion (pycolmap)."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from collections import Counter

@@ -1,7 +1,5 @@
 """Depth images of a mesh, by rays through the pixel centres."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 """Folders of robots and scanners with a pose for each image: TUM RGB-D, Open3D, RTAB-Map exports;
 each reader returns keyframes, in metres."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Sequence

@@ -1,8 +1,6 @@
 """Images of the rock alone: premultiplied alpha in memory (the rock in front of black), straight
 alpha in PNG files. Alpha is the share of a pixel's area that shows the rock, 0 to 1."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

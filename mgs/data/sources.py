@@ -1,7 +1,5 @@
 """Data to import: recognition of its format, and the files of nerfstudio and NeRF-synthetic."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """A video as a source: its sharpest frames, as photographs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from mgs.data.tracks import Spacing

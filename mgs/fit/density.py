@@ -1,8 +1,6 @@
 """Density control of a fit: between passes, Gaussians are moved, added or removed where the images
 need it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -8,8 +8,6 @@ nats to the log evidence (MacKay 1992), with delta how far the fit moved it from
 it Phi rises by 1/2 (H + lam) delta^2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal

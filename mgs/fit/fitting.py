@@ -1,8 +1,6 @@
 """Fit Gaussians to posed images: lower the objective of `mgs.fit.objective` by steps on one image
 each. A pass uses every image once, in random order."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Losses of a fit, by name: what each pixel value adds, given a render and an image."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

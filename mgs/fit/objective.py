@@ -7,8 +7,6 @@ J^T J + lam, with the Jacobian J of all images; the two are of squared differenc
 Alpha may be a fourth channel, whose squared differences count (sigma / sigma_alpha)^2 times.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

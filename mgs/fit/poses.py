@@ -7,8 +7,6 @@ axes). They lower
 with the weights w of the pixels. `mgs.learning.refine_poses` lets steps and fits take turns.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Prune a model: remove the Gaussians whose removal changes the images least."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Settings of a fit, validated and frozen. Imports neither Mitsuba nor Dr.Jit."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 

@@ -1,7 +1,5 @@
 """When a fit stops, and why: pure functions of its losses."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from enum import StrEnum

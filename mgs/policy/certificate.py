@@ -6,8 +6,6 @@ A criterion f is concave in weights x of the views, so its tangent at any x boun
 
 The maximum takes the k largest entries of the gradient, the prices of the views."""
 
-from __future__ import annotations
-
 import heapq
 import time
 from collections.abc import Iterable, Sequence

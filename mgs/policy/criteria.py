@@ -1,8 +1,6 @@
 """Criteria: scores of a view from Fisher information alone (docs/nbv.md). H [N,P] is the diagonal
 of J^T J summed over the training views, F [N,P] that of a candidate, lam [P] the regularisation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pose policies: scores of candidates from camera positions alone. Pure NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,8 +1,6 @@
 """The figure of a prior: cloud, ground plane, rock cluster, mesh and samples from one side.
 "Picture coordinates" are right, up, and towards the viewer, in metres."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

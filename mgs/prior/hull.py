@@ -1,8 +1,6 @@
 """The visual hull by carving (Laurentini 1994): marching cubes where the least distance of a
 point's projections inside the masks' outlines, times the size of a pixel there, is 0."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

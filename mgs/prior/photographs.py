@@ -1,7 +1,5 @@
 """Surfaces from photographs without depth: of triangulated points, the visual hull, or both."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

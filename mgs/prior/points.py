@@ -1,8 +1,6 @@
 """Points of the object, with normals, from a triangulated cloud: judged one by one, then by masks,
 else by ground plane and density clusters (HDBSCAN), and last by their neighbours."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Sample spacing that the training images can resolve: a detail of a period under two pixels is in
 no image (Nyquist), and samples closer than the closest camera's pixels differ by noise only."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

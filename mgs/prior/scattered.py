@@ -1,8 +1,6 @@
 """Random start: a prior for photographs whose object has no known surface. Points that came with
 the cameras take the place of as many random ones."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any

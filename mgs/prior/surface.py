@@ -1,8 +1,6 @@
 """The surface: watertight mesh of the rock's points (Poisson) and evenly spread samples (blue
 noise)."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, replace
 from decimal import Decimal

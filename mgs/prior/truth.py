@@ -1,7 +1,5 @@
 """Distance of a prior from the true rock, for datasets that hold it (rock.glb)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Views of a run as datasets that other programs train on: nerfstudio and COLMAP."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A run's model in so many bytes, or with so much quality: `mgs export RUN --bytes`, `--psnr`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial

@@ -1,8 +1,6 @@
 """Maps of what the training views of a run say about its model (docs/evaluation.md), in views (EXR,
 PNG) and of Gaussians (PLY). A map of a scalar is its mean in each pixel by blending weights."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from os import PathLike

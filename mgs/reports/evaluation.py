@@ -1,7 +1,5 @@
 """Evaluation of runs and of models in files: metrics.json, and pictures beside it."""
 
-from __future__ import annotations
-
 import gc
 import json
 from collections.abc import Callable, Iterable, Sequence

@@ -1,7 +1,5 @@
 """Models for viewers of other programs: `mgs export`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

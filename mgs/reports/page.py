@@ -1,7 +1,5 @@
 """The report as one HTML page that opens from the disk and loads nothing: `mgs report --html`."""
 
-from __future__ import annotations
-
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

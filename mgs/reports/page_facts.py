@@ -1,7 +1,5 @@
 """Words and numbers of the report page, read from the files of runs: notes, tables, links."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from pathlib import Path

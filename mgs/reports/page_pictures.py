@@ -1,7 +1,5 @@
 """Pictures of the report page: truth, render, error and uncertainty of views, of the last model."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,8 +1,6 @@
 """Plots of the report page as Plotly takes them: `title`, `alt`, `data`, `layout`, and as a table
 `numbers`. The script of the page adds the size and the colours of light and dark."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Pictures of a model of Gaussians through given cameras: `mgs render`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

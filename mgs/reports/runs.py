@@ -1,7 +1,5 @@
 """Runs that are compared: read, checked, and their numbers as curves. Nothing is computed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path

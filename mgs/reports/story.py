@@ -1,7 +1,5 @@
 """The story of a run: the model after each view. Fits are repeated: a run keeps the last model."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Files of a suggestion: a figure, numbers, and the poses to fly."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path

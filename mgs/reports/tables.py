@@ -1,7 +1,5 @@
 """The table that compares runs: as numbers, as cells of text, as Markdown."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

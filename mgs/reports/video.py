@@ -1,7 +1,5 @@
 """Films of a run: a turntable, or in a whole scene a flight among the cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace

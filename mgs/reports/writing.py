@@ -1,7 +1,5 @@
 """The report that compares runs on one dataset: figures and a table, from the runs' files."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path

@@ -1,8 +1,6 @@
 """Candidate poses of the next pictures, from a file or placed around the object. Files are in the
 world of the dataset's files, metres."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Entries of steps.jsonl that compare renders with images."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Choose the next view: rank candidates by a policy, or plan a flight over some."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 """Detectors: numbers of each step that grow as a run goes wrong, and their warnings. Limits are 1.3
 to 4 times the largest value of good runs (docs/stability.md), unless a comment says otherwise."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

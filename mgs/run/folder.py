@@ -1,8 +1,6 @@
 """The folder of a run. docs/nbv.md lists its files and the keys of steps.jsonl. `config.json` is
 written first. `checkpoint.npz` is replaced atomically: the commit of a step."""
 
-from __future__ import annotations
-
 import json
 import math
 import warnings

@@ -1,7 +1,5 @@
 """Live capture: a pose goes out as JSON, and a picture comes back (docs/howto/on-site.md)."""
 
-from __future__ import annotations
-
 import re
 import secrets
 import warnings

@@ -1,7 +1,5 @@
 """The paper's loop: fit, information, choose, capture, again. No candidate's image is read."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """`mgs nbv` for programs: start a run, resume it, or both. Prints nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path

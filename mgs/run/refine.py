@@ -1,7 +1,5 @@
 """Move planned poses to the best places near them, by the derivatives of their information."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

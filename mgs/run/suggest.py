@@ -3,8 +3,6 @@
 The model is a coarse one: about COARSE of its Gaussians, larger by the ratio of their spacings, in
 smaller images in which they are as large as before."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial

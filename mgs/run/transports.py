@@ -1,8 +1,6 @@
 """Transports: functions deliver(pose, out) by which a pose file reaches a camera. They return once
 the picture is complete in `out`, with its COMPANIONS, or raise InputError or OSError."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

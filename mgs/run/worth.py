@@ -1,7 +1,5 @@
 """Worth of plans: their certificates, and the number of views that is enough."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

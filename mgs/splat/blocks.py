@@ -6,8 +6,6 @@ A splat that touches five blocks makes five (splat, block) *pairs*. Blocks are g
 while no footprint changes (`changes`), and their depth order while the means stay.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

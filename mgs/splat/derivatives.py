@@ -10,8 +10,6 @@ A polynomial is a dict {(a, b): coefficient of xi^a eta^b}; moments are dicts wi
 Symbols: docs/notation.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -8,8 +8,6 @@ r g b in each), 3 log-scales, 4 of the quaternion, 1 opacity logit; then 0 or 3 
 (`MEANS`). Symbols: docs/notation.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,8 +1,6 @@
 """Products with the Jacobian J of an image by the parameters of the Gaussians: J v (`jvp`, forward
 mode) and z^T J (`vjp`, reverse mode). J itself is never formed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any

@@ -7,8 +7,6 @@ make the same decisions. They store sums for each (splat, block) pair, and a sec
 those of each splat in a fixed order.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

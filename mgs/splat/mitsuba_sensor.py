@@ -1,7 +1,5 @@
 """Convert a Mitsuba sensor to a `Camera`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr

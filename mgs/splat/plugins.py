@@ -1,8 +1,6 @@
 """Registers the Mitsuba plugins of mgs when imported: the files in `plugins/` run for the current
 variant, and again for every variant set later, to which their classes belong."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from typing import Any

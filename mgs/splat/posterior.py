@@ -3,8 +3,6 @@ of the posterior. H = sum over the views of J^T W J has a row for each of P N pa
 all Gaussians that share a pixel; `fisher` gives its diagonal blocks alone. A product H v takes two
 passes a view."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property

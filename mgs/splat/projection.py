@@ -6,8 +6,6 @@ in double, rounded to float32 once (docs/splatting.md, Project). Where a splat i
 are of order one, so the fourth powers in the Fisher information lose no digits.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,8 +1,6 @@
 """Record kernels once per set of sizes and replay them, since tracing takes longer than drawing a
 small image."""
 
-from __future__ import annotations
-
 import functools
 import gc
 import threading

@@ -2,8 +2,6 @@
 every Gaussian on every pixel, and derivatives as dense Jacobians, written independently of the
 kernels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

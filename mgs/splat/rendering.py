@@ -1,7 +1,5 @@
 """Render Gaussians in one differentiable call, with block lists cached per camera."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass

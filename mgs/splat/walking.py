@@ -6,8 +6,6 @@ are added before they are stored: scattered addresses, not arithmetic, limit a C
 draws one pixel (`lane_size`). Loops over a block's pixels are unrolled. Symbols: docs/notation.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any

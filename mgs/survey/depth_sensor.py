@@ -6,8 +6,6 @@ Sensors 12(2), 2012 (quantisation). Lost returns on grazing surfaces have no pub
 is linear.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from mgs.camera import Camera

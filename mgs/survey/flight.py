@@ -2,8 +2,6 @@
 whose first pose is known and whose others are registered. Poses are [4,4] camera-to-world,
 metres."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any

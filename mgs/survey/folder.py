@@ -1,7 +1,5 @@
 """The folder of a survey: itself a dataset, with estimated poses and measured depth; its figure."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Fusion of depth images into one cloud on a grid; and what the cameras of a dataset look at."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,8 +1,6 @@
 """Relative poses of a flight's cameras from their depth images: GICP, loops, pose graph. Poses are
 [4,4] camera-to-world, metres; a step is the next camera's in the axes of the one before."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The ground of a scene: undulating regolith and scattered stones."""
 
-from __future__ import annotations
-
 import numpy as np
 import trimesh
 

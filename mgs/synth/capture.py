@@ -1,8 +1,6 @@
 """Images of an on-demand dataset, rendered when a run takes them. The variant must be set before
 this module is imported (`mgs.runtime.start`)."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Callable
 from functools import cache

@@ -1,7 +1,5 @@
 """Band-limited noise for the shape and colour of rocks and ground."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Render an orbit around a rock into a dataset folder."""
 
-from __future__ import annotations
-
 import importlib.util
 import shutil
 from collections.abc import Callable

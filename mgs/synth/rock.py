@@ -1,7 +1,5 @@
 """Rocks as textured meshes that stand in the ground z = 0: procedural, or from a mesh file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

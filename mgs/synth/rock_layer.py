@@ -1,8 +1,6 @@
 """The picture of the rock alone, from the same rendering as the whole image. The variant must be
 set before this module is imported: an integrator is a class of the variant."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import drjit as dr

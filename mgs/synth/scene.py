@@ -1,8 +1,6 @@
 """The Mitsuba scene: rock, ground, sun and sky, loaded once, and one camera that moves. The variant
 must be set before this module is imported (`mgs.runtime.start`)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import isqrt
 from typing import Any

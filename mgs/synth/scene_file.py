@@ -1,7 +1,5 @@
 """Scene files: one TOML per scene, validated. Lengths in metres, angles in degrees, linear RGB."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 

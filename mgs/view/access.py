@@ -1,8 +1,6 @@
 """Who may use the viewer. Any website can open connections to servers on this machine, so a request
 must name this server as host and origin. Elsewhere the first must have the printed token."""
 
-from __future__ import annotations
-
 import hmac
 import logging
 import secrets

@@ -1,7 +1,5 @@
 """Layers of the viewer, as colours of Gaussians and as images of the kernel."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mgs.camera import Camera

@@ -1,8 +1,6 @@
 """The viewer: a local web server (viser). Its threads only record requests; all is computed in
 `Viewer.tick`, on the thread that made the viewer, because Mitsuba's variant belongs to a thread."""
 
-from __future__ import annotations
-
 import math
 import time
 import warnings

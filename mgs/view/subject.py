@@ -1,7 +1,5 @@
 """Contents of the viewer, read from a run folder or a PLY."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 

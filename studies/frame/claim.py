@@ -6,8 +6,6 @@ other side, and otherwise, and for fewer than two runs, *depends* on rock, views
 are the replicates: draws and views of one rock are no samples.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal

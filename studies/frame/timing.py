@@ -4,8 +4,6 @@ Each timed call follows a fixed piece of work, the *reference*. What slows the m
 Charts show seconds: the median ratio times the reference's median seconds over the whole study.
 """
 
-from __future__ import annotations
-
 import functools
 import time
 from collections.abc import Callable, Iterable
