@@ -2,8 +2,6 @@
 truth is `Frame.target`: the rock in front of black. Metrics of the full frame flatter, because any
 model gets the black right. Held-out views are those that the model was never trained on."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -45,7 +43,7 @@ def no_progress(done: int, total: int) -> None:
 
 
 def render_view(
-    gaussians: Gaussians, camera: Camera, cache: ListCache | None = None
+    gaussians: Gaussians, camera: Camera, cache: "ListCache | None" = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Render on black: linear RGB [H,W,3], alpha [H,W], expected z-depth [H,W] in metres."""
     from mgs.splat import render
@@ -55,7 +53,7 @@ def render_view(
     return rgb, np.asarray(image.alpha), np.asarray(image.depth)
 
 
-def normals(gaussians: Gaussians, camera: Camera, cache: ListCache | None = None) -> np.ndarray:
+def normals(gaussians: Gaussians, camera: Camera, cache: "ListCache | None" = None) -> np.ndarray:
     """Unit normals of a view in the world's axes, towards the camera, float32 [H,W,3]; 0 where
     nothing is drawn. The normal of a Gaussian is its shortest axis, and that of a pixel their mean
     by blending weight. Raises InputError as `render`."""
@@ -73,7 +71,7 @@ def normals(gaussians: Gaussians, camera: Camera, cache: ListCache | None = None
 
 
 def psnr_measure(
-    dataset: Dataset, cache: ListCache, exposure: bool = False
+    dataset: Dataset, cache: "ListCache", exposure: bool = False
 ) -> Callable[[Gaussians, list[int]], dict[str, float]]:
     """Returns measure(gaussians, frames taken) -> mean PSNR, dB, by the names of `psnr_over`.
 
@@ -96,7 +94,7 @@ def psnr_measure(
 
 
 def psnr_over(
-    frames: Sequence[Frame], cache: ListCache, exposure: bool = False, world: World = UPRIGHT
+    frames: Sequence[Frame], cache: "ListCache", exposure: bool = False, world: World = UPRIGHT
 ) -> Callable[[Gaussians, Sequence[int]], dict[str, np.ndarray]]:
     """Returns a function (gaussians, indices of frames) -> PSNR of each of these views, dB.
 

@@ -1,8 +1,6 @@
 """The Gaussians of a model. Fields are NumPy arrays everywhere except inside `mgs.splat`, where
 they are Dr.Jit tensors: Dr.Jit traverses the fields of a plain dataclass."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -78,12 +76,12 @@ class Gaussians:
         g = self.map(np.asarray)
         return html(repr(self), [cloud(g.means, g.linear_rgb(g.rgb))])
 
-    def __getitem__(self, index: Any) -> Gaussians:
+    def __getitem__(self, index: Any) -> "Gaussians":
         """Select Gaussians by a slice, a mask [N], indices [M] in their order, or one index."""
         rows = [index] if isinstance(index, int | np.integer) else index
         return self.map(lambda array: array[rows])
 
-    def counted_from(self, origin: Sequence[float]) -> Gaussians:
+    def counted_from(self, origin: Sequence[float]) -> "Gaussians":
         """The same Gaussians in a world whose coordinates count from `origin` [3], metres. Those
         without an origin of their own count from there already."""
         if not any(self.origin):
@@ -91,7 +89,7 @@ class Gaussians:
         x, y, z = np.subtract(self.origin, origin).tolist()
         return replace(self, origin=(x, y, z))
 
-    def map(self, function: Callable[[Any], Any]) -> Gaussians:
+    def map(self, function: Callable[[Any], Any]) -> "Gaussians":
         """Gaussians of the results of a function of each array."""
         return replace(self, **{name: function(getattr(self, name)) for name in ARRAYS})
 
@@ -124,7 +122,7 @@ class Gaussians:
         """Degree of the spherical harmonics, 0 to 3."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
-    def with_degree(self, degree: int) -> Gaussians:
+    def with_degree(self, degree: int) -> "Gaussians":
         """Raise the SH degree of Gaussians with NumPy fields; new coefficients are 0."""
         sh = np.zeros((len(self), (degree + 1) ** 2, 3), np.float32)
         sh[:, : self.sh.shape[1]] = self.sh
@@ -140,7 +138,7 @@ class Gaussians:
         """Opacities [N] in [0,1]. Those of very large logits are rounded to exactly 0 or 1."""
         return expit(self.logit_opacities.astype(np.float64)).astype(np.float32)
 
-    def check(self, where: object = "gaussians") -> Gaussians:
+    def check(self, where: object = "gaussians") -> "Gaussians":
         """Check shapes and values (NumPy fields only), and return self. Raises InputError as
         `check_shapes`, and if a number is not finite or a colour coefficient exceeds SH_MAX. The
         message begins with `where`, and names the parameter and the first such Gaussian."""

@@ -1,7 +1,5 @@
 """Style, creation and writing of figures."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -38,7 +36,7 @@ DPI = 200  # pixels per inch of a figure
 FORMATS = ("png", "pdf", "svg")  # file formats of figures
 
 
-def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:
+def new_figure(width: float, height: float, dpi: int = DPI) -> "Figure":
     """Empty figure of this width and height, inches. It needs no display."""
     from matplotlib.figure import Figure
 
@@ -50,7 +48,7 @@ def literal(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def save_figure(figure: Figure, path: str | Path) -> None:
+def save_figure(figure: "Figure", path: str | Path) -> None:
     """Write a figure in the format of its suffix: .png, .pdf or .svg; the file appears complete.
     Raises InputError for another suffix, and as `mgs.files.atomic_path`."""
     kind = Path(path).suffix.lower()[1:]
@@ -64,7 +62,7 @@ def save_figure(figure: Figure, path: str | Path) -> None:
 @contextmanager
 def drawing(
     path: str | Path, width: float, height: float, style: dict[str, Any] = STYLE, dpi: int = DPI
-) -> Iterator[Figure]:
+) -> "Iterator[Figure]":
     """Context with an empty figure, which is written to `path` when the block ends without error.
 
     width, height: inches. style: settings while it is drawn. Raises as `save_figure`."""

@@ -1,7 +1,5 @@
 """`Scene`, which stays fixed in a run, and `State`, which each step makes anew."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -166,7 +164,7 @@ class Scene:
             self.memo[key] = make()
         return self.memo[key]
 
-    def with_seed(self, seed: int) -> Scene:
+    def with_seed(self, seed: int) -> "Scene":
         """The same scene with another seed of the policies' draws; computed values are kept."""
         other = copy(self)
         object.__setattr__(other, "settings", self.settings.model_copy(update={"seed": seed}))

@@ -7,8 +7,6 @@ one. Factors are varied one at a time around the default; those that matter most
 Points are timed one by one: let nothing else run meanwhile.
 """
 
-from __future__ import annotations
-
 import shlex
 import shutil
 from argparse import Namespace
@@ -348,7 +346,7 @@ def _factor(row: Row) -> str:
     return str(row["factors"].split("; ")[-1])
 
 
-def _draw_kind(axes: Axes, rows: Sequence[Row], looks: Mapping[str, dict[str, Any]]) -> None:
+def _draw_kind(axes: "Axes", rows: Sequence[Row], looks: Mapping[str, dict[str, Any]]) -> None:
     """Draw one panel. looks: keywords for matplotlib by factor."""
     most = Counter(row["images"] for row in rows).most_common(1)[0][0]
     rows = [row for row in rows if row["images"] == most]

@@ -3,8 +3,6 @@ each. A run has failed if its PSNR on the test views, which no fault touches, is
 below that of the clean run on the same rock and views.
 """
 
-from __future__ import annotations
-
 import functools
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
@@ -55,7 +53,7 @@ class Experiment:
     """
 
     question: str
-    cells: Callable[[StressSize], list[Cell]]
+    cells: "Callable[[StressSize], list[Cell]]"
     claims: Sequence[Claim]
     panels: Sequence[Panel]
 
@@ -114,7 +112,7 @@ class Lab:
         """Cameras of all frames."""
         return [frame.camera for frame in self.frames]
 
-    def changed(self, **fields: Any) -> Lab:
+    def changed(self, **fields: Any) -> "Lab":
         """Copy with other frames or another prior, and a cache of its own."""
         return replace(self, cache=mgs.ListCache(CACHE), **fields)
 

@@ -11,6 +11,8 @@ from mgs import InputError, load_dataset, open_run, start_run
 from mgs.run.policy_file import check_policy, policy_of
 
 FUNCTIONS = """
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`mgs eval`, `diagnose`, `simplify`: measure the model of a run, or make a smaller one."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -151,7 +149,7 @@ def simplify(
         echo("\n".join([*lines, f"wrote {run / name}"]))
 
 
-def _pruned(result: PrunedRun, noise: float) -> list[str]:
+def _pruned(result: "PrunedRun", noise: float) -> list[str]:
     share, before, after = 1 - result.after / result.before, result.before, result.after
     lines = [f"{before:,} Gaussians, {after:,} stay: {share:.0%} are left out"]
     values = f"predicted {result.predicted:.2g}, measured {result.actual:.2g}, allowed {noise:.2g}"
@@ -162,7 +160,7 @@ def _pruned(result: PrunedRun, noise: float) -> list[str]:
     return lines
 
 
-def _refitted(result: RefittedRun) -> list[str]:
+def _refitted(result: "RefittedRun") -> list[str]:
     model, left_out = result.lean, result.lean.left_out
     share = model.parameters / result.before
     shares = ", ".join(f"{kind} {mask.mean():.0%}" for kind, mask in model.learned.items())

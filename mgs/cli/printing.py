@@ -1,7 +1,5 @@
 """Tables that commands print."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -70,7 +68,7 @@ def _heading(key: str, new: bool) -> str:
     return ("masked\n" if mask else "") + f"{name.upper()}\n{group}"
 
 
-def print_run(out: Path, state: Checkpoint, metrics: dict[str, Any], console: Terminal) -> None:
+def print_run(out: Path, state: "Checkpoint", metrics: dict[str, Any], console: Terminal) -> None:
     from mgs.reports.tables import metrics_row
     from mgs.run.ending import RunEnd, why_ended
 

@@ -1,7 +1,5 @@
 """`mgs prior`: from depth images, points, masks or a mesh to a rock mesh and samples of it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -177,12 +175,12 @@ def prior(
 
 
 def _built(
-    dataset: Dataset,
-    settings: PriorSettings,
+    dataset: "Dataset",
+    settings: "PriorSettings",
     folder: Path,
     on_stage: Callable[[str], None],
     **options: Any,
-) -> tuple[Prior, SegmentedCloud | None]:
+) -> "tuple[Prior, SegmentedCloud | None]":
     """`prior_and_cloud`. A refused cloud is drawn beside `folder`; the error names the picture."""
     from mgs.prior.build import prior_and_cloud
     from mgs.prior.figure import draw_refused

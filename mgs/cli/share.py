@@ -1,7 +1,5 @@
 """`mgs export` and `mgs video`: models and films for others."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from functools import partial
@@ -140,7 +138,7 @@ def _export_views(runs: list[Path], kind: str, out: Path | None, every: bool, fo
         echo(f"wrote {what} to {folder}")
 
 
-def _in_srgb(model: Path, linear: Gaussians) -> Gaussians:
+def _in_srgb(model: Path, linear: "Gaussians") -> "Gaussians":
     """Gaussians of a linear model for sRGB blending; prints what that costs."""
     from mgs.reports.evaluation import compare_models
     from mgs.reports.exporting import as_imported, in_srgb, refit_in_srgb

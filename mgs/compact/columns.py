@@ -5,8 +5,6 @@ A rotation u from its start is p = u_xyz / (1 + u_w), so the quaternion is the s
 (1 - |p|^2, 2 p), which needs no function whose last bit depends on the machine.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -36,7 +34,7 @@ class Start:
     inset: float  # depth below the mesh, metres
 
 
-def start_of(prior: Prior, inset: float) -> Start:
+def start_of(prior: "Prior", inset: float) -> Start:
     """Start of the Gaussians of `mgs.prior.initial`. inset: their depth below the mesh, metres."""
     from mgs.prior.initial import BACKING_DEPTH
 

@@ -1,7 +1,5 @@
 """Read a compact model: `read_compact`. The same bytes give the same numbers on every machine."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
@@ -30,7 +28,7 @@ CELLS_OF_BYTE = 64  # most cells that a byte of a packet places: a file of few b
 IDENTITY = np.array([[1.0, 0, 0, 0]])
 
 
-def read_compact(path: Path, prior: Prior | None = None) -> Gaussians:
+def read_compact(path: Path, prior: "Prior | None" = None) -> Gaussians:
     """Read Gaussians from a file of the format mgs, in the world of the data; an incomplete file
     gives what it has, with a Notice. prior: where the file leaves positions to it. Raises
     InputError if the file is damaged at its start, needs a prior, or was made with another one."""

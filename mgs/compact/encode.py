@@ -1,7 +1,5 @@
 """Write a compact model: `Encoder`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -49,7 +47,7 @@ class Compact:
         """The model that a reader gets, in the upright world."""
         return decoded(self.header, self.payloads, self.start)
 
-    def first(self, most: int) -> Compact:
+    def first(self, most: int) -> "Compact":
         """The first packets, up to so many bytes in all."""
         ends = np.cumsum([len(packet(key, data)) for key, data in self.payloads.items()])
         count = int((len(bytes(self.header)) + ends <= most).sum())

@@ -1,21 +1,16 @@
 """Check of poses against pictures: points matched between neighbours, their depth, the outlines of
 their masks, or only whether the cameras look at one place."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.frames import Frame
+from mgs.data.structure import Matcher
 from mgs.data.visibility import in_image, nearest_point
-
-if TYPE_CHECKING:
-    from mgs.data.structure import Matcher
 
 PAIRS = 12  # most pairs of neighbours that are compared
 # Matches of a pair that agree with one epipolar geometry, their share of all matches, and number of

@@ -1,7 +1,5 @@
 """Triangulated point clouds and their PLY files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,13 +26,13 @@ class SparseCloud:
     track: np.ndarray | None = None  # [N] number of images that saw it
     error: np.ndarray | None = None  # [N] mean reprojection error, pixels
 
-    def upright(self, world: World) -> SparseCloud:
+    def upright(self, world: World) -> "SparseCloud":
         """The same cloud, of the files of a dataset, in its upright world (`World.enter`)."""
         views = None if self.views is None else world.enter(self.views)
         points = world.enter(towards(self.points, world.origin))
         return SparseCloud(points, views, self.track, self.error)
 
-    def scaled(self, factor: float) -> SparseCloud:
+    def scaled(self, factor: float) -> "SparseCloud":
         """The same cloud with coordinates multiplied by `factor`."""
         return SparseCloud(self.points * factor, self.views, self.track, self.error)
 

@@ -1,7 +1,5 @@
 """A dataset folder in nerfstudio style: transforms.json, images/, depth/, masks/, rock/."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter
@@ -78,14 +76,14 @@ class Dataset:
         """All frames, except on-demand ones whose names are not in `taken`."""
         return tuple(frame for frame in self.frames if not frame.on_demand or frame.name in taken)
 
-    def test_views(self) -> Dataset | None:
+    def test_views(self) -> "Dataset | None":
         """Load the test views, on which no model is trained, or None. Raises InputError as
         `load_dataset`."""
         folder = self.root / TEST_FOLDER
         there = (folder / "transforms.json").is_file()
         return load_dataset(folder, up=self.world.up) if there else None
 
-    def survey(self) -> Dataset:
+    def survey(self) -> "Dataset":
         """Dataset to build the prior from: the survey of an on-demand dataset, else this one.
         Raises InputError if an on-demand dataset has no survey, and as `load_dataset`."""
         if not self.on_demand:

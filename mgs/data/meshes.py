@@ -1,7 +1,5 @@
 """Triangle meshes on disk, and distances to a mesh."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,7 +67,7 @@ def face_crosses(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
-def load_mesh(path: str | Path, coloured: bool = True) -> trimesh.Trimesh:
+def load_mesh(path: str | Path, coloured: bool = True) -> "trimesh.Trimesh":
     """Read a triangle mesh (GLB, OBJ, PLY ...) in the axes and units of its file. coloured: with
     its texture or vertex colours. Raises InputError if the file is missing or unreadable, the mesh
     has no faces or no area, a vertex is NaN, infinite or beyond FURTHEST, or a face names a vertex
@@ -196,7 +194,7 @@ def mesh_of(corners: ArrayLike, triangles: ArrayLike, where: object = "mesh") ->
     return Mesh(vertices, faces[:, ::-1] if inside_out else faces, np.ones(len(faces), bool))
 
 
-def to_glb(mesh: trimesh.Trimesh) -> bytes:
+def to_glb(mesh: "trimesh.Trimesh") -> bytes:
     """GLB file of a mesh in world coordinates, with normals and texture, turned to +Y up."""
     copy: Any = mesh.copy(include_cache=True)  # the cache holds the vertex normals
     if copy.visual.kind == "vertex":  # glTF's are linear

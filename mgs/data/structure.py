@@ -1,8 +1,6 @@
 """Structure from motion by pycolmap. Seeds are fixed and pictures enter the database in order, so
 results repeat, but bundle adjustments of over 50,000 observations sum in any order."""
 
-from __future__ import annotations
-
 import shutil
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -70,7 +68,7 @@ class Matcher:
         ]
 
     @classmethod
-    def of_frames(cls, frames: Sequence[Frame], folder: Path) -> Matcher:
+    def of_frames(cls, frames: Sequence[Frame], folder: Path) -> "Matcher":
         """Matcher of the images of a dataset."""
         cameras = []
         for camera in (frame.camera for frame in frames):

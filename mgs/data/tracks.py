@@ -1,7 +1,5 @@
 """Poses measured over time, and the choice of keyframes among the images of a recording."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
@@ -63,7 +61,7 @@ class Track:
     transforms: np.ndarray
 
     @classmethod
-    def of(cls, samples: Sequence[tuple[float, np.ndarray]]) -> Track:
+    def of(cls, samples: Sequence[tuple[float, np.ndarray]]) -> "Track":
         """Track of (time, transform); of samples of the same time the last counts."""
         by_time = dict(samples)
         times = sorted(by_time)
@@ -110,7 +108,7 @@ class Spacing:
     metres: bool = False
 
     @classmethod
-    def parse(cls, text: str) -> Spacing:
+    def parse(cls, text: str) -> "Spacing":
         """Spacing of a text as 0.5s or 0.2m. Raises InputError for anything else."""
         match = re.fullmatch(r"(\d+\.?\d*|\.\d+)(s|m)", text.strip())
         if not match:

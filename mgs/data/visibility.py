@@ -1,17 +1,12 @@
 """Visibility of surface points in a camera, from its depth image and its mask."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 
 from mgs.camera import Camera
-
-if TYPE_CHECKING:
-    from mgs.data.frames import Frame
+from mgs.data.frames import Frame
 
 GRAZING = 0.2  # least cosine of the angle between normal and view that widens the tolerance
 

@@ -1,8 +1,6 @@
 """Worlds of files, and the upright one in which mgs works: what is read is turned so that +Z is up,
 what leaves is turned back, and between the two nothing names an upward direction."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -51,7 +49,7 @@ class World:
         return camera.seen_from(self.enter(np.negative(self.origin)))
 
     @property
-    def home(self) -> World:
+    def home(self) -> "World":
         """This world without an origin that was moved."""
         return World(self.up, self.unit)
 

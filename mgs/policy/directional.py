@@ -9,8 +9,6 @@ harmonics y. W_vj: its squared blending weights in view v, y_vj: y of the direct
 
 with M_j = sum over the dome of W_vj y_vj y_vj^T, by the Sherman-Morrison formula."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -41,7 +39,7 @@ class Views(NamedTuple):
     positions: Array
     seen: Array
 
-    def of(self, views: Sequence[int]) -> Views:
+    def of(self, views: Sequence[int]) -> "Views":
         return Views(self.positions[list(views)], self.seen[list(views)])
 
 

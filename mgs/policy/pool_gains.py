@@ -11,8 +11,6 @@ weights W. By the Sherman-Morrison formula, with u = S_j y, w = S_j M_j u, k = W
 All is float64: variances fall by many orders of magnitude. Each number is written by one lane, so a
 resumed run has the same bits. Of a matrix the upper triangle is kept, an array [N] an entry."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from copy import copy
 from typing import Any
@@ -79,7 +77,7 @@ class PoolGains:
             self.q = _dot(_times([_at(entry, self.of) for entry in self.M], Sy), Sy)
         dr.eval(self.S, self.M, self.g, self.q)
 
-    def copy(self) -> PoolGains:
+    def copy(self) -> "PoolGains":
         other = copy(self)
         other.taken = list(self.taken)
         return other

@@ -8,8 +8,6 @@ with the weight x_v = 1 for a candidate that is taken, and 0 otherwise. A(0) hol
 views taken before. `Coverage` counts Gaussians instead. `mgs.policy.certificate` bounds both over
 all sets of k candidates."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -70,7 +68,7 @@ class Relaxation:
         return self.candidates * len(self.base)
 
     @cached_property
-    def coarse(self) -> Relaxation:
+    def coarse(self) -> "Relaxation":
         """The same for about COARSE of the Gaussians, which stand for all."""
         step = max(len(self.base) // COARSE, 1)
 
@@ -329,7 +327,7 @@ class Coverage:
         return len(self.F) * len(self.H)
 
     @property
-    def coarse(self) -> Coverage:
+    def coarse(self) -> "Coverage":
         return self
 
     @cached_property

@@ -1,19 +1,14 @@
 """Tours of a flight: lengths of legs, 2-opt, and plans within a limit. Metres. A tour is a list of
 poses, indices of rows of a matrix of legs. Its two ends stay where they are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mgs.policy.criteria import Array
-
-if TYPE_CHECKING:
-    from mgs.policy.pool_gains import PoolGains
+from mgs.policy.pool_gains import PoolGains
 
 Share = Callable[[Array, int], NDArray[np.float64]]
 """(metres of a tour, number of its stops) -> share of the limits that it takes; at most 1 fits."""

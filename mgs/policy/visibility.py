@@ -1,10 +1,7 @@
 """Visibility of the prior's surface from camera poses, measured once per run, and plans by it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cache, cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,11 +9,9 @@ from mgs.camera import Camera
 from mgs.memory import IMAGE_BYTES, kept_within
 from mgs.policy.criteria import Array
 from mgs.policy.directional import Views, dome_cameras, gains, of_points, squared_weights
+from mgs.policy.pool_gains import PoolGains
 from mgs.policy.poses import nearest_poses
 from mgs.progress import Stage, report
-
-if TYPE_CHECKING:
-    from mgs.policy.pool_gains import PoolGains
 
 Model = tuple[int, float, bool]
 """SH degree, tau, and whether gains are those of I-optimality over the dome, else D-optimality."""

@@ -1,8 +1,6 @@
 """The mesh prior (paper, section III-A): build it from a dataset or a mesh, save and load it
 (docs/prior.md)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -82,13 +80,13 @@ class Prior:
         """World of the files of the dataset that the prior was built from."""
         return World(unit_up(self.numbers["up"])) if "up" in self.numbers else UPRIGHT
 
-    def with_up(self, up: Sequence[float]) -> Prior:
+    def with_up(self, up: Sequence[float]) -> "Prior":
         """The prior turned so that this direction in the dataset's files is +Z."""
         old, new = self.world, World(unit_up(up))
         prior = self.moved(lambda points: new.enter(old.leave(points)))
         return replace(prior, numbers=self.numbers | {"up": list(new.up)})
 
-    def moved(self, change: Callable[[np.ndarray], np.ndarray]) -> Prior:
+    def moved(self, change: Callable[[np.ndarray], np.ndarray]) -> "Prior":
         """The prior with `change` applied to its vertices, points and normals [N,3]."""
         mesh = replace(self.mesh, vertices=change(self.mesh.vertices))
         points, normals = change(self.points), change(self.normals)

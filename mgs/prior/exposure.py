@@ -1,18 +1,13 @@
 """Gains of photographs, before any fit, of the ratios of colours of the surface that they share:
 least squares of their logarithms over all pairs (Brown and Lowe 2007, section 6)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mgs.data.frames import Frame
+from mgs.prior.build import Prior
 from mgs.prior.initial import depth_of, seen_colours
-
-if TYPE_CHECKING:
-    from mgs.prior.build import Prior
 
 SAMPLES = 4000  # about the most surface samples compared, evenly spread over the prior's
 # Exponent of the cosine between normal and view in a sample's weight: surfaces shine at grazing

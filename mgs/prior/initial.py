@@ -2,12 +2,10 @@
 second one a larger, opaque one behind it, so that the far side does not show through
 (docs/fit.md)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -19,10 +17,8 @@ from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
 from mgs.data.visibility import in_image, in_mask, visible
 from mgs.gaussians import ARRAYS, Gaussians, sh_from_rgb
+from mgs.prior.build import Prior
 from mgs.rotation import quat_from_normals
-
-if TYPE_CHECKING:
-    from mgs.prior.build import Prior
 
 IN_PLANE_SCALE = 0.65  # standard deviation of a Gaussian along the surface, over the spacing
 # Opacity of a Gaussian, chosen with IN_PLANE_SCALE so that the far side is hidden from the start:

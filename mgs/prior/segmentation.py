@@ -1,7 +1,5 @@
 """Segmentation of the fused cloud: ground plane (RANSAC), rock points (DBSCAN), normals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -44,7 +42,7 @@ class Plane:
     tolerance: float  # points below this height are ground, metres
 
     @classmethod
-    def from_estimate(cls, points: np.ndarray) -> Plane:
+    def from_estimate(cls, points: np.ndarray) -> "Plane":
         """Least-squares plane of points [N,3], for skimage.measure.ransac; sigma, tolerance 0."""
         centre = points.mean(0)
         normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]

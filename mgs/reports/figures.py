@@ -1,8 +1,6 @@
 """Figures of reports: each function takes plain data and writes one file, a PNG, PDF or SVG. Raises
 InputError if it cannot be written. A label is what a report calls a run."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain, cycle
@@ -85,7 +83,7 @@ def orbit_figure(
 
 
 def draw_cameras(
-    axis: Axes,
+    axis: "Axes",
     positions: np.ndarray,
     surface: np.ndarray,
     seeds: Sequence[int],
@@ -117,7 +115,7 @@ def draw_cameras(
     axis.spines[:].set_visible(False)
 
 
-def _draw_length(axis: Axes, unit: str) -> None:
+def _draw_length(axis: "Axes", unit: str) -> None:
     from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
     longest = float(np.ptp(axis.get_xlim())) / 4
@@ -149,7 +147,7 @@ def curves_figure(
         _legend_beside(figure)
 
 
-def _legend_beside(figure: Figure) -> None:
+def _legend_beside(figure: "Figure") -> None:
     """Put the legend of the first axes to the right of all, and widen the figure."""
     legend = figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper")
     box, (width, height), dpi = legend.get_window_extent(), figure.get_size_inches(), figure.dpi

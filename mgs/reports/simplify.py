@@ -1,7 +1,5 @@
 """Smaller models of a run, compared with the whole one on other views: `mgs simplify`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,7 +67,7 @@ class RefittedRun:
     None."""
 
     before: int
-    lean: LeanModel
+    lean: "LeanModel"
     views: str
     psnr: list[float] | None
 

@@ -1,18 +1,14 @@
 """Why a run ended, and the messages about the end of a run and of its fits."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mgs.fit.stopping import DIVERGED_PASSES
 from mgs.policy.criteria import GAIN_UNIT
-
-if TYPE_CHECKING:
-    from mgs.run.settings import NbvSettings
+from mgs.run.settings import NbvSettings
 
 
 def diverged(out: Path, step: int, steps: int, losses: Sequence[float]) -> str:

@@ -1,7 +1,5 @@
 """Limits of a flight, which starts at the first view taken, its home, and ends there."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -52,7 +50,7 @@ def views_left(state: State, mission: Mission) -> int:
     return mission.budget - state.step
 
 
-def flight_of(scene: Scene, state: State, mission: Mission) -> Flight:
+def flight_of(scene: Scene, state: State, mission: Mission) -> "Flight":
     home, skipped = state.taken[max(state.skipped - 1, 0)], state.skipped
     no_fly = mission.flight.no_fly or 0.0
 

@@ -1,12 +1,10 @@
 """Hashes of a run's inputs: a run is resumed only if these are unchanged. Files of frames that were
 not taken are never opened."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,11 +12,9 @@ from mgs.camera import Camera
 from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame
 from mgs.errors import InputError
+from mgs.prior.build import Prior
 from mgs.run import policy_file
-
-if TYPE_CHECKING:
-    from mgs.prior.build import Prior
-    from mgs.run.settings import NbvSettings
+from mgs.run.settings import NbvSettings
 
 DECIMALS = 9  # decimals of poses and intrinsics: their last bits differ between machines
 

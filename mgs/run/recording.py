@@ -1,7 +1,5 @@
 """Run the loop in a folder: checkpoints, times, warnings and evaluation around `select_views`."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -106,7 +104,7 @@ def resumed(scene: Scene, settings: NbvSettings, checkpoint: Checkpoint) -> Stat
 
 def _go_on(
     out: Path,
-    recorder: Recorder,
+    recorder: "Recorder",
     state: State | None,
     checkpoint: Checkpoint | None,
     on_step: Callable[[Checkpoint], None],

@@ -1,7 +1,5 @@
 """Contents of the JSON files of a run, checked when they are read. A text is no number."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -116,7 +114,7 @@ class Record(_Strict, extra="forbid"):
     linear: bool = True
 
     @model_validator(mode="after")
-    def _agree(self) -> Record:
+    def _agree(self) -> "Record":
         seeds = (self.steps[0].seeds or []) if self.steps else []
         lines = self.steps[1:]
         if self.taken != [*seeds, *(line.frame for line in lines)] or not seeds:

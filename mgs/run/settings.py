@@ -1,7 +1,5 @@
 """Settings of a run, validated once. The docstring of a field is the help of its option."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from reprlib import repr
@@ -110,7 +108,7 @@ class NbvSettings(ModelSettings, Mission):
     """Standard deviations of the poses that are refined."""
 
     @model_validator(mode="after")
-    def _go_together(self) -> NbvSettings:
+    def _go_together(self) -> "NbvSettings":
         means, density = self.train.means, self.train.density
         fixed = [f"estimator {self.estimator}"] if self.estimator != "exact" else []
         fixed += ["policy paper"] if self.policy == "paper" else []
@@ -127,7 +125,7 @@ class NbvSettings(ModelSettings, Mission):
             raise ValueError(f"travel {self.travel:g}: {own}")
         return self
 
-    def with_spacing(self, spacing: float, loose: float = 1.0) -> NbvSettings:
+    def with_spacing(self, spacing: float, loose: float = 1.0) -> "NbvSettings":
         """The settings with a rate and a prior std of learned means, from the samples' spacing, m.
 
         loose: factor on the default prior std of every kind. What is given stays; nothing changes

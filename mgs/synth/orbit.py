@@ -1,7 +1,5 @@
 """Cameras that fly around a rock at the origin and look at its middle."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -85,7 +83,7 @@ def orbit_cameras(
 
 
 def rock_cameras(
-    scene: SceneFile, size: tuple[int, int], frames: int, rock: trimesh.Trimesh
+    scene: SceneFile, size: tuple[int, int], frames: int, rock: "trimesh.Trimesh"
 ) -> list[Camera]:
     """Cameras of the scene's orbit, aimed at the middle of the rock above the ground. size: (width,
     height), pixels. Raises InputError if that part of the rock is not wholly inside a frame."""
@@ -93,7 +91,7 @@ def rock_cameras(
 
 
 def evaluation_cameras(
-    scene: SceneFile, size: tuple[int, int], views: int, rock: trimesh.Trimesh
+    scene: SceneFile, size: tuple[int, int], views: int, rock: "trimesh.Trimesh"
 ) -> list[Camera]:
     """Cameras of test views, spread evenly over a dome of EVALUATION_ELEVATIONS at the radius of
     the scene's orbit. Raises InputError as `rock_cameras`."""
@@ -107,7 +105,7 @@ def _aimed(
     orbit: Orbit,
     size: tuple[int, int],
     frames: int,
-    rock: trimesh.Trimesh,
+    rock: "trimesh.Trimesh",
     what: str,
 ) -> list[Camera]:
     target = np.array([0, 0, rock.bounds[1, 2] / 2])

@@ -5,8 +5,6 @@ A case names the cells that render its dataset and build its prior. The function
 folder, or absolute. All tasks continue after an interruption.
 """
 
-from __future__ import annotations
-
 import shutil
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
@@ -170,7 +168,7 @@ class Case:
         """The arguments `dataset` and `prior` of tasks."""
         return {"dataset": self.dataset, "prior": self.prior}
 
-    def on_orbit(self, orbit: Mapping[str, Any]) -> Case:
+    def on_orbit(self, orbit: Mapping[str, Any]) -> "Case":
         """Case with values of the orbit's section, and a folder named after them."""
         kind = "-".join([orbit["kind"], *map(str, orbit.get("distances", ()))])
         return replace(self, changes={"orbit": dict(orbit)}, label=f"{self.rock.name}/{kind}")
@@ -192,7 +190,7 @@ class Case:
         needs = tuple(cell.name for cell in cells)
         return [*cells, Cell(self.prior_name, f"{__name__}:make_prior", arguments, needs)]
 
-    def surveyed(self, seed: int) -> tuple[Case, list[Cell]]:
+    def surveyed(self, seed: int) -> "tuple[Case, list[Cell]]":
         """Case of a survey of this dataset, and the cells of the dataset, survey and prior."""
         label = f"{self.name}-survey"
         task, arguments = f"{__name__}:make_survey", {"dataset": self.dataset, "seed": seed}

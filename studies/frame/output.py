@@ -1,7 +1,5 @@
 """Output of studies: tables as CSV, JSON and Markdown, and plots of rows with intervals."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re
@@ -281,7 +279,7 @@ def _points(panel: Panel, rows: Sequence[Row], group: Any) -> tuple[list[Any], n
     return list(values), np.array([(m, *pair) for m, pair in zip(means, ends, strict=True)]).T
 
 
-def _draw_lines(axis: Axes, panel: Panel, rows: Sequence[Row]) -> None:
+def _draw_lines(axis: "Axes", panel: Panel, rows: Sequence[Row]) -> None:
     """Lines through the means against a number, with their intervals as bands."""
     groups = _groups(panel, rows)
     crowded = len({row[panel.x] for row in rows}) > 30
@@ -300,7 +298,7 @@ def _draw_lines(axis: Axes, panel: Panel, rows: Sequence[Row]) -> None:
     axis.set(xlabel=panel.x_label, ylabel=textwrap.fill(panel.y_label, 31))
 
 
-def logarithmic(axis: Axes) -> None:
+def logarithmic(axis: "Axes") -> None:
     """Make the x axis logarithmic, with plain numbers at 1, 2 and 5 where it spans few decades."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -312,7 +310,7 @@ def logarithmic(axis: Axes) -> None:
         axis.xaxis.set_major_formatter(lambda x, _: f"{x:g}" if x < 1e4 else f"{x / 1000:g}k")
 
 
-def _draw_names(axis: Axes, panel: Panel, rows: Sequence[Row]) -> None:
+def _draw_names(axis: "Axes", panel: Panel, rows: Sequence[Row]) -> None:
     """A line for each name: the mean as a point, its interval as a bar."""
     groups = _groups(panel, rows)
     names = list(dict.fromkeys(row[panel.x] for row in rows))

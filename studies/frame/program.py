@@ -1,7 +1,5 @@
 """The program of a study: `python -m studies.NAME OUT`. Options, the folder, cells, files."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 import warnings
@@ -66,8 +64,8 @@ class Work:
     options: Namespace
     command: str
     size: Any = None
-    cells: Sequence[Cell] = ()
-    results: Results = field(default_factory=dict)
+    cells: "Sequence[Cell]" = ()
+    results: "Results" = field(default_factory=dict)
 
     @property
     def out(self) -> Path:
@@ -99,7 +97,7 @@ class Study:
     about: str
     write: Callable[[Work], list[Path]]
     sizes: Mapping[str, Any] = field(default_factory=dict)
-    cells: Callable[[Work], list[Cell]] = lambda work: []
+    cells: "Callable[[Work], list[Cell]]" = lambda work: []
     options: Options = field(default_factory=dict)
     sized: Callable[[Any, Namespace], Any] = lambda size, options: size
     growing: bool = False
@@ -156,7 +154,7 @@ class Study:
         with _begun(work.out, options.scale):
             self.tell(self.write(replace(work, results=self._results(work))))
 
-    def _results(self, work: Work) -> Results:
+    def _results(self, work: Work) -> "Results":
         from studies.frame.sweep import results_so_far, run_cells
 
         timed = [cell for cell in work.cells if cell.alone]
@@ -198,7 +196,7 @@ def names_of(only: str | None, names: Sequence[str]) -> list[str]:
 
 
 @contextmanager
-def _begun(out: Path, scale: str) -> Iterator[None]:
+def _begun(out: Path, scale: str) -> "Iterator[None]":
     """Lock the folder of a study and record its scale.
 
     Raises InputError if the folder is of another scale, holds something else, cannot be written or

@@ -5,8 +5,6 @@ beside the files it writes, and is reused as long as function and arguments stay
 one after another in this process, or several at a time in Dask workers; the results are the same.
 """
 
-from __future__ import annotations
-
 import gc
 import logging
 import os
@@ -142,7 +140,7 @@ def run_cells(
 
 
 @contextmanager
-def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
+def _client(workers: int, scheduler: str | None) -> "Iterator[Client]":
     """Connection to a scheduler: the one at the address, or a cluster of this machine that ends
     with the block."""
     import dask
@@ -179,7 +177,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
             logger.setLevel(level)
 
 
-def _connected(scheduler: str) -> Client:
+def _connected(scheduler: str) -> "Client":
     from distributed import Client
 
     client = None
@@ -205,7 +203,7 @@ def _connected(scheduler: str) -> Client:
 
 
 def _done_in_workers(
-    root: Path, cells: list[Cell], client: Client, threads: int | None
+    root: Path, cells: list[Cell], client: "Client", threads: int | None
 ) -> Iterator[tuple[Cell, dict[str, Any]]]:
     """Do cells in workers, one at a time in each; yield them with their results as they end."""
     from distributed import Future, KilledWorker, as_completed
