@@ -34,11 +34,13 @@ def refused(capsys, arguments: list, out: Path | None = None, study: str = "") -
     return lines[0]
 
 
-def fails(words: str, call: Callable[..., object], *arguments, **options) -> None:
-    """Check that a call raises an InputError of one line in which this pattern is found."""
-    with pytest.raises(InputError, match=words) as error:
+def fails(words: str, call: Callable[..., object], *arguments, **options) -> str:
+    """Check that a call raises an InputError of one line in which this pattern is found; return the
+    line."""
+    with pytest.raises(InputError, match=words or None) as error:
         call(*arguments, **options)
     assert "\n" not in str(error.value)
+    return str(error.value)
 
 
 def occupied(path: Path) -> Path:

@@ -1,7 +1,5 @@
 """The public names of `mgs`: present, lazy, typed, and silent."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import tiny
@@ -11,8 +9,6 @@ from refusals import fails, refused
 from synthetic import pinhole
 
 import mgs
-
-ROOT = Path(__file__).parent.parent
 
 
 def test_public_names_are_present_and_documented():
@@ -72,8 +68,7 @@ def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
     assert isinstance(information, np.ndarray)
     already = r"run is there already; .* with `force`; `mgs nbv --resume "
     fails(already, mgs.run_nbv, dataset, tmp_path / "run", prior=prior)
-    with pytest.raises(mgs.InputError, match=r"^seeds = 0: must be at least 1"):
-        mgs.run_nbv(dataset, tmp_path / "other", prior=prior, seeds=0)
+    fails("^seeds = 0: ", mgs.run_nbv, dataset, tmp_path / "other", prior=prior, seeds=0)
 
 
 def highest(candidates):
@@ -94,8 +89,7 @@ def test_a_function_is_a_policy_that_a_resumed_run_asks_for(dataset, prior, tmp_
     left = [i for i in range(len(places)) if i not in run.state.taken[:3]]
     assert run.state.taken[3] == max(left, key=lambda i: highest(places)[i])
     assert run.label == "highest"
-    with pytest.raises(mgs.InputError, match="unknown parameter view"):
-        mgs.start_run(dataset, tmp_path / "wrong", policy=lambda view: 0, **given)
+    fails("parameter view", mgs.start_run, dataset, out / "x", policy=lambda view: 0, **given)
     (out / "policy.py").write_text("def highest(candidates): ...")
     fails("policy highest: is not as", mgs.resume_nbv, out, policy=highest)
 
@@ -134,8 +128,7 @@ def test_priors_and_normals_of_arrays(tmp_path):
     inside = np.asarray(image.alpha) > 0.9
     assert (found[np.asarray(image.alpha) == 0] == 0).all()
     assert (found[inside] * points[inside]).sum(1).mean() > 0.95
-    with pytest.raises(mgs.InputError, match="mesh: face 0 names vertex 9 of 3; repair"):
-        mgs.prior_from_mesh((np.eye(3), [[0, 1, 9]]), settings)
+    fails("face 0 names vertex 9 of 3", mgs.prior_from_mesh, (np.eye(3), [[0, 1, 9]]), settings)
 
 
 def test_a_fit_takes_a_loss_of_its_own_and_says_what_is_wrong_with_images(dataset):
@@ -151,6 +144,5 @@ def test_a_fit_takes_a_loss_of_its_own_and_says_what_is_wrong_with_images(datase
     assert own.gaussians == usual.gaussians
     doubled = mgs.fit_gaussians(model, cameras, images, few, loss=lambda *a: 2 * squared(*a))
     np.testing.assert_allclose(doubled.losses[0], 2 * usual.losses[0], rtol=1e-5)
-    with pytest.raises(mgs.InputError, match=r"target: has shape \[2, 2, 3\], expected \[12,16"):
-        mgs.fit_gaussians(model, cameras[:1], [np.ones((2, 2, 3))])
+    fails(r"target: .*\[12,16", mgs.fit_gaussians, model, cameras[:1], [np.ones((2, 2, 3))])
     fails("there are 2 cameras, but 1 targets", mgs.fit_gaussians, model, cameras, images[:1])

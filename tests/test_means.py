@@ -9,7 +9,7 @@ import tiny
 from program import change_settings
 from refusals import fails, refused
 
-from mgs import Camera, InputError, diagnose, fit_gaussians, load_dataset, load_prior
+from mgs import Camera, diagnose, fit_gaussians, load_dataset, load_prior
 from mgs.fit.objective import objective
 from mgs.fit.settings import MEAN_RATE, TrainSettings
 from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
@@ -107,8 +107,7 @@ def test_displaced_means_move_back_to_the_surface(cameras, targets):
 
 
 def test_a_rate_that_is_missing_is_named(cameras, targets):
-    with pytest.raises(InputError, match=r"train.rates: has no rate of mean"):
-        fit_gaussians(ball(), cameras, targets, TrainSettings(means="free"))
+    fails("no rate of mean", fit_gaussians, ball(), cameras, targets, TrainSettings(means="free"))
     wanted = NbvSettings(dataset=".", prior=".", train=TrainSettings(means="free"))
     fails("prior_std: has no number for mean", wanted.regularisation, groups(0, "free"))
 

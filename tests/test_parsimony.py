@@ -9,7 +9,7 @@ import trimesh
 from program import command, study
 from refusals import fails
 
-from mgs import InputError, PriorSettings
+from mgs import PriorSettings
 from mgs.data.meshes import Mesh
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.prior.build import _samples, build_prior, prior_from_mesh
@@ -87,8 +87,7 @@ def test_a_given_mesh_takes_its_number_from_the_pixels_too(data, tmp_path):
     synthetic.rock_mesh().export(tmp_path / "rock.ply")
     command("prior", data.root, "--out", tmp_path / "p", "--mesh", tmp_path / "rock.ply")
     assert "resolution" in json.loads((tmp_path / "p/prior.json").read_text())
-    with pytest.raises(InputError, match="a density is relative to the voxels of a cloud"):
-        prior_from_mesh(tmp_path / "rock.ply", PriorSettings(density=0.5))
+    fails("a density", prior_from_mesh, tmp_path / "rock.ply", PriorSettings(density=0.5))
 
 
 def test_the_automatic_number_has_a_limit(data, monkeypatch):

@@ -7,7 +7,7 @@ import tiny
 from refusals import fails, refused
 
 import mgs
-from mgs import InputError, load_dataset, open_run, start_run
+from mgs import load_dataset, open_run, start_run
 from mgs.run.policy_file import check_policy, policy_of
 
 FUNCTIONS = """
@@ -143,8 +143,7 @@ def test_a_policy_that_fails_keeps_the_steps_before(loaded, file, tmp_path, func
 
 
 def test_an_error_in_a_plan_is_one_line(file):
-    with pytest.raises(InputError, match=r"mine\.py failed: TypeError: 'NoneType' object is not"):
-        policy_of(f"{file}:Lost").plan(None, None, [], 1, None)
+    fails(r"mine\.py failed: TypeError", policy_of(f"{file}:Lost").plan, None, None, [], 1, None)
 
 
 def test_a_run_goes_on_with_the_same_file_only(dataset, file, tmp_path, monkeypatch):

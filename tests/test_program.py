@@ -155,8 +155,7 @@ def test_the_datasets_own_prior_is_the_default(dataset, tmp_path):
 def test_the_default_budget_is_50_or_all_candidates(prior, tmp_path, frames, budget):
     dataset = tiny.write_dataset(tmp_path / "orbit", frames=frames)
     assert started(dataset, tmp_path / "run", prior).budget == budget
-    with pytest.raises(InputError, match=f"has {frames - 4} candidates, fewer"):
-        started(dataset, tmp_path / "more", prior, budget=frames - 3)
+    fails(f"{frames - 4} candidates", started, dataset, tmp_path / "more", prior, budget=frames - 3)
 
 
 @pytest.mark.parametrize(("frame", "images"), [(4, 0), (6, 4)])

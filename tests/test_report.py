@@ -232,10 +232,7 @@ def unfinished(run):
 
 UNFIT = {
     "measured before": (edit("metrics.json", images=7), "not evaluated since its last step"),
-    "damaged metrics": (
-        edit("metrics.json", views=[{}]),
-        "is damaged (views.0.name: ",
-    ),
+    "damaged metrics": (edit("metrics.json", views=[{}]), "is damaged (views.0.name: "),
     "view not measured": (edit("metrics.json", views=[], test_views=[]), "no view on which all"),
     "another dataset": (lambda run: change_settings(run, dataset="/"), "another dataset"),
     "frames changed": (edit("config.json", frames=[]), "its frames differ"),

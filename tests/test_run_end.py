@@ -14,7 +14,7 @@ from program import change_settings
 from refusals import fails
 from tiny import resume, run
 
-from mgs import InputError, load_dataset
+from mgs import load_dataset
 from mgs.policy import criteria
 from mgs.run import folder as run_folder
 from mgs.run.ending import run_end
@@ -161,5 +161,4 @@ def test_a_run_does_not_go_on_from_other_initial_gaussians(half_done):
         g = tiny.initial(frames)
         return replace(g, means=g.means + np.float32(0.01))
 
-    with pytest.raises(InputError, match=r"is not the prior that .*run was started on"):
-        tiny.resume(out, load_dataset(root), initial=initial)
+    fails("is not the prior that .*run", tiny.resume, out, load_dataset(root), initial=initial)

@@ -76,9 +76,7 @@ def test_versions_are_compared_as_numbers(tmp_path):
 )
 def test_a_bad_library_is_named(monkeypatch, library, message):
     monkeypatch.setenv(runtime.LIBRARY_VARIABLE, library)
-    with pytest.raises(InputError, match=message) as error:
-        runtime.find_libllvm()
-    assert runtime.LIBRARY_VARIABLE in str(error.value)
+    assert runtime.LIBRARY_VARIABLE in fails(message, runtime.find_libllvm)
 
 
 def test_the_doctor_names_a_bad_library_in_one_line_and_exits_with_2():

@@ -193,5 +193,4 @@ def test_every_scene_frames_its_rock_on_every_orbit(scene):
 def test_a_rock_that_renders_as_nan_is_refused():
     rgb, mask = np.full((2, 2, 3), np.nan, np.float32), np.ones((2, 2), bool)
     scene = SimpleNamespace(light=lambda *_: (rgb, rgb, rgb), cast=lambda _: (mask, mask))
-    with pytest.raises(InputError, match="NaN or infinite in frame 0; repair its mesh"):
-        _meter(scene, [None] * 4, 0, 1, False, print)
+    fails("NaN or infinite in frame 0", _meter, scene, [None] * 4, 0, 1, False, print)

@@ -16,7 +16,7 @@ from program import command
 from refusals import fails
 
 import mgs
-from mgs import InputError, Run, open_run, plotting, report, write_page
+from mgs import Run, open_run, plotting, report, write_page
 from mgs.camera import opencv_from_opengl
 from mgs.data.dataset import load_cameras, load_dataset, write_transforms
 from mgs.data.world import UPRIGHT, World, unit_up
@@ -121,8 +121,7 @@ def test_a_tilted_run_of_an_older_version_is_refused(runs, tmp_path):
     record = json.loads(str(arrays["json"][()]))
     del record["upright"]
     np.savez(path, **arrays | {"json": np.array(json.dumps(record))})
-    with pytest.raises(InputError, match="older mgs"):
-        _ = open_run(folder).state
+    fails("older mgs", getattr, open_run(folder), "state")
 
 
 @pytest.fixture(scope="module")
