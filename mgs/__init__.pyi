@@ -2,7 +2,7 @@
 
 from .camera import Camera as Camera
 from .camera import look_at as look_at
-from .cli.progress import progress_bar as progress_bar
+from .cli.terminal import progress_bar as progress_bar
 from .data.dataset import Dataset as Dataset
 from .data.dataset import load_cameras as load_cameras
 from .data.dataset import load_dataset as load_dataset
@@ -34,7 +34,6 @@ from .reports.evaluation import evaluate_run as evaluate_run
 from .reports.page import write_page as write_page
 from .reports.writing import report as report
 from .run.choosing import choose as choose
-from .run.directional import Directional as Directional
 from .run.folder import Checkpoint as Checkpoint
 from .run.folder import Run as Run
 from .run.folder import open_run as open_run
@@ -47,6 +46,7 @@ from .run.nbv import start_run as start_run
 from .run.policies import AOptimal as AOptimal
 from .run.policies import Cover as Cover
 from .run.policies import Coverage as Coverage
+from .run.policies import Directional as Directional
 from .run.policies import DOptimal as DOptimal
 from .run.policies import Farthest as Farthest
 from .run.policies import FisherRF as FisherRF

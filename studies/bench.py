@@ -53,8 +53,7 @@ def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
 @cache
 def _rock(seed: int) -> Any:
     """Mesh of the default rock. It takes seconds, and tests use it often."""
-    from mgs.synth.noise import Noise
-    from mgs.synth.rock import rock_shape
+    from mgs.synth.rock import Noise, rock_shape
     from mgs.synth.scene_file import load_scene_file
 
     return rock_shape(load_scene_file("boulder").rock, Noise(generator(seed, "bench/rock")))[0]

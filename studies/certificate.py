@@ -16,7 +16,7 @@ import mgs
 from mgs.learning import fit_views
 from mgs.policy import certificate, poses
 from mgs.policy.relaxation import Relaxation
-from mgs.run.directional import DIRECTIONAL_D, Directional
+from mgs.run.policies import DIRECTIONAL_D, Directional
 from studies.frame.case import ROCKS, Rock
 from studies.frame.claim import Row
 from studies.frame.output import (

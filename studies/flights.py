@@ -19,8 +19,8 @@ from mgs.learning import fit_views
 from mgs.policy import tour
 from mgs.policy.poses import travel_cost
 from mgs.run.choosing import planned_flight, rated
-from mgs.run.directional import DIRECTIONAL_D
 from mgs.run.flight import flight_of, reachable
+from mgs.run.policies import DIRECTIONAL_D
 from mgs.run.settings import FlightLimits
 from studies.frame.case import ROCKS
 from studies.frame.claim import Row

@@ -11,8 +11,7 @@ from mgs.gaussians import sh_from_rgb
 from mgs.policy import criteria
 from mgs.policy.criteria import Array, observed
 from mgs.policy.poses import angles
-from mgs.run.directional import Directional
-from mgs.run.policies import Information, Paper, each
+from mgs.run.policies import Directional, Information, Paper, each
 from mgs.splat import fisher, groups, render
 from mgs.splat.reference import sh_basis
 

@@ -32,7 +32,7 @@ from mgs.fit.fitting import fit_gaussians
 from mgs.fit.settings import COLOURS_ALONE, as_3dgs
 from mgs.memory import IMAGE_BYTES, Deferred, kept_within
 from mgs.prior.initial import round_gaussians
-from mgs.prior.scattered import scattered
+from mgs.prior.points import scattered
 from mgs.run import policy_file
 from mgs.run.inputs import policy_record
 from studies.frame.case import Case, Rock, Size, test_views_of

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import settings
 
 from mgs import runtime
-from mgs.cli import progress
+from mgs.cli import terminal
 
 if WORKER := os.environ.get("PYTEST_XDIST_WORKER"):
     # Threads of two workers on the same two processors cost a third more seconds.
     processors = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {processors[int(WORKER[2:]) % len(processors)]})
 runtime.start()
-progress.SECONDS_BETWEEN = float("inf")  # a busy machine would print lines of progress
+terminal.SECONDS_BETWEEN = float("inf")  # a busy machine would print lines of progress
 # No deadline: the machine may be busy, and a first call loads libraries.
 settings.register_profile("mgs", deadline=None)
 settings.load_profile("mgs")

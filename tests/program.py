@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from mgs.cli.app import main
-from mgs.reports.runs import compare_runs
-from mgs.reports.tables import comparison_rows
+from mgs.reports.tables import compare_runs, comparison_rows
 from studies.frame.program import study_of
 
 

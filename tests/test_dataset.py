@@ -17,7 +17,7 @@ from mgs.camera import Camera, look_at, opencv_from_opengl
 from mgs.colour import linear_from_srgb
 from mgs.data.check import check_dataset
 from mgs.data.dataset import load_dataset, target_of, write_transforms
-from mgs.data.rock_image import boundary, write_rock_image
+from mgs.data.frames import boundary, write_rock_image
 from mgs.gaussians import ARRAYS
 from mgs.images import write_exr, write_png
 from mgs.prior.exposure import without_gain

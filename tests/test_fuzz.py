@@ -33,7 +33,7 @@ from mgs.data.meshes import load_mesh
 from mgs.data.sources import read_source
 from mgs.files import read_json, write_json
 from mgs.images import exif_exposure, image_size, read_mask, read_values, write_exr, write_png
-from mgs.reports.runs import compare_runs
+from mgs.reports.tables import compare_runs
 from mgs.run.candidates import Site, read_poses, refusals
 from mgs.splat_files import load_gaussians
 from mgs.splat_ply import read_ply, write_compressed_ply, write_ply

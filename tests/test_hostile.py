@@ -198,7 +198,7 @@ PLACES = {"report": "report", "diagnose": "diagnostics", "eval": "", "simplify":
 
 def test_two_commands_on_one_run(capsys, stranger, monkeypatch):
     """The second one would remove the half-written files of the first."""
-    monkeypatch.setattr("mgs.reports.runs.compare_runs", lambda runs: runs)
+    monkeypatch.setattr("mgs.reports.tables.compare_runs", lambda runs: runs)
     for name, place in PLACES.items():
         with folder_locked(stranger / place):
             (stranger / ".checkpoint.1073741824-01234567.part.npz").write_bytes(b"half")

@@ -194,7 +194,7 @@ def test_a_file_where_a_run_keeps_its_pictures(capsys, dataset, prior, tmp_path)
 
 WHOLE = {
     "prior": ("mgs.prior.figure", "mesh.ply points.ply prior.json prior.png"),
-    "survey": ("mgs.survey.folder", "cloud.ply rock.glb survey.json survey.png transforms.json"),
+    "survey": ("mgs.survey.flight", "cloud.ply rock.glb survey.json survey.png transforms.json"),
 }
 """Command -> module that draws its picture, and the files that it writes."""
 

@@ -19,7 +19,7 @@ from refusals import refused
 
 from mgs import Camera, evaluate_run, load_dataset, open_run, write_page
 from mgs.files import read_json, write_json
-from mgs.reports import page_pictures
+from mgs.reports import page as pages
 from mgs.reports.page_plots import corners_at
 
 
@@ -129,7 +129,7 @@ def test_uncertainty_falls_with_every_view(runs):
 
     run, album = open_run(runs[0]), MagicMock()
     frames, model = run.taken, run.state.gaussians
-    page_pictures.draw_taken(album, "a", run, lambda: None)
+    pages.draw_taken(album, "a", run, lambda: None)
     shown = {name: values for (name, values, _), _ in album.add_uncertainty.call_args_list}
     lam = regularisation(groups(0), run.settings.pixel_noise, run.settings.prior_std)
     H = np.zeros((tiny.POINTS, 11))
@@ -148,12 +148,12 @@ def test_uncertainty_falls_with_every_view(runs):
 
 def test_pictures_stay_within_their_share(monkeypatch, runs):
     dataset = open_run(runs[0]).dataset
-    album = page_pictures.new_album(dataset.frames, 1)
+    album = pages.new_album(dataset.frames, 1)
     rows, columns = album.window
     mask = np.logical_or.reduce([frame.mask() for frame in dataset.frames])
     assert mask[rows, columns].sum() == mask.sum()
-    monkeypatch.setattr(page_pictures, "PIXELS", 1000)
-    small = page_pictures.new_album(dataset.frames, 50)
+    monkeypatch.setattr(pages, "PIXELS", 1000)
+    small = pages.new_album(dataset.frames, 50)
     assert small.width**2 * mask[rows, columns].shape[0] / mask[rows, columns].shape[1] <= 1000 / 50
 
 

@@ -37,8 +37,7 @@ from mgs.images import write_png
 from mgs.prior import hull
 from mgs.prior.build import build_prior, load_prior, prior_and_cloud
 from mgs.prior.hull import visual_hull
-from mgs.prior.points import _grown, main_cluster, on_surface, reliable
-from mgs.prior.scattered import scattered
+from mgs.prior.points import _grown, main_cluster, on_surface, reliable, scattered
 from mgs.splat_files import load_gaussians
 from mgs.synth.orbit import perturb
 
@@ -469,9 +468,9 @@ def test_poses_alone_are_fitted_from_random_points(tmp_path, capsys):
 def test_random_points_are_fewer_than_those_of_the_cameras(colmap, tmp_path, monkeypatch):
     """Unless these are few. Too many hide the scene."""
     dataset = import_source(read_source(colmap), tmp_path / "d")
-    monkeypatch.setattr("mgs.prior.scattered.PIXELS", 1)
+    monkeypatch.setattr("mgs.prior.points.PIXELS", 1)
     assert scattered(dataset, PriorSettings())[4]["n"] == 10_000
-    monkeypatch.setattr("mgs.prior.scattered.GAUSSIANS", 100)
+    monkeypatch.setattr("mgs.prior.points.GAUSSIANS", 100)
     many = scattered(dataset, PriorSettings())[4]
     assert many["n"] == round(1.1 * many["triangulated"])
     asked = scattered(dataset, PriorSettings(gaussians=5000))[4]

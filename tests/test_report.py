@@ -23,7 +23,7 @@ from mgs.files import read_json, write_json
 from mgs.reports import figures, tables, writing
 from mgs.reports.figures import POLICY_STYLE
 from mgs.reports.page_plots import SYMBOLS
-from mgs.reports.runs import compare_runs
+from mgs.reports.tables import compare_runs
 from mgs.run.policies import POLICIES
 
 FIGURES = ("orbit", "gain", "coverage", "comparison", "psnr")

@@ -7,9 +7,8 @@ from PIL import Image
 
 from mgs.data.meshes import read_mesh, to_glb
 from mgs.seeds import generator
-from mgs.synth.noise import Noise
 from mgs.synth.orbit import orbit_cameras, orbit_positions, perturb
-from mgs.synth.rock import load_rock, make_rock
+from mgs.synth.rock import Noise, load_rock, make_rock
 from mgs.synth.scene_file import Orbit, Rock
 
 COARSE = Rock(detail=0.08)

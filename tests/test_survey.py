@@ -10,13 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from mgs import Camera, PriorSettings, build_prior, look_at
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, write_transforms
-from mgs.data.rock_image import write_rock_image
+from mgs.data.frames import write_rock_image
 from mgs.files import read_json, write_json
 from mgs.images import write_png
 from mgs.survey import depth_sensor
 from mgs.survey.depth_sensor import AXIAL_GROWTH, QUANTUM, depth_noise, filter_depth, noisy_depth
-from mgs.survey.flight import SurveySettings, fly, survey_numbers, trajectory_error
-from mgs.survey.folder import write_survey
+from mgs.survey.flight import SurveySettings, fly, survey_numbers, trajectory_error, write_survey
 from mgs.survey.registration import Edge, chain, drifting_odometry, loop_candidates, optimise
 
 CENTRES = [[0.1, -0.05, 0.2], [0.7, 0.5, 0.05], [-0.6, 0.6, 0], [-0.4, -0.8, 0.05], [1, -0.6, 0]]

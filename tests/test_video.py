@@ -12,7 +12,6 @@ from PIL import Image
 from program import change_settings, command
 from refusals import fails, refused
 
-from mgs.reports import story
 from mgs.reports.video import camera_path, path_among, write_film
 
 
@@ -101,7 +100,7 @@ def test_the_story_has_a_frame_for_each_view(run, tmp_path, monkeypatch):
         for count in range(1, len(run.state.taken) + 1):
             yield replace(run.state, taken=run.state.taken[:count])
 
-    monkeypatch.setattr(story, "models", models)
+    monkeypatch.setattr("mgs.reports.video.models", models)
     command("video", run, "--out", tmp_path / "a.gif", "--story")
     with Image.open(tmp_path / "a.gif") as image:
         assert image.n_frames > 1

@@ -4,8 +4,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from mgs.cli.progress import progress_bar
-from mgs.cli.terminal import Terminal
+from mgs.cli.terminal import Terminal, progress_bar
 from mgs.errors import InputError
 from mgs.files import working_in
 

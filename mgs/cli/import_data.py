@@ -12,8 +12,7 @@ import numpy as np
 import typer
 
 from mgs.cli.options import parse_up
-from mgs.cli.progress import progress_bar
-from mgs.cli.terminal import Terminal
+from mgs.cli.terminal import Terminal, progress_bar
 from mgs.errors import InputError
 from mgs.files import Ours, clear_folder, scratch_folder
 from mgs.progress import listening
@@ -77,7 +76,7 @@ def import_data(
       points that pictures share; for poses that are a little wrong. Needs texture.
     - test_split: Split of NeRF-synthetic data that becomes the test views; publications take test.
     """
-    from mgs.cli.fit import moves_in_words
+    from mgs.cli.nbv import moves_in_words
     from mgs.data.agreement import agreement
     from mgs.data.bags import is_bag
     from mgs.data.clouds import write_cloud

@@ -1,21 +1,24 @@
-"""`mgs nbv`: choose views one by one, as the paper does."""
+"""`mgs nbv`: choose views one by one, as the paper does. `mgs fit`: fit a model to all images."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from pydantic import Field
 
-from mgs.cli.options import Settings, merged, not_none, parse_settings, with_keys
+from mgs.cli.options import Settings, merged, not_none, parse_gaussians, parse_settings, with_keys
+from mgs.cli.terminal import Terminal, progress_bar
+from mgs.errors import InputError
+from mgs.files import check_writable
 from mgs.run.policies import POLICIES
 from mgs.run.policy_file import in_file
 from mgs.run.settings import Frozen, NbvSettings, Positive, settings_in, validated
 
 if TYPE_CHECKING:
-    from mgs.cli.terminal import Terminal
     from mgs.gaussians import Gaussians
     from mgs.run.folder import Checkpoint, Run
     from mgs.run.live import Live
@@ -78,10 +81,6 @@ def nbv(
       writes a PNG.
     - capture_folder: Folder to which poses are written; pictures are awaited there.
     """
-    from mgs.cli.options import parse_gaussians
-    from mgs.cli.terminal import Terminal
-    from mgs.errors import InputError
-
     console = Terminal()
     values = parse_settings(settings, nbv)
     live = live_capture(capture_command, capture_folder, values.pop("capture", {}))
@@ -117,8 +116,6 @@ PASSES_BETWEEN = 5  # passes of a fit to all images between two pictures of a te
 def live_capture(command: str | None, folder: Path | None, values: dict[str, Any]) -> Live | None:
     """`Live` of the options of a live capture, None without one. Raises InputError as `command`,
     and where options are wrong or do not go together."""
-    from mgs.errors import InputError
-    from mgs.files import check_writable
     from mgs.run import transports
     from mgs.run.live import Live
 
@@ -142,7 +139,6 @@ def start_and_print(
 ) -> Run:
     """`mgs.run.nbv.start_run`, or another start, with its progress; print which prior was found in
     the dataset."""
-    from mgs.cli.progress import progress_bar
     from mgs.run.flight import allowed
     from mgs.run.nbv import scene_of, start_run
 
@@ -165,10 +161,7 @@ def resume_and_print(
 
     policy: FILE.py:FUNCTION where the run has a policy of the user's own. live: of its pictures.
     """
-    from functools import partial
-
     from mgs.cli.printing import print_run, step_lines
-    from mgs.cli.progress import progress_bar
     from mgs.reports.evaluation import drawn_test_view, evaluate_run
     from mgs.run.folder import open_run
     from mgs.run.nbv import resume_nbv
@@ -193,3 +186,63 @@ def resume_and_print(
         watched = partial(progress, "evaluating")
         metrics = evaluate_run(run.folder, pictures=False, progress=watched)
     print_run(run.folder, state, metrics, console)
+
+
+@with_keys(
+    NbvSettings,
+    *("train", "sh", "exposure", "pixel_noise", "prior_std", "seed", "refine_poses", "pose_noise"),
+)
+def fit(
+    dataset: Path,
+    out: Annotated[Path, typer.Option()],
+    prior: Path | None = None,
+    gaussians: str | None = None,
+    passes: int | None = None,
+    means: str | None = None,
+    sh: int | None = None,
+    density: str | None = None,
+    loss: str | None = None,
+    exposure: bool | None = None,
+    refine_poses: bool | None = None,
+    seed: int | None = None,
+    settings: Settings = None,
+    force: bool = False,
+) -> None:
+    """Fit a model to all images of a dataset, and measure it.
+
+    By default means are free if the prior comes from photographs (points, masks or random), and
+    colours have SH degree 1 if it comes from points or masks. Otherwise means are frozen and
+    colours have degree 0. Photographs without masks are fitted whole, unless --prior is given. Test
+    views are never fitted. The output is a run folder like that of `mgs nbv`, so all commands for
+    runs accept it.
+
+    - out: New folder for the run.
+    - passes: Default: 30 with adaptive density or free means from photographs, else 10.
+    - means: Default: free from photographs or with adaptive density, else frozen.
+    - sh: Default: 3 with adaptive density, 1 with free means from photographs, else 0.
+    - density: The defaults of adaptive are those of 3DGS. Default: split of whole scenes without
+      --gaussians, else fixed.
+    """
+    from mgs.run.nbv import start_fit
+
+    console = Terminal()
+    train = not_none(passes=passes, means=means, density=density, loss=loss)
+    options = not_none(sh=sh, exposure=exposure, seed=seed, refine_poses=refine_poses)
+    values = merged(parse_settings(settings, fit), options | {"train": train})
+    values |= {"prior": prior, "gaussians": parse_gaussians(gaussians), "force": force}
+    run = start_and_print(dataset, out, console, start_fit, **values)
+    if run.poses_moved:
+        console.print(moves_in_words(run.poses_moved, run.dataset.unit))
+    if prior is None and (seen := run.prior.numbers.get("triangulated")) is not None:
+        others = run.prior.numbers["n"] - seen
+        console.print(f"start: {seen:,} points of the cameras and {others:,} random ones")
+    resume_and_print(run, console, run.settings.policy)
+
+
+def moves_in_words(moves: dict[str, dict[str, float]], unit: str) -> str:
+    """Format the mean and largest move of poses. moves: by frame, degrees and length."""
+    name = max(moves, key=lambda one: moves[one]["degrees"])
+    degrees = sum(move["degrees"] for move in moves.values()) / len(moves)
+    length = sum(move["length"] for move in moves.values()) / len(moves)
+    most = f"{name} most: {moves[name]['degrees']:.2f} and {moves[name]['length']:.3g}"
+    return f"poses moved {degrees:.2f} degrees and {length:.3g} {unit} in the mean, {most}"

@@ -10,8 +10,7 @@ import typer
 
 from mgs import runtime
 from mgs.cli.options import Count
-from mgs.cli.progress import progress_bar
-from mgs.cli.terminal import echo
+from mgs.cli.terminal import echo, progress_bar
 from mgs.errors import InputError
 from mgs.files import check_new_folder, folder_locked
 
@@ -49,7 +48,7 @@ def render(
     """
     from mgs.data.dataset import load_cameras, load_origin
     from mgs.reports.exporting import read_model
-    from mgs.reports.pictures import draw_views
+    from mgs.reports.video import draw_views
     from mgs.run.folder import open_run
 
     if not all(0 <= value <= 1 for value in background):

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 
 from mgs.cli.options import Seed, parse_gaussians, parse_up
-from mgs.cli.progress import progress_bar
-from mgs.cli.terminal import Terminal
+from mgs.cli.terminal import Terminal, progress_bar
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, below
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 import typer
 
-from mgs.cli.progress import progress_bar
-from mgs.cli.terminal import echo
+from mgs.cli.terminal import echo, progress_bar
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, atomic_path, check_new_file
 
@@ -189,8 +188,7 @@ def video(
     - width: Width of a picture in pixels. Default: the cameras' own.
     """
     from mgs import runtime
-    from mgs.reports.story import story_frames
-    from mgs.reports.video import check_film, path_frames, write_film
+    from mgs.reports.video import check_film, path_frames, story_frames, write_film
     from mgs.run.folder import open_run
 
     unused: dict[str, object] = (

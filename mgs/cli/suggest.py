@@ -11,8 +11,7 @@ from rich.table import Table
 
 from mgs import runtime
 from mgs.cli.options import Count, Settings, not_none, parse_gaussians, parse_settings, with_keys
-from mgs.cli.progress import progress_bar
-from mgs.cli.terminal import Terminal
+from mgs.cli.terminal import Terminal, progress_bar
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
 from mgs.progress import listening

@@ -6,8 +6,7 @@ from typing import Any, Literal
 from rich.table import Table
 
 from mgs.cli.options import Seed
-from mgs.cli.progress import progress_bar
-from mgs.cli.terminal import Terminal
+from mgs.cli.terminal import Terminal, progress_bar
 from mgs.files import Ours, atomic_folder, below
 
 FILES = [
@@ -40,8 +39,7 @@ def survey(
     - drift: Factor on the errors of odometry. Default: as the dataset's scene says, else 1.
     """
     from mgs.data.dataset import load_dataset
-    from mgs.survey.flight import SurveySettings, fly
-    from mgs.survey.folder import save_survey
+    from mgs.survey.flight import SurveySettings, fly, save_survey
     from mgs.synth.scene_file import sensor_of
 
     console = Terminal()

@@ -10,8 +10,7 @@ import typer
 from mgs import runtime
 from mgs.camera import MAX_PIXELS
 from mgs.cli.options import Count, Seed
-from mgs.cli.progress import progress_bar
-from mgs.cli.terminal import Terminal
+from mgs.cli.terminal import Terminal, progress_bar
 from mgs.errors import InputError
 from mgs.files import Ours, clear_folder
 from mgs.synth.scene_file import OrbitKind, load_scene_file

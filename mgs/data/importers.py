@@ -14,10 +14,9 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.data.clouds import write_cloud
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, resumes, write_transforms
-from mgs.data.frames import Frame
+from mgs.data.frames import Frame, premultiplied, write_rock_image
 from mgs.data.lens import Undo, read_fitting, shrunk, undistorter
 from mgs.data.meshes import Mesh, read_mesh
-from mgs.data.rock_image import premultiplied, write_rock_image
 from mgs.data.shots import Shot, Source, find_image
 from mgs.data.world import PLUS_Z, Vector, World
 from mgs.errors import InputError, Notice

@@ -19,7 +19,13 @@ from mgs.data.lens import Lens
 from mgs.data.metashape import is_metashape, read_metashape
 from mgs.data.peers import PEERS, is_peer, read_peer
 from mgs.data.photographs import KIND as PHOTOGRAPHS
-from mgs.data.photographs import UNREAD, photographs_in, read_photographs
+from mgs.data.photographs import (
+    UNREAD,
+    VIDEO_SUFFIXES,
+    photographs_in,
+    read_photographs,
+    sharpest_frames,
+)
 from mgs.data.rgbd_folders import is_open3d, is_rtabmap, is_tum, read_open3d, read_rtabmap, read_tum
 from mgs.data.shots import (
     PICTURE_SUFFIXES,
@@ -31,7 +37,6 @@ from mgs.data.shots import (
     turned_by_exif,
 )
 from mgs.data.tracks import ROUNDED, Spacing, orthonormal
-from mgs.data.video import VIDEO_SUFFIXES, sharpest_frames
 from mgs.data.world import unit_up
 from mgs.errors import InputError
 from mgs.images import image_size

@@ -26,13 +26,13 @@ from mgs.files import atomic_path, check_new_folder, parsing, read_json, write_j
 from mgs.notebook import cloud, html
 from mgs.prior.hull import MOST_PIXELS
 from mgs.prior.photographs import check_masks, check_photographs, choose_source, surface_of
+from mgs.prior.points import scattered
 from mgs.prior.resolution import (
     MOST_GAUSSIANS,
     PIXELS_OF_PHOTOGRAPHS,
     PIXELS_PER_SAMPLE,
     resolution,
 )
-from mgs.prior.scattered import scattered
 from mgs.prior.segmentation import SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import Surface, poisson_mesh, sample_surface, spread_first

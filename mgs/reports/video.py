@@ -1,4 +1,5 @@
-"""Films of a run: a turntable, or in a whole scene a flight among the cameras."""
+"""Pictures of a model through given cameras, and films of a run: a turntable, in a whole scene a
+flight among the cameras, or the story of the run, the model after each view."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -10,13 +11,24 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from mgs.camera import Camera, look_at
+from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.data.dataset import Dataset
+from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import atomic_path
-from mgs.plotting import painted
+from mgs.gaussians import Gaussians
+from mgs.images import write_exr, write_png
+from mgs.learning import learn
+from mgs.metrics import psnr
+from mgs.plotting import NO_GRID, crop, new_figure, painted
+from mgs.policy import criteria
 from mgs.policy.tour import flying_order, legs
-from mgs.reports.diagnostics import VISIBLE, picture, run_scalars, view_maps
+from mgs.progress import Progress, listening
+from mgs.reports.diagnostics import VISIBLE, picture, run_scalars, show_map, view_maps
+from mgs.reports.figures import NEWEST, draw_cameras
 from mgs.run.folder import Run
+from mgs.run.nbv import scene_of
+from mgs.scene import Scene, State
 
 Film = Iterator[np.ndarray]  # frames, sRGB uint8 [H,W,3], all of one size
 
@@ -155,3 +167,121 @@ def _write_animation(path: Path, frames: Film, seconds: Sequence[float], gif: bo
     options: dict[str, Any] = {"save_all": True, "append_images": pictures[1:], "loop": 0}
     options["duration"] = [round(1000 * each) for each in seconds[: len(pictures)]]
     pictures[0].save(path, format="GIF" if gif else "PNG", optimize=True, **options)
+
+
+SIZE = (8.4, 3.1)  # width and height of a frame, inches
+
+DPI = 110
+
+
+def models(run: Run, scene: Scene) -> Iterator[State]:
+    """Fit the run's views again, one more each time; yield every model."""
+    taken, seeds = run.state.taken, run.settings.seeds
+    before: State | None = None
+    for count in range(1, len(taken) + 1):
+        before = learn(scene, taken[:count], before if count > seeds else None)
+        yield before
+
+
+def story_frames(run: Run, progress: Progress) -> Film:
+    """Frames of the story, one for each view taken: the cameras from above, the render of one view,
+    and the share of the variance that is left in it. The view is the brightest of those that the
+    first image leaves more unknown than most, among test views, views never taken, or all. Raises
+    InputError as `models`, and if an image cannot be read."""
+    scene, view = scene_of(run), None
+    with listening(progress):
+        for model in models(run, scene):
+            unknown = {"uncertainty": criteria.uncertainty(model.H, scene.lam)}
+            view = view or _shown_view(run, model, unknown)
+            maps = view_maps(model.gaussians, view.camera, unknown)
+            yield _drawn(run, model, maps, view)
+
+
+def _shown_view(run: Run, model: State, unknown: dict[str, np.ndarray]) -> Frame:
+    tests, frames = run.dataset.test_views(), run.dataset.frames
+    new = [frame for i, frame in enumerate(frames) if i not in run.state.taken]
+    others = tests.frames if tests is not None else run.dataset.with_images({f.name for f in new})
+    choice = list(others or run.taken)
+    shares = [_left(view_maps(model.gaussians, frame.camera, unknown)) for frame in choice]
+    least_known = [f for f, mean in zip(choice, shares, strict=True) if mean >= np.median(shares)]
+    return max(least_known, key=lambda frame: srgb_from_linear(frame.masked_rgb()).mean())
+
+
+def _left(maps: dict[str, np.ndarray]) -> float:
+    """Mean share of the variance that is left, over the pixels that show the model."""
+    return float(maps["uncertainty"][maps["A"] >= VISIBLE].mean())
+
+
+def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], view: Frame) -> np.ndarray:
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    truth = srgb_from_linear(view.masked_rgb())
+    rgb = picture(maps)
+    window = crop(truth.max(axis=2) > 0)
+    count, seeds = len(model.taken), run.settings.seeds
+    why = f"one of {seeds} to begin with" if count <= seeds else f"chosen by {run.label}"
+    title = f"image {count} of {len(run.state.taken)}: {why}"
+    with matplotlib.rc_context(NO_GRID | {"font.size": 11}):
+        figure = new_figure(*SIZE, dpi=DPI)
+        orbit, render, map_ = figure.subplots(1, 3, width_ratios=(1, 1, 1))
+        figure.suptitle(title, fontsize=14, color=NEWEST)
+        eyes = np.array([frame.camera.position for frame in run.dataset.frames])
+        views = model.taken[:seeds], model.taken[seeds:]
+        draw_cameras(orbit, eyes, model.gaussians.means, *views, model.taken[-1])
+        orbit.set_xlabel("cameras, from above")
+        render.imshow(rgb[window], interpolation="nearest")
+        render.set_xlabel(f"render of a new view: {psnr(rgb, truth):.1f} dB")
+        image = show_map(map_, maps, "uncertainty", window, UNKNOWN, vmin=0, vmax=1)
+        map_.set_axis_on()
+        map_.set_xlabel(f"still unknown: {100 * _left(maps):.0f} %")
+        bar = figure.colorbar(image, ax=map_, shrink=0.7, aspect=14)
+        bar.set_ticks([0, 1], labels=["known", "unknown"])
+        for axis in (render, map_):
+            axis.set(xticks=[], yticks=[])
+            axis.spines[:].set_visible(False)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+    return np.ascontiguousarray(pixels[: pixels.shape[0] // 2 * 2, : pixels.shape[1] // 2 * 2])
+
+
+def draw_views(
+    out: Path,
+    gaussians: Gaussians,
+    views: Sequence[tuple[str, Camera]],
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    exr: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Draw a model through every camera; write one PNG for each into the folder `out`.
+
+    views: (path of the view's image, camera); a picture takes the name of the image (`file_names`).
+    background: sRGB in [0,1]. exr: write an OpenEXR file too, with linear R G B over the
+    background, opacity A and expected z-depth Z in metres, 0 where nothing is drawn. progress:
+    called as progress(views done, all). Raises InputError as `mgs.splat.render`, and if a file
+    cannot be written."""
+    from mgs.splat import as_drjit, render
+
+    model, linear = as_drjit(gaussians), gaussians.linear
+    behind = linear_from_srgb(background) if linear else np.asarray(background, np.float32)
+    names = file_names([path for path, _ in views])
+    for done, (name, (_, camera)) in enumerate(zip(names, views, strict=True)):
+        progress(done, len(views))
+        image = render(model, camera, behind.tolist())
+        rgb = np.asarray(image.rgb)
+        write_png(out / f"{name}.png", rgb, linear=linear)
+        if exr:
+            r, g, b = np.moveaxis(rgb if linear else linear_from_srgb(rgb), -1, 0)
+            alpha, depth = np.asarray(image.alpha), np.asarray(image.depth)
+            channels = {"R": r, "G": g, "B": b, "A": alpha, "Z": depth}
+            write_exr(out / f"{name}.exr", channels, camera)
+    progress(len(views), len(views))
+
+
+def file_names(paths: Sequence[str]) -> list[str]:
+    """File names without suffix for image paths; numbered if some are equal."""
+    stems = [Path(path).stem for path in paths]
+    if len(set(stems)) == len(stems):
+        return stems
+    return [f"{i:04d}_{stem}" for i, stem in enumerate(stems)]

@@ -12,8 +12,15 @@ from mgs.evaluation import render_view
 from mgs.files import write_json, write_text
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.reports import figures
-from mgs.reports.runs import check_measured, compare_runs, least_trained, step_curves
-from mgs.reports.tables import comparison_rows, markdown_table, table_cell
+from mgs.reports.tables import (
+    check_measured,
+    compare_runs,
+    comparison_rows,
+    least_trained,
+    markdown_table,
+    step_curves,
+    table_cell,
+)
 from mgs.run.folder import Run
 
 CHOICES = ("orbit", "gain", "coverage")  # figures of the chosen views

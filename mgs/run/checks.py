@@ -12,9 +12,8 @@ import numpy as np
 from mgs.data.frames import Frame
 from mgs.gaussians import Gaussians
 from mgs.run import detectors
-from mgs.run.directional import DIRECTIONAL_D
 from mgs.run.flight import views_left
-from mgs.run.policies import Policy
+from mgs.run.policies import DIRECTIONAL_D, Policy
 from mgs.run.settings import NbvSettings
 from mgs.scene import Scene, State
 

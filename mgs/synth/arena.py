@@ -3,8 +3,7 @@
 import numpy as np
 import trimesh
 
-from mgs.synth.noise import Noise, tile
-from mgs.synth.rock import rock_shape
+from mgs.synth.rock import Noise, rock_shape, tile
 from mgs.synth.scene_file import Arena, Lobe, Rock
 
 REACH = 400.0  # half the side of the square terrain, metres; its edge looks like the horizon

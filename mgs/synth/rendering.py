@@ -23,10 +23,9 @@ from mgs.data.dataset import (
     resumes,
     write_transforms,
 )
-from mgs.data.frames import Frame
+from mgs.data.frames import Frame, write_rock_image
 from mgs.data.masks import write_sheet
 from mgs.data.meshes import to_glb
-from mgs.data.rock_image import write_rock_image
 from mgs.errors import InputError, row_named
 from mgs.files import atomic_path, copy_file, fingerprint, folder_locked, reading, write_json
 from mgs.images import write_exr, write_png

@@ -12,7 +12,7 @@ import trimesh
 
 from mgs.camera import Camera
 from mgs.colour import linear_from_srgb
-from mgs.data.rock_image import boundary
+from mgs.data.frames import boundary
 from mgs.images import around
 from mgs.memory import padded
 from mgs.seeds import generator

@@ -235,8 +235,7 @@ def make_dataset(
 def make_survey(root: Path, out: Path, dataset: str, seed: int) -> dict[str, Any]:
     """Survey a dataset into OUT/survey, as `mgs survey` does. Returns the rms errors of the poses,
     metres and degrees."""
-    from mgs.survey.flight import SurveySettings, fly
-    from mgs.survey.folder import save_survey
+    from mgs.survey.flight import SurveySettings, fly, save_survey
 
     folder, data, settings = (
         out / "survey",
