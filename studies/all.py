@@ -30,7 +30,7 @@ STAGES = {
     "survey": ("survey", "--rocks", "8"),
     "parsimony": ("parsimony",),
     "chart": ("chart",),
-    "stress": ("stress",),
+    "stress": ("stress", "--rocks", "8"),
     "table1-paper": ("table1", "--scale", "paper", "--batch", "5"),
 }
 """Studies and their arguments by folder. Three need programs or data of others and are run by hand:

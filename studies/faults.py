@@ -13,15 +13,17 @@ import mgs
 from mgs.colour import linear_from_srgb, srgb_from_linear
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Captured(mgs.Frame):
-    """A frame with its pixels in memory. pixels: linear RGB [H,W,3]; rgba: the rock alone,
-    premultiplied [H,W,4]; z: depth [H,W], metres; rock: mask [H,W]."""
+    """A frame with its pixels in memory, equal to itself alone. pixels: linear RGB [H,W,3]; rgba:
+    the rock alone, premultiplied [H,W,4]; z: depth [H,W], metres; rock: mask [H,W]."""
 
     pixels: np.ndarray
     rgba: np.ndarray
     z: np.ndarray
     rock: np.ndarray
+
+    __hash__, __eq__ = object.__hash__, object.__eq__
 
     def rgb(self) -> np.ndarray:
         """Linear RGB [H,W,3]."""

@@ -1,33 +1,39 @@
 """Stress tests on small ellipsoids."""
 
-import json
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import synthetic
-from program import study
 
 from mgs.data.dataset import load_dataset
+from mgs.prior.build import load_prior
+from mgs.run.detectors import DETECTORS
 from studies import faults, stress
-from studies.frame.claim import Claim
-from studies.frame.output import Panel, read_rows
-from studies.frame.sweep import Cell
-from studies.stress import Experiment, open_lab
 
 FOLDERS = {"dataset": "dataset", "prior": "dataset/prior"}
 
 
-def test_detectors_are_judged_by_false_and_missed_alarms():
-    def rows(sign):
-        clean = {"run": "a", "size": 6, "fault": "none", "failed": False, "sign exposure": 0.01}
-        failed = {"run": "a", "size": 1, "fault": "exposure", "failed": True, "sign exposure": sign}
-        return [clean, failed, failed | {"failed": False}]
+def row(rock, fault, size, lost=0.0, warnings=None, kept=1.0):
+    about = {"part": "faults", "rock": rock, "scene": rock, "fault": fault, "size": size}
+    choices = {f"choice {name}": kept for name in stress.POLICIES}
+    return about | {"lost": lost, "warnings": warnings} | choices
 
-    assert (stress.caught(rows(9.0)), stress.caught(rows(0.0))) == ([1.0], [0.0])
-    assert stress.false_alarms(rows(9.0)) == [0.0]
-    noisy = [row | {"sign exposure": 9.0} for row in rows(9.0)]
-    assert stress.false_alarms(noisy + noisy) == [1.0], "a clean run of two experiments counts once"
+
+def test_tables_give_the_cost_and_the_warnings_of_each_size():
+    rows = [row(rock, "none", 0) for rock in "ab"]
+    for size, lost in ((0.1, 0.2), (0.3, 2.0), (1.0, 4.0)):
+        rows.append(row("a", "exposure", size, lost, "exposure" if lost > 1 else None, 0.5))
+        rows.append(row("b", "exposure", size, lost + 1, "exposure" if lost > 2 else None))
+    few = {"part": "few_views", "views": 2, "means": "free", "psnr": 30.0, "over": -0.5}
+    rows += [few | {"scene": scene, "moved": 0.5, "tau": 0.9} for scene in "ab"]
+    of_faults, of_warnings, of_views = stress.tables(rows).split("\n\n")
+    cells = [cell.strip() for cell in of_faults.splitlines()[-1].split("|")[1:-1]]
+    sizes = ["exposure", "0.1 / 0.3 / 1 stops", "0.7 / 2.5 / 4.5"]
+    assert cells[:3] == sizes
+    assert cells[3].startswith("2.5 [")
+    assert cells[4:] == ["0 / 1 / 2", "exposure", *["75% / 75% / 75%"] * 2]
+    counts = [line.split("|")[2:4] for line in of_warnings.splitlines()[2:]]
+    assert [[int(n) for n in line] for line in counts] == [[2, 0], [1, 0], [5, 3]]
+    assert "-0.50" in of_views
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +44,6 @@ def root(tmp_path_factory):
     cameras = synthetic.orbit_cameras(3, 48, 36, altitude=2.0)
     synthetic.write_dataset(folder / "dataset/test", cameras)
     return folder
-
-
-@pytest.fixture
-def lab(root):
-    return open_lab(root / "dataset", root / "dataset/prior")
 
 
 @pytest.mark.parametrize("name", faults.IMAGE_FAULTS)
@@ -65,9 +66,9 @@ def test_a_fault_of_images_is_a_pure_function_that_grows_with_its_size(root, nam
 
 
 @pytest.mark.parametrize("name", faults.PRIOR_FAULTS)
-def test_a_fault_of_the_prior_leaves_the_prior_as_it_was(lab, name):
+def test_a_fault_of_the_prior_leaves_the_prior_as_it_was(root, name):
     function, sizes, _ = faults.PRIOR_FAULTS[name]
-    prior = lab.prior
+    prior = load_prior(root / "dataset/prior")
     before, moved = prior.points.copy(), []
     for size in sizes:
         spoiled = function(prior, size, np.random.default_rng(1))
@@ -78,66 +79,25 @@ def test_a_fault_of_the_prior_leaves_the_prior_as_it_was(lab, name):
     assert np.array_equal(prior.points, before)
 
 
-def test_even_views_turn(lab):
-    assert lab.even(5) == [0, 2, 4, 6, 8]
-    assert sorted(lab.even(5, 0.5)) == [1, 3, 5, 7, 9]
-
-
 def test_fits_are_measured(root):
-    rows = stress.free_means(root, root, "rock", **FOLDERS, turns_=1, counts=[4])["rows"]
+    rows = stress.few_views(root, root, **FOLDERS, counts=[4])["rows"]
     by = {row["means"]: row for row in rows}
-    assert by["frozen"]["drift"] == 0 < by["free"]["drift"]
+    assert by["frozen"]["moved"] == 0 < by["free"]["moved"]
     assert by["frozen"]["tau"] == by["frozen, no prior"]["tau"] == pytest.approx(1)
 
 
-def test_faults_are_measured_against_the_clean_run(root, monkeypatch):
-    monkeypatch.setattr(stress, "PRIOR_FAULTS", {"shifted prior": (faults.shifted, (0.4,), "")})
-    monkeypatch.setattr(stress, "IMAGE_FAULTS", {"image noise": (faults.image_noise, (0.3,), "")})
-    how = {"scene": "rock", **FOLDERS, "repeats": 1}
-    rows = stress.faults(root, root, **how, kinds="prior", others=[FOLDERS])
-    clean, shifted, same = rows["rows"]
-    assert (clean["fault"], clean["lost"], clean["failed"]) == ("none", 0, False)
-    assert shifted["lost"] > stress.FAILURE
-    assert shifted["failed"]
-    assert same["lost"] == 0, "the prior of the same rock"
-    rows = stress.faults(root, root, **how, kinds="images", others=[])
-    kinds = [row["fault"] for row in rows["rows"]]
-    few, free = ["few passes"] * 3, ["none", "free means"] * 2
-    assert kinds == ["none", "image noise", *few, *free, *["one bad pose"] * 2]
-
-
-CALLS = []
-
-
-def toy(root, out, scene, lift):
-    """Task with one row per run."""
-    CALLS.append(scene)
-    rows = [{"run": f"{scene}, {k}", "kind": "a", "x": lift + k / 10} for k in (0, 1)]
-    return {"rows": rows}
-
-
-def test_a_run_writes_its_files_continues_and_keeps_earlier_experiments(tmp_path, capsys):
-    def experiment(name, lift):
-        task = "test_stress:toy"
-        cells = [Cell(f"{name}/{s}", task, {"scene": s, "lift": lift}) for s in "ab"]
-        claim = Claim("It is so.", lambda rows: [r["x"] for r in rows], "dB", "above", 1.0)
-        panels = (Panel("kind", "x", "kind", "x"),)
-        return Experiment("Is it so?", lambda size: cells, (claim,), panels)
-
-    table = {"one": experiment("one", 2.0), "two": experiment("two", 0.0)}
-    size = replace(stress.SIZES["quick"], experiments=table)
-    CALLS.clear()
-
-    def verdicts(*arguments):
-        study("stress", tmp_path / "out", *arguments, sizes={"quick": size})
-        found = json.loads((tmp_path / "out/verdicts.json").read_text())["experiments"]
-        return [(one["name"], one["claims"][0]["verdict"]) for one in found]
-
-    assert verdicts("--only", "one") == [("one", "holds")]
-    assert verdicts("--only", "two") == [("one", "holds"), ("two", "fails")]
-    assert "| It is so. | **holds** | 2.05 (" in capsys.readouterr().out
-    assert verdicts() == [("one", "holds"), ("two", "fails")]
-    assert CALLS == ["a", "b", "a", "b"]
-    assert len(read_rows(tmp_path / "out/stability.csv")) == 8
-    assert "| It is so. | **holds** | 2.05 (" in (tmp_path / "out/stability.md").read_text()
-    assert (tmp_path / "out/one.png").is_file()
+def test_faults_are_measured_against_the_fit_without(root):
+    lab = stress.Lab(root, **FOLDERS)
+    shifted = faults.shifted(lab.prior, 0.4, lab.rng("shifted prior", 0.4))
+    lab.add("shifted prior", 0.4, shifted)
+    lab.add(stress.ANOTHER, 0, load_prior(root / FOLDERS["prior"]))
+    blurred = lab.spoiled(faults.defocus, 2.0, lab.taken, "defocus")
+    lab.add("defocus", 2.0, frames=blurred)
+    clean, moved, same, soft = lab.rows
+    assert clean["lost"] == same["lost"] == 0, "the prior of the same rock"
+    assert moved["lost"] > stress.FAILURE
+    assert moved["sign prior"] > DETECTORS["prior"].limit > clean["sign prior"]
+    assert soft["lost"] > 0.1
+    for one in lab.rows:
+        assert all(0 < one[f"choice {name}"] <= 1 for name in stress.POLICIES)
+    assert clean["choice d-optimal"] == soft["choice directional-i"] == 1, "no image, no change"

@@ -1,6 +1,6 @@
 """Draw the figures of docs/results again from the rows beside them.
 
-python tools/figures.py [NAME ...]     # chart, parsimony, setups, prior-faults; default: all
+python tools/figures.py [NAME ...]     # chart, parsimony, setups, stress; default: all
 """
 
 import csv
@@ -9,9 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from studies import chart, parsimony, setups
-from studies.frame.output import draw_panels
-from studies.stress import LOST, label_of
+from studies import chart, parsimony, setups, stress
 
 RESULTS = Path(__file__).parent.parent / "docs/results"
 
@@ -42,16 +40,11 @@ def _chart(path: Path, rows: Rows) -> None:
     chart.draw(path, {k: [{"preset": ""} | row for row in rows] for k, rows in kinds.items()})
 
 
-def _faults(path: Path, rows: Rows) -> None:
-    labelled = [row | {"label": label_of(row["fault"], row["size"])} for row in rows]
-    draw_panels(path, [LOST], labelled)
-
-
 FIGURES: Mapping[str, tuple[str, Callable[[Path, Rows], None]]] = {
     "chart": ("chart/fit", _chart),
     "parsimony": ("parsimony/parsimony", parsimony.draw),
     "setups": ("setups/setups", setups.draw),
-    "prior-faults": ("stress/prior-faults", _faults),
+    "stress": ("stress/stress", stress.draw),
 }
 """Figures by name: file below RESULTS without its ending, and the function that draws its rows."""
 
