@@ -17,10 +17,11 @@ import mgs
 from mgs import Prior, load_cameras, load_dataset, open_run
 from mgs.camera import Camera, heading_and_pitch, look_at
 from mgs.data import flight_plan
+from mgs.data.clouds import SparseCloud, write_cloud
 from mgs.data.meshes import distances_to_mesh
 from mgs.data.world import World, unit_up
 from mgs.reports.suggestion import write_suggestion
-from mgs.run.candidates import Site, inside, place_poses, read_poses
+from mgs.run.candidates import Site, hidden, inside, place_poses, read_poses
 from mgs.run.suggest import coarse_prior, suggest
 
 
@@ -116,6 +117,28 @@ def test_candidates_of_one_pose_are_one_and_those_that_see_nothing_none(run, sit
         ("sees nothing of the object", 1),
         ("the same as one before", 1),
     ]
+
+
+def test_places_behind_a_wall_are_left_out(run, site):
+    """Images of a wall and a ball before it: a place counts as behind where all say so."""
+    across = np.stack(np.meshgrid(*[np.linspace(-4, 4, 60)] * 2), -1).reshape(-1, 2)
+    wall = np.insert(across, 1, 3.0, axis=1)
+    ball = np.random.default_rng(0).normal(size=(400, 3))
+    ball = 0.5 * ball / np.linalg.norm(ball, axis=1)[:, None] - [0, 1, 0]
+    taken = [synthetic.pinhole(50, 64, 48, [x, -4, 0]) for x in (-3, 0, 3)]
+    eyes = {"behind": [0, 4, 0], "before": [1.5, 2, 0], "by the ball": [0, 2, 0], "out": [9, 4, 0]}
+    eyes = np.array(list(eyes.values()), float)
+    assert hidden(eyes, taken, np.concatenate([wall, ball])).tolist() == [True, *[False] * 3]
+    assert not hidden(eyes, taken[:1], wall).any()
+    assert not hidden(eyes, taken, None).any()
+    opened = open_run(run)
+    cloud = opened.dataset.root / "sparse.ply"
+    write_cloud(cloud, SparseCloud(wall * [1, -0.4, 1]))
+    found = suggest(opened, place_poses("ring", 12, 2, (0, 4), site))
+    cloud.unlink()
+    assert found.dropped["behind what the images show"] >= 2
+    assert len(found.ranking) + sum(found.dropped.values()) == 12
+    assert not any(255 < view.azimuth < 285 for view in found.ranking)
 
 
 def test_gains_of_a_model_without_a_surface_are_no_guide(run, monkeypatch, capsys):

@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mgs.camera import Camera, look_at
 from mgs.data.clouds import towards
 from mgs.data.dataset import finite_number, load_cameras
 from mgs.data.frames import Frame
 from mgs.data.meshes import Mesh, distances_to_mesh
+from mgs.data.visibility import in_image
 from mgs.data.world import UPRIGHT, Thing, World
 from mgs.errors import InputError
 from mgs.files import read_csv
@@ -29,6 +31,9 @@ COLUMNS = ("name", *POSITION, *TARGET, *QUATERNION)
 
 MOST_POSES = 5000  # candidates: each is drawn, and the legs between all are compared
 SAME_PLACE, SAME_VIEW = 1e-3, 1.0  # share of the distance, and degrees: counts as taken
+# Points of an image that say how deep it sees at a pixel: at most so far away, over its width, and
+# on all sides. Images in which a place is judged by them. Chosen constants.
+AROUND, REACH, WITNESSES = 32, 0.2, 2
 FELT = 0.05  # least move that is named, over the distance from the object; as an angle, radians
 
 Named = tuple[str, Camera]
@@ -38,11 +43,13 @@ Named = tuple[str, Camera]
 class Site:
     """The object, and the camera that looks at it.
 
-    like: camera whose intrinsics candidates have by default. world: of files of poses."""
+    like: camera whose intrinsics candidates have by default. world: of files of poses. points:
+    triangulated from the images [N,3], if they are known."""
 
     prior: Prior
     like: Camera
     world: World = UPRIGHT
+    points: NDArray[np.float64] | None = None
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -205,6 +212,30 @@ def inside(mesh: Mesh, points: np.ndarray) -> NDArray[np.bool_]:
     return within
 
 
+def hidden(
+    eyes: np.ndarray, taken: Sequence[Camera], points: np.ndarray | None
+) -> NDArray[np.bool_]:
+    """Whether places [M,3] lie behind a wall: behind the points [N,3] around them in every image
+    that has them in view, WITNESSES or more. An object in front hides a place in some images."""
+    judges, behind = np.zeros((2, len(eyes)), int)
+    if points is None:
+        return judges > 0
+    for camera in taken:
+        (pixels, depth), (places, far) = camera.project(points), camera.project(eyes)
+        seen, here = in_image(camera, pixels, depth), in_image(camera, places, far)
+        if seen.sum() < AROUND or not here.any():
+            continue
+        apart, near = cKDTree(pixels[seen]).query(places[here], AROUND)
+        right, below = np.moveaxis(pixels[seen][near] > places[here][:, None], 2, 0)
+        close = apart < REACH * camera.width
+        sides = [(close & (right == x) & (below == y)).any(1) for x in (0, 1) for y in (0, 1)]
+        views = np.flatnonzero(here)[np.all(sides, 0)]
+        judges[views] += 1
+        middle = np.nanmedian(np.where(close, depth[seen][near], np.nan)[np.all(sides, 0)], axis=1)
+        behind[views] += middle < far[views]
+    return (judges >= WITNESSES) & (behind == judges)
+
+
 def refusals(
     poses: Sequence[Named],
     taken: Sequence[Camera],
@@ -230,6 +261,7 @@ def refusals(
     reasons = {
         "inside the object": within,
         f"nearer to it than {safe_distance:.3g}": near,
+        "behind what the images show": hidden(eyes, taken, site.points),
         f"not between {low:g} and {high:g} degrees": beyond,
         "taken already": _are_taken(poses, taken, far),
         "the same as one before": [keys.index(key) < k for k, key in enumerate(keys)],

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from mgs.camera import Camera
 from mgs.colour import SH_C0
+from mgs.data.clouds import read_cloud
 from mgs.data.frames import Frame
+from mgs.data.structure import CLOUD
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.learning import information, surface_information
@@ -113,7 +115,10 @@ def suggest(
         raise InputError(f"{run.folder}: its policy is a program, {own}; name it with `policy`")
     settings |= {} if policy is None else {"policy": name_of(policy)}
     images = taken_in_order(run)
-    site, taken = Site(run.prior, images[-1].camera), [frame.camera for frame in images]
+    cloud = run.dataset.root / CLOUD
+    points = read_cloud(cloud).upright(run.dataset.world).points if cloud.is_file() else None
+    site = Site(run.prior, images[-1].camera, points=points)
+    taken = [frame.camera for frame in images]
     why = refusals(poses, taken, site, safe_distance, elevations)
     flyable = [pose for pose, reason in zip(poses, why, strict=True) if not reason]
     dropped = {reason: why.count(reason) for reason in dict.fromkeys(why) if reason}
