@@ -1,4 +1,5 @@
-"""Cameras of other programs: OpenSfM and ODM, Bundler, LLFF, MVSNet, 3D Gaussian Splatting.
+"""Cameras of other programs: Metashape, OpenSfM and ODM, Bundler, LLFF, MVSNet, 3D Gaussian
+Splatting.
 
 Each reader turns the program's axes into those of `Camera`: x right, y down, z forward."""
 
@@ -21,7 +22,7 @@ from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, find_image, frame_nam
 from mgs.data.tracks import ROUNDED, orthonormal
 from mgs.data.world import PLUS_Z
 from mgs.errors import InputError
-from mgs.files import parsing, read_bytes, read_json, read_text
+from mgs.files import parsing, read_bytes, read_json, read_text, read_xml
 from mgs.images import image_size
 
 OPENSFM = {  # projections of OpenSfM and COLMAP's model of the same formula
@@ -47,19 +48,73 @@ class View(NamedTuple):
 
 
 class Contents(NamedTuple):
-    """Cameras and points [N,3] of a file. track: images of each point [N]."""
+    """Cameras and points [N,3] of a file. track: images of each point [N]. world: up and unit, as
+    of `Source`, where the file says them. left_out: numbers of other images, by reason."""
 
     views: list[View]
     points: Sequence[Any] = ()
     track: Sequence[int] | None = None
-    metric: bool = False
+    world: Mapping[str, Any] = MappingProxyType({})
     notes: tuple[str, ...] = ()
+    left_out: Mapping[str, int] = MappingProxyType({})
 
 
 def _matrix(rotation: Any, translation: Any) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = np.reshape(rotation, (3, 3)), np.reshape(translation, 3)
     return pose
+
+
+METASHAPE = {"frame": "OPENCV", "fisheye": "THIN_PRISM_FISHEYE"}  # as OPENSFM
+
+
+def _metashape(path: Path, folders: list[Path]) -> Contents:
+    """Agisoft Metashape (File, Export, Cameras: XML): aligned and enabled cameras. Lengths are
+    metres where the chunk has a scale. Position and north of a georeferenced chunk are left out. K
+    has its origin in the middle of the image, and p1 and p2 are OpenCV's p2 and p1 (its manual,
+    appendix D)."""
+    chunk, views, left_out = read_xml(path).find("chunk"), list[View](), Counter[str]()
+    if chunk is None:
+        raise ValueError("no chunk")
+    lenses = {lens.get("id"): lens for lens in chunk.iterfind("sensors/sensor")}
+    scale = chunk.find("transform/scale")
+    factor = 1.0 if scale is None else float(scale.text or "")
+    for camera in chunk.iterfind("cameras//camera"):
+        if camera.find("transform") is None:
+            left_out["not aligned"] += 1
+        elif camera.get("enabled", "true") in ("false", "0"):
+            left_out["disabled"] += 1
+        else:
+            label, numbers = camera.get("label") or "", camera.find("transform").text.split()
+            pose = np.array([float(number) for number in numbers]).reshape(4, 4)
+            pose[:3, 3] *= factor
+            where, lens = f"{path}: camera {label}", lenses[camera.get("sensor_id")]
+            views.append(View(label, np.linalg.inv(pose), *_metashape_lens(where, lens)))
+    world = {} if scale is None else {"unit": "m"}
+    return Contents(views, world=world, left_out=left_out)
+
+
+def _metashape_lens(where: str, lens: Any) -> tuple[Any, ...]:
+    """Fields of `View` from `focal` on."""
+    model = METASHAPE.get(lens.get("type", "frame"))
+    if model is None:
+        raise InputError(
+            f"{where} is of type {lens.get('type')}, and only {' and '.join(METASHAPE)} are "
+            "supported; export undistorted photographs"
+        )
+    adjusted = lens.find("calibration[@class='adjusted']")
+    calibration = lens.find("calibration") if adjusted is None else adjusted
+    size = lens.find("resolution") if calibration is None else calibration.find("resolution")
+    if calibration is None or size is None:
+        raise InputError(f"{where} has no calibration; align the photographs first")
+    value = {one.tag: float(one.text) for one in calibration if one.tag != "resolution"}
+    if value.get("b2") or (value.get("k4") and model == "OPENCV"):
+        raise InputError(f"{where} has b2 or k4; align without them")
+    width, height, f = int(size.get("width")), int(size.get("height")), value["f"]
+    centre = width / 2 + value.get("cx", 0.0), height / 2 + value.get("cy", 0.0)
+    keys = {"k1": "k1", "k2": "k2", "k3": "k3", "k4": "k4", "p1": "p2", "p2": "p1"}
+    coefficients = {ours: value.get(theirs, 0.0) for ours, theirs in keys.items()}
+    return (f + value.get("b1", 0.0), f), (width, height), centre, model, coefficients
 
 
 def _opensfm(path: Path, folders: list[Path]) -> Contents:
@@ -93,7 +148,8 @@ def _opensfm(path: Path, folders: list[Path]) -> Contents:
     others = [len(one["shots"]) for one in parts if one is not part]
     note = f"took the largest part, of {len(views)} images; others have {others}"
     points = [point["coordinates"] for point in part.get("points", {}).values()]
-    return Contents(views, points, None, metric, (note,) if others else ())
+    world = {"up": PLUS_Z, "unit": "m"} if metric else {}
+    return Contents(views, points, None, world, (note,) if others else ())
 
 
 def _bundler(path: Path, folders: list[Path]) -> Contents:
@@ -173,6 +229,7 @@ def _splatting(path: Path, folders: list[Path]) -> Contents:
 
 
 PEERS: dict[str, tuple[tuple[str, ...], Callable[[Path, list[Path]], Contents]]] = {
+    "Metashape": ((".xml",), _metashape),
     "OpenSfM": (("reconstruction.json", "opensfm/reconstruction.json"), _opensfm),
     "Bundler": (("bundle.out", "bundle/bundle.out"), _bundler),
     "LLFF": (("poses_bounds.npy",), _llff),
@@ -186,7 +243,7 @@ def _file_of(kind: str, source: Path) -> Path | None:
     """File of cameras that a path names, or that its folder holds beside no other poses."""
     names = PEERS[kind][0]
     if source.is_file():
-        fits = "." in names[0] and source.name.endswith(names[0]) and not _is_object(source)
+        fits = "." in names[0] and source.name.lower().endswith(names[0]) and not _is_object(source)
         return source if fits else None
     if any(source.glob("transforms*.json")) or models_in(source):
         return None
@@ -219,6 +276,7 @@ def read_peer(kind: str, source: Path, images: Path | None, *_: Any) -> Source:
     with parsing(path, f"file of {kind}", "export it again"):
         contents = PEERS[kind][1](path, folders)
         shots, left_out, rounded = list[Shot](), Counter[str](), 0
+        left_out.update(contents.left_out)
         for view in contents.views:
             at = _image(view.name, folders)
             if at is None:
@@ -233,8 +291,7 @@ def read_peer(kind: str, source: Path, images: Path | None, *_: Any) -> Source:
             raise ValueError("points that are not finite")
     notes = (*contents.notes, *([f"{rounded} {ROUNDED}"] if rounded else []))
     sparse = SparseCloud(points, track=track) if len(points) > 1 else None
-    world = {"up": PLUS_Z, "unit": "m"} if contents.metric else {}
-    return Source(kind, shots, left_out, notes, sparse, **world)  # type: ignore[arg-type]
+    return Source(kind, shots, left_out, notes, sparse, **contents.world)
 
 
 def _image(name: str, folders: list[Path]) -> tuple[Path, str] | None:

@@ -16,7 +16,6 @@ from mgs.data.clouds import read_cloud
 from mgs.data.colmap import models_in, read_colmap
 from mgs.data.dataset import finite_number, posed_camera, read_records, timestamp_of, unit_of
 from mgs.data.lens import Lens
-from mgs.data.metashape import is_metashape, read_metashape
 from mgs.data.peers import PEERS, is_peer, read_peer
 from mgs.data.photographs import KIND as PHOTOGRAPHS
 from mgs.data.photographs import (
@@ -64,10 +63,6 @@ RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
     "TUM RGB-D": (is_tum, lambda path, _, spacing, *__: read_tum(path, spacing)),
     "Open3D": (is_open3d, lambda path, _, spacing, *__: read_open3d(path, spacing)),
     "RTAB-Map": (is_rtabmap, lambda path, _, spacing, *__: read_rtabmap(path, spacing)),
-    "Metashape": (
-        is_metashape,
-        lambda path, images, *_: read_metashape(path, images or path.parent / "images"),
-    ),
     **{kind: (partial(is_peer, kind), partial(read_peer, kind)) for kind in PEERS},
 }
 
