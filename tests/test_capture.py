@@ -20,7 +20,7 @@ from mgs.synth import arena, rendering
 from mgs.synth.capture import capture_of
 from mgs.synth.rendering import PoseNoise, RenderPreset, synth_orbit
 from mgs.synth.scene_file import Arena, Rock, SceneFile
-from mgs.view.subject import read_subject
+from mgs.view.layers import read_subject
 
 TINY = RenderPreset(width=64, height=48, frames=8, spp=2)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=0))

@@ -38,7 +38,7 @@ from mgs.run.candidates import Site, read_poses, refusals
 from mgs.splat_files import load_gaussians
 from mgs.splat_ply import read_ply, write_compressed_ply, write_ply
 from mgs.synth.scene_file import load_scene_file
-from mgs.view.subject import read_subject
+from mgs.view.layers import read_subject
 from studies.frame.sweep import Cell, result_of
 
 FLOATS = (float("nan"), float("inf"), -1.0, 0.0, 1e-300)

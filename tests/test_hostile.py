@@ -28,7 +28,7 @@ from mgs.run.checks import predicted_psnr
 from mgs.run.detectors import alarms
 from mgs.run.folder import open_run, text_of
 from mgs.run.records import Record, checked
-from mgs.view.subject import read_subject
+from mgs.view.layers import read_subject
 from studies.frame.output import write_csv
 
 

@@ -19,7 +19,7 @@ from mgs.run import folder as run_folder
 from mgs.run.nbv import run_nbv, start_run
 from mgs.run.settings import NbvSettings
 from mgs.splat import MEANS, as_drjit, fisher, groups, render
-from mgs.view.subject import SCALARS, read_subject
+from mgs.view.layers import SCALARS, read_subject
 
 N, SPACING = 300, (4 * np.pi / 300) ** 0.5
 

@@ -26,8 +26,8 @@ from synthetic import pinhole
 from mgs import Camera, Run, evaluate_run, load_dataset, look_at, open_run, render, write_ply
 from mgs.colour import srgb_from_linear
 from mgs.view import layers
+from mgs.view.layers import read_subject, scaled
 from mgs.view.server import FILLED, Viewer, window_camera
-from mgs.view.subject import read_subject, scaled
 
 
 def steps(run, budget):

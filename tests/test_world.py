@@ -24,7 +24,7 @@ from mgs.files import write_json
 from mgs.reports import diagnostics
 from mgs.splat_files import load_gaussians
 from mgs.view import layers
-from mgs.view.subject import read_subject
+from mgs.view.layers import read_subject
 
 TILTED = World(unit_up([0.3, -0.8, 0.2]), "unit")
 WORLDS = UPRIGHT, TILTED

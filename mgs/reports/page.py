@@ -19,21 +19,19 @@ from mgs.notebook import data_uri
 from mgs.plotting import crop, painted
 from mgs.policy.criteria import GAIN_UNIT, uncertainty
 from mgs.reports.diagnostics import VISIBLE, view_maps
-from mgs.reports.page_facts import (
-    links,
-    measured,
-    measured_views,
-    notes,
-    psnr_of,
-    setting_rows,
-    step_facts,
-    summary_rows,
-)
 from mgs.reports.page_plots import (
     METRIC_NAMES,
     curve_plot,
     line_plot,
+    links,
+    measured,
+    measured_views,
+    notes,
     orbit_plot,
+    psnr_of,
+    setting_rows,
+    step_facts,
+    summary_rows,
     timing_plot,
     views_plot,
 )

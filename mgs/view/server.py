@@ -18,7 +18,7 @@ from mgs.errors import InputError
 from mgs.reports.page_plots import FRUSTUM
 from mgs.view import layers
 from mgs.view.access import Access, bound_socket, plain
-from mgs.view.subject import View, read_subject
+from mgs.view.layers import View, read_subject
 
 REST = 0.2  # seconds without movement after which a camera counts as resting
 FOLLOW = 1.0  # seconds between two checks of the run folder
