@@ -12,7 +12,7 @@ import secrets
 import shutil
 import stat
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -175,6 +175,25 @@ def write_text(path: str | Path, text: str) -> None:
 
 LARGEST = 1 << 25  # most bytes of a text file that is read whole: 30,000 frames of transforms.json
 LARGEST_TOML, LONGEST_LINE = 1 << 16, 1 << 12  # bytes of a file, a line: a.a.a = 1 takes cubic time
+
+
+def write_columns(
+    path: str | Path,
+    elements: Mapping[str, Mapping[str, tuple[Any, str]]],
+    comments: Sequence[str] = (),
+) -> None:
+    """Write a binary PLY, atomically. elements: the properties of each, name -> (values [N], type
+    of NumPy). Raises InputError if it cannot be written."""
+    import numpy as np
+    from plyfile import PlyData, PlyElement
+
+    tables = []
+    for element, columns in elements.items():
+        layout = [(name, kind) for name, (_, kind) in columns.items()]
+        table = np.rec.fromarrays([values for values, _ in columns.values()], dtype=layout)
+        tables.append(PlyElement.describe(table, element))
+    with atomic_path(path) as temporary:
+        PlyData(tables, byte_order="<", comments=list(comments)).write(str(temporary))
 
 
 def read_bytes(path: str | Path, what: str = "file", most: int = LARGEST) -> bytes:

@@ -11,13 +11,13 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile
 
 import numpy as np
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 from scipy.spatial import cKDTree
 from scipy.special import expit, logit
 
 from mgs.colour import SH_C0
 from mgs.errors import InputError
-from mgs.files import atomic_path, parsing, reading
+from mgs.files import parsing, reading, write_columns
 from mgs.gaussians import Gaussians
 from mgs.splat_places import settled
 
@@ -60,20 +60,13 @@ def write_ply(
     opacity, normals = np.reshape(g.logit_opacities, (n, 1)), np.zeros((n, 3))
     parts = [g.means, normals, g.sh[:, 0, :], rest, opacity, g.log_scales, g.quats]
     columns = np.concatenate(parts, axis=1).astype(np.float32)
-    marks = marks or {}
-    wide = names[:3] if any(g.origin) else []
-    types = [(name, "f8" if name in wide else "f4") for name in names]
-    vertices = np.empty(n, dtype=types + [(name, "u1") for name in marks])
-    for i, name in enumerate(names):
-        vertices[name] = columns[:, i]
-    for name, first in zip(wide, g.origin, strict=False):
-        vertices[name] += first
-    for name, mask in marks.items():
-        vertices[name] = mask
+    vertices = {name: (values, "f4") for name, values in zip(names, columns.T, strict=True)}
+    if any(g.origin):
+        places = columns[:, :3].astype(np.float64) + g.origin
+        vertices |= {name: (places[:, i], "f8") for i, name in enumerate("xyz")}
+    vertices |= {name: (mask, "u1") for name, mask in (marks or {}).items()}
     comments = [LINEAR_COMMENT] * g.linear + [ANTIALIASED_COMMENT] * gaussians.antialiased
-    ply = PlyData([PlyElement.describe(vertices, "vertex")], comments=comments)
-    with atomic_path(path) as temporary:
-        ply.write(str(temporary))
+    write_columns(path, {"vertex": vertices}, comments)
 
 
 def read_ply(path: str | Path) -> Gaussians:
@@ -258,7 +251,7 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
     g = gaussians[cKDTree(gaussians.means, leafsize=CHUNK).indices]
     n, rest = len(g), 3 * (g.sh.shape[1] - 1)
     starts = np.arange(0, n, CHUNK)
-    chunk_types, chunk_columns, shares = [], [], []
+    chunks, shares = dict[str, tuple[np.ndarray, str]](), []
     groups = (
         ("", "xyz", g.means),
         ("scale_", "xyz", g.log_scales),
@@ -267,8 +260,8 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
     for prefix, names, values in groups:
         low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
         for end, bound in (("min", low), ("max", high)):
-            chunk_types += [(f"{end}_{prefix}{name}", "<f4") for name in names]
-            chunk_columns += list(bound.T)
+            columns = zip(names, bound.T, strict=True)
+            chunks |= {f"{end}_{prefix}{name}": (column, "f4") for name, column in columns}
         first, span = (np.repeat(part, CHUNK, 0)[:n] for part in (low, high - low))
         shares.append((values - first) / np.where(span > 0, span, 1))
     colour = np.column_stack([shares[2], g.opacities])
@@ -278,25 +271,13 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
         _packed(shares[1], (11, 10, 11)),
         _packed(colour, (8, 8, 8, 8)),
     ]
-    tables = {
-        "chunk": _table(chunk_types, chunk_columns),
-        "vertex": _table([(name, "<u4") for name in PACKED], words),
-    }
+    packed = {name: (word, "u4") for name, word in zip(PACKED, words, strict=True)}
+    elements = {"chunk": chunks, "vertex": packed}
     if rest:
         higher = np.transpose(g.sh[:, 1:], (0, 2, 1)).reshape(n, rest)
         steps = np.clip(np.floor((higher / 8 + 0.5) * 256), 0, 255)
-        tables["sh"] = _table([(f"f_rest_{i}", "u1") for i in range(rest)], list(steps.T))
-    elements = [PlyElement.describe(table, name) for name, table in tables.items()]
-    comments = [ANTIALIASED_COMMENT] * gaussians.antialiased
-    with atomic_path(path) as temporary:
-        PlyData(elements, byte_order="<", comments=comments).write(str(temporary))
-
-
-def _table(types: list[tuple[str, str]], columns: list[np.ndarray]) -> np.ndarray:
-    rows = np.empty(len(columns[0]), types)
-    for (name, _), column in zip(types, columns, strict=True):
-        rows[name] = column
-    return rows
+        elements["sh"] = {f"f_rest_{i}": (step, "u1") for i, step in enumerate(steps.T)}
+    write_columns(path, elements, [ANTIALIASED_COMMENT] * gaussians.antialiased)
 
 
 def _packed(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 
 from mgs.camera import Camera
 from mgs.data.visibility import in_image
 from mgs.data.world import World
 from mgs.errors import InputError
-from mgs.files import atomic_path, parsing, reading
+from mgs.files import parsing, reading, write_columns
 
 FIELDS = ("x", "y", "z", "nx", "ny", "nz", "track", "error")
 NEAREST_SHARE = 0.25  # share of cameras with a point in view taken to have seen it, nearest first
@@ -52,11 +52,7 @@ def write_cloud(path: str | Path, cloud: SparseCloud) -> None:
         columns |= {name: cloud.views[:, k] for k, name in enumerate(("nx", "ny", "nz"))}
     extra = {"track": cloud.track, "error": cloud.error}
     columns |= {name: value for name, value in extra.items() if value is not None}
-    table = np.empty(len(cloud.points), [(name, "f4") for name in columns])
-    for name, value in columns.items():
-        table[name] = value
-    with atomic_path(path) as temporary:
-        PlyData([PlyElement.describe(table, "vertex")]).write(str(temporary))
+    write_columns(path, {"vertex": {name: (value, "f4") for name, value in columns.items()}})
 
 
 def read_cloud(path: str | Path) -> SparseCloud:

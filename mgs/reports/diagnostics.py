@@ -14,7 +14,7 @@ from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.evaluation import render_view
-from mgs.files import atomic_path
+from mgs.files import write_columns
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr
 from mgs.policy import criteria
@@ -90,7 +90,6 @@ def write_information_ply(
     Colours show the information, from 0 to its largest value (colour map viridis). Dots in names
     become underscores. scalars: name -> [N]. Raises InputError if the file cannot be written."""
     import matplotlib
-    from plyfile import PlyData, PlyElement
 
     information = scalars["information"]
     share = information / max(float(information.max(initial=0)), 1e-30)
@@ -98,10 +97,7 @@ def write_information_ply(
     columns = {axis: (gaussians.means[:, i], "f4") for i, axis in enumerate("xyz")}
     columns |= {name: (rgb[:, i], "u1") for i, name in enumerate(("red", "green", "blue"))}
     columns |= {name.replace(".", "_"): (values, "f4") for name, values in scalars.items()}
-    layout = [(name, kind) for name, (_, kind) in columns.items()]
-    vertices = np.rec.fromarrays([values for values, _ in columns.values()], dtype=layout)
-    with atomic_path(path) as temporary:
-        PlyData([PlyElement.describe(vertices, "vertex")]).write(str(temporary))
+    write_columns(path, {"vertex": columns})
 
 
 PANELS = {
