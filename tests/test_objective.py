@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from refusals import fails
 from scipy.ndimage import correlate1d
+from splat.scenes import cameras_around
 
-from mgs import Camera, TrainSettings, fit_gaussians, look_at
+from mgs import TrainSettings, fit_gaussians
 from mgs.colour import srgb_from_linear
 from mgs.fit.losses import LOSSES, similarity
 from mgs.fit.objective import objective
@@ -41,10 +42,7 @@ def case(request):
     offsets = 0.02 * rng.standard_normal((N, MEANS[means]))
     if means == "free":
         model.means = (start.means + offsets).astype(np.float32)
-    first = surface_camera(start, 24, 20)
-    distance = np.linalg.norm(first.position)
-    eyes = [distance * np.array([np.cos(a), np.sin(a), 0.4]) for a in (0.3, 2.0)]
-    cameras = [Camera(first.K, 24, 20, look_at(eye, [0, 0, 0.4])) for eye in eyes]
+    cameras = cameras_around(start, (0.3, 2.0), 24, 20)
     channels = 4 if alpha_weight else 3
     truths = [rng.uniform(0, 1, (20, 24, channels)).astype(np.float32) for _ in cameras]
     weights = [(rng.uniform(size=(20, 24, 1)) > 0.2).astype(np.float32) for _ in cameras]

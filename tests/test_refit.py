@@ -13,9 +13,9 @@ from plyfile import PlyData
 from program import change_settings, command
 from refusals import fails, refused
 from scipy.stats import multivariate_normal
+from splat.scenes import cameras_around
 
 from mgs import Scene, evaluate_run, learning, open_run, read_ply, render, run_nbv
-from mgs.camera import Camera, look_at
 from mgs.fit import evidence
 from mgs.fit.evidence import BLOCKS, DIRECTIONAL, Worth, kinds, lean_fit, paying, worth
 from mgs.fit.fitting import fit_gaussians
@@ -24,7 +24,7 @@ from mgs.gaussians import LEARNED
 from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD
 from mgs.reports.simplify import REFITTED, refit_run
 from mgs.run.settings import NbvSettings
-from studies.bench import surface_camera, surface_gaussians
+from studies.bench import surface_gaussians
 
 VIEWS = 8
 SETTINGS = NbvSettings(dataset="data", prior="prior", train={"loss": "squared"})
@@ -38,17 +38,12 @@ def model(n=500):
     return gaussians
 
 
-def cameras_around(gaussians, views=VIEWS):
-    first = surface_camera(gaussians, 40, 32)
-    distance = np.linalg.norm(first.position)
-    angles = 2 * np.pi * np.arange(views) / views
-    eyes = [distance * np.array([np.cos(a), np.sin(a), 0.4]) for a in angles]
-    return [Camera(first.K, 40, 32, look_at(eye, [0, 0, 0.4])) for eye in eyes]
-
-
 def images_of(truth, start, views=VIEWS):
     """Images of the truth, with noise, and the start of a fit."""
-    rng, cameras = np.random.default_rng(0), cameras_around(truth, views)
+    rng, cameras = (
+        np.random.default_rng(0),
+        cameras_around(truth, 2 * np.pi * np.arange(views) / views),
+    )
     targets = [np.asarray(render(truth, camera).rgb) for camera in cameras]
     noisy = [target + rng.normal(0, 0.002, target.shape) for target in targets]
     known = [np.dstack([target, np.ones(target.shape[:2])]).astype(np.float32) for target in noisy]
@@ -100,7 +95,7 @@ def test_what_pays_least_is_left_out_as_long_as_it_is_allowed(n, loss, seed):
 @pytest.mark.parametrize("optimiser", ["natural", "adam"])
 def test_only_those_gaussians_learn_a_kind_that_are_asked_to(optimiser):
     start = model()
-    cameras = cameras_around(start, 3)
+    cameras = cameras_around(start, (0.0, 2.1, 4.2))
     targets = [np.full((32, 40, 3), 0.3, np.float32)] * 3
     train = TrainSettings(passes=3, optimiser=optimiser)
     some, n = np.arange(len(start)) % 3 == 0, len(start)

@@ -1,13 +1,13 @@
 """`mgs render`: PLY files of any order, encoding and degree, drawn through cameras."""
 
 import json
-import struct
 from dataclasses import replace
 
 import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
+from plyfile import PlyData, PlyElement
 from program import command
 
 from mgs import Gaussians, render, write_ply
@@ -49,25 +49,17 @@ def foreign_ply(path, g: Gaussians, encoding: str = "ascii") -> None:
     """Write a PLY as another tool might: properties shuffled, unknown properties, another element
     first."""
     rng, n = np.random.default_rng(g.sh_degree), len(g)
-    named = {name: ("float", "f", values) for name, values in columns(g).items()}
-    named["red"] = "uchar", "B", rng.integers(0, 255, n)
-    named["confidence"] = "double", "d", rng.random(n)
-    named["nx"] = "float", "f", np.zeros(n)
-    named["f_rest_of_it"] = "float", "f", np.ones(n)
-    named["label"] = "int", "i", rng.integers(-9, 9, n)
+    named = columns(g) | {"red": rng.integers(0, 255, n, np.uint8), "confidence": rng.random(n)}
+    named |= {"nx": np.zeros(n, np.float32), "f_rest_of_it": np.ones(n, np.float32)}
+    named["label"] = rng.integers(-9, 9, n, np.int32)
     order = rng.permutation(sorted(named))
-    header = ["ply", f"format {encoding} 1.0", "comment from another tool"]
-    header += ["element camera 1", "property float focal", f"element vertex {n}"]
-    header += [f"property {named[name][0]} {name}" for name in order] + ["end_header", ""]
-    rows = list(zip(*(named[name][2].tolist() for name in order), strict=True))
-    if encoding == "ascii":
-        lines = [" ".join(map(repr, row)) for row in rows]
-        body = "\n".join(["1.5", *lines, ""]).encode()
-    else:
-        endian = "<" if "little" in encoding else ">"
-        layout = endian + "".join(named[name][1] for name in order)
-        body = struct.pack(f"{endian}f", 1.5) + b"".join(struct.pack(layout, *row) for row in rows)
-    path.write_bytes("\n".join(header).encode() + body)
+    table = np.empty(n, [(name, named[name].dtype) for name in order])
+    for name in order:
+        table[name] = named[name]
+    focal = np.array([(1.5,)], [("focal", "f4")])
+    parts = [PlyElement.describe(focal, "camera"), PlyElement.describe(table, "vertex")]
+    how = {"text": encoding == "ascii", "byte_order": ">" if "big" in encoding else "<"}
+    PlyData(parts, comments=["from another tool"], **how).write(path)
 
 
 def camera_in(path) -> np.ndarray:

@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from refusals import fails
+from splat.scenes import cameras_around
 
-from mgs import Camera, InputError, ListCache, TrainSettings, fisher, look_at, render
+from mgs import Camera, InputError, ListCache, TrainSettings, fisher, render
 from mgs.fit.fitting import COLOUR_MIN, fit_gaussians
 from mgs.fit.optimisers import ADAM_EPSILON
 from mgs.fit.stopping import LOSS_FLOOR, StopReason, stop_reason
 from mgs.gaussians import LEARNED, Gaussians
-from studies.bench import surface_camera, surface_gaussians
+from studies.bench import surface_gaussians
 
 
 @pytest.fixture(scope="module")
@@ -25,10 +26,7 @@ def truth() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def cameras(truth) -> list[Camera]:
-    first = surface_camera(truth, 40, 32)
-    distance = np.linalg.norm(first.position)
-    eyes = [distance * np.array([np.cos(a), np.sin(a), 0.4]) for a in (0.0, 2.1, 4.2)]
-    return [Camera(first.K, 40, 32, look_at(eye, [0, 0, 0.4])) for eye in eyes]
+    return cameras_around(truth, (0.0, 2.1, 4.2))
 
 
 @pytest.fixture(scope="module")

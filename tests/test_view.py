@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -106,9 +106,8 @@ def test_what_the_kernel_draws(run):
 def test_a_whole_scene_opens_at_a_camera(run, monkeypatch):
     pytest.importorskip("viser", reason="viser is not installed")
     monkeypatch.setattr(Run, "of_scene", True)
-    viewer = Viewer(run, port=0)
-    first, camera = viewer.server.initial_camera, viewer.subject.taken[0].frame.camera
-    viewer.close()
+    with closing(Viewer(run, port=0)) as viewer:
+        first, camera = viewer.server.initial_camera, viewer.subject.taken[0].frame.camera
     np.testing.assert_allclose(first.position, camera.position)
     np.testing.assert_allclose(first.look_at - first.position, camera.world_to_camera[2, :3])
 
@@ -208,8 +207,7 @@ def viewing(*arguments):
 def test_a_run_is_followed_from_its_beginning(dataset, prior, tmp_path):
     pytest.importorskip("viser", reason="viser is not installed")
     tiny.start(tmp_path / "run", load_dataset(dataset), prior=prior, budget=2)
-    viewer = Viewer(tmp_path / "run", port=0, follow=True)
-    try:
+    with closing(Viewer(tmp_path / "run", port=0, follow=True)) as viewer:
         viewer.tick()
         assert viewer.title.content == "**run: no finished step yet**"
         assert viewer.layer.options == ("colour", "alpha", "depth")
@@ -225,27 +223,23 @@ def test_a_run_is_followed_from_its_beginning(dataset, prior, tmp_path):
         viewer.select("kf_0000")
         assert "no such image" in viewer.facts.content
         assert not viewer.image.visible
-    finally:
-        viewer.close()
 
 
 def test_what_a_window_asks_for_during_a_failed_drawing_is_drawn(run, monkeypatch):
     pytest.importorskip("viser", reason="viser is not installed")
-    viewer, drawn = Viewer(run, port=0), []
+    drawn = []
 
     def draw(client):
         drawn.append(client)
         viewer._again()
         raise ValueError
 
-    monkeypatch.setattr(viewer, "_draw", draw)
-    viewer.clients[0] = SimpleNamespace(moved=0.0, drawn=None)
-    try:
+    with closing(Viewer(run, port=0)) as viewer:
+        monkeypatch.setattr(viewer, "_draw", draw)
+        viewer.clients[0] = SimpleNamespace(moved=0.0, drawn=None)
         viewer.tick()
         viewer.tick()
-        assert len(drawn) == 2
-    finally:
-        viewer.close()
+    assert len(drawn) == 2
 
 
 def of_viser(message) -> bool:

@@ -31,6 +31,16 @@ def make_camera(
     return Camera(K, width, height, look_at(eye, target))
 
 
+def cameras_around(gaussians: Gaussians, angles, width=40, height=32) -> list[Camera]:
+    """Cameras at these azimuths, radians, that see all of a surface of `studies.bench`."""
+    from studies.bench import surface_camera
+
+    first = surface_camera(gaussians, width, height)
+    distance = np.linalg.norm(first.position)
+    eyes = [distance * np.array([np.cos(a), np.sin(a), 0.4]) for a in angles]
+    return [Camera(first.K, width, height, look_at(eye, [0, 0, 0.4])) for eye in eyes]
+
+
 def make_gaussians(
     n,
     seed,
