@@ -16,9 +16,8 @@ SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--igno
 @contextmanager
 def chromium() -> Iterator[Any]:
     """Yield a browser of playwright; skip the test if there is none."""
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is not installed (pip install playwright)"
-    )
+    missing = "playwright is not installed (pip install playwright)"
+    playwright = pytest.importorskip("playwright.sync_api", reason=missing)
     path = next((found for name in NAMES if (found := shutil.which(name))), None)
     if path is None:
         pytest.skip("no Chromium on this machine (apt-get install chromium)")

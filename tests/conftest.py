@@ -67,6 +67,13 @@ def whole(loaded, tmp_path_factory):
     return out
 
 
+@pytest.fixture(scope="session")
+def seeded(pristine, tmp_path_factory):
+    """The folder of a run of its seeds alone, which no test changes."""
+    root = tmp_path_factory.mktemp("seeded")
+    return tiny.write_run(root / "run", pristine, tiny.write_prior(root / "prior"))
+
+
 @pytest.fixture
 def dataset(pristine, tmp_path):
     """A copy of a tiny dataset, for this test alone."""

@@ -13,9 +13,8 @@ from studies.frame.program import study_of
 def listing(root: Path) -> dict[str, bytes | None]:
     """Every file below a folder with its content, every folder with None."""
     paths = (root, *root.rglob("*")) if root.exists() else ()
-    return {
-        str(path.relative_to(root)): path.read_bytes() if path.is_file() else None for path in paths
-    }
+    read = {path: path.read_bytes() if path.is_file() else None for path in paths}
+    return {str(path.relative_to(root)): content for path, content in read.items()}
 
 
 def refused(capsys, arguments: list, out: Path | None = None, study: str = "") -> str:

@@ -181,9 +181,7 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
         ("kf_0000.png: is 32x24", png("masks/kf_0000.png", np.ones((24, 32), bool))),
     ],
     (synthetic.write_dataset, "import {d} --out {out} --masks none"): [("none: no such", nothing)],
-    (synthetic.write_dataset, "import {d} --out {out} --masks b --mesh a.glb"): [
-        ("one of", nothing)
-    ],
+    (synthetic.write_dataset, "import {d} --out {out} --masks b --mesh a"): [("one of", nothing)],
     (synthetic.write_dataset, "import {d} --out {out} --mesh {d}/mm.ply"): [
         ("the mesh is in no picture", millimetres),
         ("mm.ply", nothing),

@@ -69,9 +69,8 @@ def test_a_run_from_random_points_reads_no_candidate(scenes, tmp_path, monkeypat
     assert run.settings.train.means == "free"
     assert set(read) == {data.frames[i].name for i in run.state.taken}
     fails("need a surface", mgs.run_nbv, data.root, tmp_path / "other", flight={"length": 9}, **how)
-    fails(
-        "`prior`", mgs.run_nbv, data.root, tmp_path / "x", prior=run.settings.prior, source="random"
-    )
+    given = {"prior": run.settings.prior, "source": "random"}
+    fails("leave out `prior`", mgs.run_nbv, data.root, tmp_path / "other", **given)
 
 
 def _noted(method, names):

@@ -151,11 +151,10 @@ def test_a_frame_rendered_alone_is_that_of_the_whole_orbit(full, fresh):
 
 def test_a_mesh_with_noisy_poses_is_captured_from_the_true_ones(full, tmp_path):
     mesh, noise = shutil.copy(full.root / "rock.glb", tmp_path), PoseNoise(0.01, 0.2)
-    given = (SCENE, RenderPreset(32, 24, 4, 2))
-    whole, poses = (
-        synth_orbit(tmp_path / name, *given, mesh=mesh, pose_noise=noise, on_demand=name == "poses")
-        for name in ("full", "poses")
-    )
+    given = {"scene": SCENE, "preset": RenderPreset(32, 24, 4, 2), "mesh": mesh}
+    given |= {"pose_noise": noise}
+    whole = synth_orbit(tmp_path / "full", **given)
+    poses = synth_orbit(tmp_path / "poses", **given, on_demand=True)
     capture = capture_of(poses)
     capture(poses.frames[2])
     assert same_files(poses.frames[2], whole.frames[2])

@@ -54,9 +54,8 @@ def test_transforms_are_nerfstudios(folder):
     ahead = synthetic.CENTRE - pose[:3, 3]
     np.testing.assert_allclose(-pose[:3, 2], ahead / np.linalg.norm(ahead), atol=1e-9)
     assert pose[2, 1] > 0  # its y is up
-    np.testing.assert_allclose(
-        load_dataset(folder).frames[1].camera.world_to_camera, opencv_from_opengl(pose)
-    )
+    camera = load_dataset(folder).frames[1].camera
+    np.testing.assert_allclose(camera.world_to_camera, opencv_from_opengl(pose))
 
 
 def test_frames_come_in_order_of_time_and_may_have_their_own_intrinsics(folder):

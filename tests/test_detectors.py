@@ -22,6 +22,7 @@ from mgs.run.ending import why_ended
 
 FITS = detectors.Before(outline=0.001, offset=0.01)
 GOOD = ViewIndicators(FITS, 0.05, 0.02, 1e-3, ratios=(-0.08, 0.0, 0.08), pixels=2000)
+DIM = replace(GOOD, ratios=(-0.21, -0.13, -0.05))
 NOWHERE = np.zeros((0, 3))
 FALLING = (1.0, 0.5, 0.3, 0.25, 0.249, 0.248)
 
@@ -44,10 +45,7 @@ BAD = {
     "worse": ({"losses": (1.0, 1.3, 1.2, 1.2, 1.2)}, "at least 20 % above"),
     "prior": ({"views": one_bad(outline=0.6)[3:] * 4}, "60.0 % of the covered pixels"),
     "residual": ({"views": (replace(GOOD, unexplained=0.9),) * 4}, "90 % of the images' variance"),
-    "exposure": (
-        {"views": (GOOD, GOOD, GOOD, replace(GOOD, ratios=(-0.21, -0.13, -0.05)))},
-        "by 50 % of",
-    ),
+    "exposure": ({"views": (GOOD, GOOD, GOOD, DIM)}, "by 50 % of"),
     "pose": ({"views": one_bad(offset=0.3)}, "10.0 times farther apart"),
     "outlier": ({"views": (GOOD, GOOD, GOOD, replace(GOOD, srgb_error=0.1))}, "10.0 times"),
     "means": ({"drift": 5.0}, "5.0 standard deviations"),
@@ -197,9 +195,8 @@ def warnings(state) -> list[str]:
 def test_a_good_run_has_no_warning_and_the_residual_of_new_images(rock, tmp_path):
     # A policy that does not plan, so that both begin alike; on few pixels fits settle late.
     given = {"policy": "d-optimal", "seeds": 5, "warm_passes": 8}
-    before, after = (
-        run_nbv(rock, tmp_path / f"{budget}", budget=budget, **given).state for budget in (1, 2)
-    )
+    runs = [run_nbv(rock, tmp_path / str(n), budget=n, **given) for n in (1, 2)]
+    before, after = (run.state for run in runs)
     assert [line.get("warnings") for line in after.steps] == [None] * 3
     assert all("prior" in line["indicators"] for line in after.steps)
     assert "saturated" in after.steps[-1]["indicators"]

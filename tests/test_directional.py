@@ -363,9 +363,8 @@ def test_a_run_takes_the_views_of_its_plan(loaded, tmp_path, policy):
 def test_a_run_records_what_its_plan_is_worth(loaded, tmp_path, policy):
     """Scores of the steps add up to the gain of the plan, which has at least the share of the best
     set of as many views that is recorded, whatever the way between them."""
-    limits, policy = (
-        ({"flight": {"length": 30.0}}, "directional-d") if " " in policy else ({}, policy)
-    )
+    limits = {"flight": {"length": 30.0}} if policy == "a flight" else {}
+    policy = "directional-d" if limits else policy
     scene, after, mission, chosen = flown(loaded, tmp_path / "run", policy, **limits)
     first, *others = steps(tmp_path / "run")
     state, recorded = after([]), first["certificate"]

@@ -186,10 +186,8 @@ def test_surface_metrics_follow_their_definitions(seed):
 
 def test_evaluate_a_perfect_model_and_nothing_held_out(tmp_path):
     dataset = write_dataset(tmp_path, orbit_cameras(2))
-    truths = {
-        id(frame.camera): (frame.masked_rgb(), 1.0 * frame.mask(), frame.depth())
-        for frame in dataset.frames
-    }
+    shown = [(frame.masked_rgb(), 1.0 * frame.mask(), frame.depth()) for frame in dataset.frames]
+    truths = dict(zip(map(id, dataset.cameras), shown, strict=True))
     names, perfect = ["kf_0000", "kf_0001"], lambda g, camera: truths[id(camera)]
     result = evaluate_model(grey(), dataset.frames, names, renderer=perfect)
     assert result["all"]["psnr"] == result["all"]["psnr_mask"] == PSNR_LIMIT

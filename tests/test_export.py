@@ -50,6 +50,11 @@ def covariances(model: Gaussians) -> np.ndarray:
     return axes @ axes.transpose(0, 2, 1)
 
 
+def colours(model: Gaussians, directions: np.ndarray) -> np.ndarray:
+    """Colours [N,D,3] in directions [D,3], for SH of degree 3."""
+    return np.einsum("dk,nkc->ndc", sh_basis(directions, 3), model.sh)
+
+
 def written(tmp_path, kind: str, model: Gaussians):
     path = tmp_path / f"x{FORMATS[kind]}"
     write_gaussians(path, model, kind, to_y_up((0, 0, 1)))
@@ -98,11 +103,8 @@ def test_a_mirrored_model_looks_the_same_from_the_mirrored_side(signs):
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     model = gaussians(3, n=5)
     turned = mirrored(model, signs)
-    colours = [
-        np.einsum("dk,nkc->ndc", sh_basis(d, 3), one.sh)
-        for d, one in ((directions, model), (directions * signs, turned))
-    ]
-    np.testing.assert_allclose(*colours, atol=1e-6)
+    mirror_image = colours(turned, directions * signs)
+    np.testing.assert_allclose(mirror_image, colours(model, directions), atol=1e-6)
     expected = covariances(model) * np.outer(signs, signs)
     np.testing.assert_allclose(covariances(turned), expected, atol=1e-7)
 
@@ -136,11 +138,8 @@ def test_a_model_far_from_the_origin(tmp_path):
         read = load_gaussians(written(tmp_path, kind, far))
         assert np.abs(np.add(read.means, read.origin) - near.means - place).max() < 1e-6
         shifted = CAMERAS[0].seen_from(np.negative(place))
-        images = [
-            np.asarray(render(model, camera).rgb)
-            for model, camera in ((near, CAMERAS[0]), (read, shifted))
-        ]
-        np.testing.assert_allclose(*images, atol=2e-5)
+        drawn = render(near, CAMERAS[0]), render(read, shifted)
+        np.testing.assert_allclose(*(np.asarray(image.rgb) for image in drawn), atol=2e-5)
     exact = reference.render(far, shifted)["rgb"]
     np.testing.assert_allclose(exact, reference.render(near, CAMERAS[0])["rgb"], atol=1e-5)
     with pytest.warns(Notice, match="count from 448262, 5411932, 412"):
@@ -196,11 +195,7 @@ def test_the_transforms_of_nodes_are_applied(tmp_path, scale):
     directions = np.random.default_rng(0).normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     own = directions @ (A / np.linalg.norm(A, axis=0))
-    colours = [
-        np.einsum("dk,nkc->ndc", sh_basis(d, 3), one.sh)
-        for d, one in ((directions, read), (own, model))
-    ]
-    np.testing.assert_allclose(*colours, atol=1e-5)
+    np.testing.assert_allclose(colours(read, directions), colours(model, own), atol=1e-5)
 
 
 def test_shear_is_refused(tmp_path):

@@ -114,19 +114,10 @@ def test_a_finished_import_says_so(capsys, dataset, tmp_path):
     assert "a finished dataset of other" in refused(capsys, arguments, tmp_path / "out")
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A run that anyone may have made."""
-    root = tmp_path_factory.mktemp("stranger")
-    data, prior = tiny.write_dataset(root / "dataset"), tiny.write_prior(root / "prior")
-    run = tiny.write_run(root / "run", data, prior)
-    assert open_run(run).state.taken
-    return run
-
-
 @pytest.fixture
-def stranger(made, tmp_path):
-    return Path(shutil.copytree(made, tmp_path / "run"))
+def stranger(seeded, tmp_path):
+    """A run that anyone may have made."""
+    return Path(shutil.copytree(seeded, tmp_path / "run"))
 
 
 def members(**changed: object):

@@ -195,11 +195,10 @@ def test_nerf_synthetic_with_alpha(dataset, tmp_path):
     _with_alpha(dataset, "binary")
     root, camera = tmp_path / "lego", dataset.frames[0].camera
     shutil.copytree(dataset.root / "images", root / "train")
-    poses = [opengl_from_opencv(frame.camera.world_to_camera).tolist() for frame in dataset.frames]
-    records = [
-        {"file_path": f"./train/{frame.name}", "transform_matrix": pose}
-        for frame, pose in zip(dataset.frames, poses, strict=True)
-    ]
+    records = []
+    for frame in dataset.frames:
+        pose = opengl_from_opencv(frame.camera.world_to_camera).tolist()
+        records.append({"file_path": f"./train/{frame.name}", "transform_matrix": pose})
     angle = 2 * np.arctan(camera.width / 2 / camera.K[0, 0])
     write_json(root / "transforms_train.json", {"camera_angle_x": angle, "frames": records})
     assert read_source(root).kind == "NeRF-synthetic"

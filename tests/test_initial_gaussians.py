@@ -49,9 +49,8 @@ def test_shapes_scales_and_rotations(prior, dataset):
 
 def test_a_warm_start_gives_new_images_to_what_none_saw_before(prior, dataset):
     """A newly seen Gaussian takes the new colour plus what was learned; all else stays."""
-    (before, seen_before), (start, seen) = (
-        initial_gaussians(prior, dataset.frames[:k]) for k in (1, 2)
-    )
+    before, seen_before = initial_gaussians(prior, dataset.frames[:1])
+    start, seen = initial_gaussians(prior, dataset.frames[:2])
     new = seen & ~seen_before
     assert new.mean() > 0.05
     learned = np.random.default_rng(0).normal(0, 0.1, before.sh.shape).astype(np.float32)

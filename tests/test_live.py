@@ -215,9 +215,8 @@ def test_poses_given_up_in_an_outage_are_asked_for_again(
             fails("10 gave no picture", mgs.run_nbv, poses, out, live=never, **settings)
         else:
             run = mgs.run_nbv(poses, out, live=live.Live(failing, tries=1), **settings)
-            assert "8 poses gave no picture, resuming asks" in why_ended(
-                run.state.steps[-1]["ended"]
-            )
+            ended = why_ended(run.state.steps[-1]["ended"])
+            assert "8 poses gave no picture, resuming asks" in ended
             assert mgs.resume_nbv(out).state.taken == run.state.taken
         run = mgs.resume_nbv(out, live=working)
     assert run.state.steps[-1]["ended"]["reason"] == "budget"

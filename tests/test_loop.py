@@ -54,9 +54,8 @@ def test_a_run_that_blends_srgb(dataset, prior, tmp_path):
     assert not np.array_equal(*views.values())
     start, seen = initial_gaussians(run.prior, run.taken)
     displayed, _ = initial_gaussians(run.prior, run.taken, linear=False)
-    np.testing.assert_allclose(
-        displayed.linear_rgb(displayed.rgb)[seen], start.rgb[seen], atol=1e-5
-    )
+    linear = displayed.linear_rgb(displayed.rgb)
+    np.testing.assert_allclose(linear[seen], start.rgb[seen], atol=1e-5)
 
 
 @pytest.mark.usefixtures("coarse_rocks", "coarse_priors")

@@ -93,14 +93,12 @@ def test_one_step_is_natural_on_the_gradient_of_the_objective(cameras, targets):
 def test_displaced_means_move_back_to_the_surface(cameras, targets):
     offsets = 0.4 * SPACING * np.random.default_rng(3).standard_normal(N)
     start = ball(offsets)
-    frozen, moved = (
-        fitted(start, cameras, targets, settings(means, 10)) for means in ("frozen", "free")
-    )
+    both = settings("frozen", 10), settings("free", 10)
+    frozen, moved = (fitted(start, cameras, targets, train) for train in both)
     seen = sum(fisher(start, camera)[:, 0] for camera in cameras) > 0.3
     assert seen.sum() > 0.8 * N
-    before, after = (
-        np.abs(np.linalg.norm(g.means, axis=1)[seen] - 1) for g in (start, moved.gaussians)
-    )
+    radii = (np.linalg.norm(g.means, axis=1)[seen] for g in (start, moved.gaussians))
+    before, after = (np.abs(radius - 1) for radius in radii)
     assert np.median(after) < 0.4 * np.median(before)
     assert (after**2).mean() < 0.5 * (before**2).mean()
     assert moved.loss < 0.5 * frozen.loss

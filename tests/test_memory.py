@@ -145,9 +145,8 @@ def test_a_padded_array_is_the_same_with_memory_behind_it(shape):
     copy = padded(np.asfortranarray(values), np.float64)
     assert np.array_equal(copy, values)
     assert copy.flags.c_contiguous
-    assert not copy.size or copy.ctypes.data % 64 == 0, (
-        "Dr.Jit compiles another kernel for other addresses"
-    )
+    aligned = not copy.size or copy.ctypes.data % 64 == 0
+    assert aligned, "Dr.Jit compiles another kernel for other addresses"
     memory = copy.base if copy.base.base is None else copy.base.base
     end, needed = memory.ctypes.data + memory.nbytes, (copy.size + PADDING) * copy.itemsize
     assert end >= copy.ctypes.data + needed

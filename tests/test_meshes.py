@@ -70,10 +70,7 @@ def _spoilt() -> dict[str, tuple[np.ndarray, np.ndarray]]:
         "vertices of no face": (both([[[900.0, 0, 0]], v]), f + 1),
         "inside out": (v, turned),
         "some faces inside out": (v, np.where(some, turned, f)),
-        "some faces inside out, no vertex shared": (
-            v[f].reshape(-1, 3),
-            np.where(some, own[:, ::-1], own),
-        ),
+        "no vertex shared": (v[f].reshape(-1, 3), np.where(some, own[:, ::-1], own)),
     }
 
 
@@ -84,10 +81,9 @@ SPOILT = _spoilt()
 def test_a_mesh_that_can_be_mended_gives_the_same_prior(tmp_path, how):
     synthetic.rock_mesh().export(tmp_path / "rock.ply")
     trimesh.Trimesh(*SPOILT[how], process=False).export(tmp_path / "spoilt.ply")
-    right, found = (
-        prior_from_mesh(tmp_path / f"{name}.ply", PriorSettings(gaussians=200, backing=0))
-        for name in ("rock", "spoilt")
-    )
+    settings = PriorSettings(gaussians=200, backing=0)
+    paths = tmp_path / "rock.ply", tmp_path / "spoilt.ply"
+    right, found = (prior_from_mesh(path, settings) for path in paths)
     assert len(found.mesh.vertices) == len(right.mesh.vertices) or how.endswith("shared")
     assert len(found.mesh.faces) == len(right.mesh.faces)
     assert found.spacing == pytest.approx(right.spacing)

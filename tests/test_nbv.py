@@ -138,18 +138,15 @@ def test_one_candidate_in_memory_at_a_time(loaded, tmp_path):
 
 
 def test_random_depends_on_the_seed_only(loaded, tmp_path):
-    one, same, other = (
-        run(tmp_path / name, loaded, policy="random", seed=seed).taken
-        for name, seed in {"a": 1, "b": 1, "c": 2}.items()
-    )
+    draws = [run(tmp_path / f"{k}", loaded, policy="random", seed=k // 2) for k in range(3)]
+    one, same, other = (state.taken for state in draws)
     assert one == same != other
 
 
-KILLS = [("fisher", 40), ("before the lines are written", 1)]
-KILLS += [("while the checkpoint is written", 3)]
+KILLS = {"fisher": 40, "before the lines are written": 1, "while the checkpoint is written": 3}
 
 
-@pytest.mark.parametrize(("moment", "count"), KILLS)
+@pytest.mark.parametrize(("moment", "count"), KILLS.items())
 def test_a_killed_run_that_is_resumed_takes_the_same_views(
     loaded, tmp_path, uninterrupted, moment, count
 ):
@@ -276,10 +273,8 @@ def test_a_batch_counts_as_taken_for_every_policy(loaded, tmp_path, policy, near
     parts = {}
     if policies.POLICIES[policy].needs_fit:
         parts = {"fit": lambda g, *rest: tiny.Fit(g, 0.1, 1)}
-    one, three = (
-        run(tmp_path / str(batch), loaded, parts=parts, policy=policy, nearest=nearest, batch=batch)
-        for batch in (1, 3)
-    )
+    given = {"parts": parts, "policy": policy, "nearest": nearest}
+    one, three = (run(tmp_path / str(n), loaded, **given, batch=n) for n in (1, 3))
     assert one.taken == three.taken
     for line, other in zip(one.steps[1:], three.steps[1:], strict=True):
         assert line["score"] == pytest.approx(other["score"], rel=1e-5, abs=1e-9)

@@ -46,10 +46,8 @@ def case(request):
     channels = 4 if alpha_weight else 3
     truths = [rng.uniform(0, 1, (20, 24, channels)).astype(np.float32) for _ in cameras]
     weights = [(rng.uniform(size=(20, 24, 1)) > 0.2).astype(np.float32) for _ in cameras]
-    targets = [
-        np.dstack([model.linear_rgb(t[..., :3]), w, t[..., 3:]])
-        for t, w in zip(truths, weights, strict=True)
-    ]
+    pairs = zip(truths, weights, strict=True)
+    targets = [np.dstack([model.linear_rgb(t[..., :3]), w, t[..., 3:]]) for t, w in pairs]
     how = {"means": means, "alpha_weight": alpha_weight}
     goal = objective(model, cameras, targets, start, LAM, **how)
     columns = np.split(np.arange(11 + MEANS[means]), (3, 6, 10, 11))

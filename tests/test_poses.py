@@ -80,9 +80,8 @@ def test_the_command_refines_the_poses_of_a_run(tmp_path, coarse_priors, capsys)
     assert metrics["all"]["psnr_mask"] > given.metrics["all"]["psnr_mask"] + 1
 
     def pixels_off(dataset):
-        ends = [
-            [c.project(run.prior.points)[0] for c in both] for both in (dataset.cameras, cameras)
-        ]
+        sides = dataset.cameras, cameras
+        ends = [[camera.project(run.prior.points)[0] for camera in side] for side in sides]
         return np.linalg.norm(np.subtract(*ends), axis=-1).mean()
 
     assert pixels_off(run.dataset) < 0.5 * pixels_off(given.dataset)

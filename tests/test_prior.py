@@ -91,9 +91,8 @@ def test_no_part_of_a_rock_is_lost(tmp_path, shape, masked):
     found = build_prior(views, PriorSettings(gaussians=800, backing=0))
     for centre, axes in rocks:
         surface = trimesh.creation.icosphere(3).vertices * axes + centre
-        others = [
-            np.linalg.norm((surface - c) / a, axis=1) > 1.1 for c, a in rocks if c is not centre
-        ]
+        others = [(surface - c) / a for c, a in rocks if c is not centre]
+        others = [np.linalg.norm(place, axis=1) > 1.1 for place in others]
         open_sides = surface[np.all(others, axis=0) & (surface[:, 2] > 0.05)]
         assert np.median(cKDTree(found.points).query(open_sides)[0]) < found.spacing
 

@@ -40,10 +40,8 @@ def model(n=500):
 
 def images_of(truth, start, views=VIEWS):
     """Images of the truth, with noise, and the start of a fit."""
-    rng, cameras = (
-        np.random.default_rng(0),
-        cameras_around(truth, 2 * np.pi * np.arange(views) / views),
-    )
+    rng = np.random.default_rng(0)
+    cameras = cameras_around(truth, 2 * np.pi * np.arange(views) / views)
     targets = [np.asarray(render(truth, camera).rgb) for camera in cameras]
     noisy = [target + rng.normal(0, 0.002, target.shape) for target in targets]
     known = [np.dstack([target, np.ones(target.shape[:2])]).astype(np.float32) for target in noisy]
@@ -66,9 +64,8 @@ def test_the_gain_is_the_logarithm_of_the_ratio_of_two_marginal_likelihoods(
     zero, both = np.zeros(pixels), noise + tau**2 * np.outer(slope, slope)
     with_it = multivariate_normal(zero, both).logpdf(seen)
     without = multivariate_normal(zero, noise).logpdf(seen)
-    found = worth(
-        np.array([[away]]), np.array([[precision]]), np.array([lam]), sigma, {"one": slice(0, 1)}, 1
-    )
+    numbers = np.array([[away]]), np.array([[precision]]), np.array([lam])
+    found = worth(*numbers, sigma, {"one": slice(0, 1)}, 1)
     assert found.gain["one"][0] == pytest.approx(with_it - without, rel=1e-6, abs=1e-6)
     at_start, at_end = seen @ seen / 2, np.square(seen - slope * away).sum() / 2 + lam * away**2 / 2
     assert found.rise["one"][0] == pytest.approx(at_start - at_end, rel=1e-6, abs=1e-9)

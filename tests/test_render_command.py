@@ -76,10 +76,8 @@ def write_cameras(path, names=("images/a.png", "images/b.png"), cameras=CAMERAS)
     K, poses = cameras[0].K, [opengl_from_opencv(camera.world_to_camera) for camera in cameras]
     lens = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     size = {"w": cameras[0].width, "h": cameras[0].height}
-    frames = [
-        {"file_path": name, "transform_matrix": pose.tolist()}
-        for name, pose in zip(names, poses, strict=True)
-    ]
+    pairs = zip(names, poses, strict=True)
+    frames = [{"file_path": name, "transform_matrix": pose.tolist()} for name, pose in pairs]
     path.write_text(json.dumps(lens | size | {"frames": frames}))
 
 
@@ -176,10 +174,9 @@ def test_antialiasing(folder, marked):
     write_ply(folder / "x.ply", model)
     run(folder)
     run(folder, "--no-antialiased" if marked else "--antialiased", out="other")
-    as_marked, otherwise = (
-        srgb_from_linear(np.asarray(render(replace(model, antialiased=kind), CAMERAS[0]).rgb))
-        for kind in (marked, not marked)
-    )
+    models = model, replace(model, antialiased=not marked)
+    images = (np.asarray(render(one, CAMERAS[0]).rgb) for one in models)
+    as_marked, otherwise = map(srgb_from_linear, images)
     assert np.abs(as_marked - otherwise).max() > 0.05
     np.testing.assert_allclose(pixels(folder / "out/a.png"), as_marked, atol=0.51 / 255)
     np.testing.assert_allclose(pixels(folder / "other/a.png"), otherwise, atol=0.51 / 255)

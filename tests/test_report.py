@@ -41,13 +41,12 @@ def runs(tmp_path_factory):
     def measure(gaussians, taken):
         return {name: float(len(taken) * (1 + len(name))) for name in names}
 
+    how = {"parts": {"measure": measure}, "evaluate_every": 1}
+    greys = {"d-optimal": 0.3, "random": 0.2}
     return [
-        tiny.write_measured_run(
-            root / policy, dataset, grey, {"measure": measure},
-            policy=policy, evaluate_every=1,
-        )
-        for policy, grey in (("d-optimal", 0.3), ("random", 0.2))
-    ]  # fmt: skip
+        tiny.write_measured_run(root / policy, dataset, grey, policy=policy, **how)
+        for policy, grey in greys.items()
+    ]
 
 
 def without(word, values):
@@ -172,10 +171,8 @@ def test_table(runs):
     path = sum(np.linalg.norm(b - a) for a, b in pairwise(positions))
     known = {"policy": "random", "images": 8, "coverage": 100 * run.steps[-1]["coverage"]}
     assert rows[1] == means | known | {"path": pytest.approx(path), "unit": "m"}
-    lines = [
-        [cell.strip() for cell in line.split("|")[1:-1]]
-        for line in tables.markdown_table(rows).splitlines()
-    ]
+    table = tables.markdown_table(rows).splitlines()
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table]
     assert len(lines) == 4
     row = dict(zip(lines[0], lines[3], strict=True))
     assert (row["policy"], row["images"]) == ("random", "8")

@@ -13,7 +13,7 @@ import synthetic
 from program import study
 from refusals import occupied, refused
 
-from mgs.files import write_json
+from mgs.files import read_json, write_json
 from mgs.run.folder import read_checkpoint
 from mgs.survey import flight
 from mgs.survey.flight import SurveySettings, fly
@@ -184,14 +184,11 @@ def test_rocks_of_ones_own_take_the_place_of_the_others(tmp_path, capsys, monkey
 
 @pytest.mark.slow
 def test_an_oracle_that_sees_the_truth_is_best_in_its_first_choice(tmp_path, capsys):
-    size = replace(
-        FEW, images=5, passes=10, setups={"ring": SETUPS["ring"]}, policies=("uniform", "random")
-    )
+    size = replace(FEW, images=5, passes=10, setups={"ring": SETUPS["ring"]})
+    size = replace(size, policies=("uniform", "random"))
     done(capsys, "oracle", tmp_path, "--rocks", 1, sizes={"quick": size})
-    found = {
-        path.parent.name: json.loads(path.read_text())["found"]["test"]
-        for path in tmp_path.glob("cells/setup/**/result.json")
-    }
+    paths = tmp_path.glob("cells/setup/**/result.json")
+    found = {path.parent.name: read_json(path)["found"]["test"] for path in paths}
     oracle = found.pop("oracle-0")
     assert len(found) == 1 + size.draws
     assert oracle >= max(found.values()) - 0.1, "its fit is warm, the judge's is not"

@@ -86,10 +86,8 @@ def test_noisy_poses_are_adjusted_to_the_pictures(frames, tmp_path, capsys):
 
     def error(views):
         """Mean turn from the truth, degrees, of each camera in the axes of the one before."""
-        steps = [
-            [motion_between(a.camera, b.camera)[:3] for a, b in pairwise(each)]
-            for each in (frames, views)
-        ]
+        both = pairwise(frames), pairwise(views)
+        steps = [[motion_between(a.camera, b.camera)[:3] for a, b in pairs] for pairs in both]
         return np.degrees(np.linalg.norm(np.subtract(*steps), axis=1)).mean()
 
     assert error(noisy) > 0.4
@@ -251,13 +249,12 @@ def test_photographs_alone_are_one_command_to_the_next_picture(
     for frame in frames[:8]:
         shutil.copy(frame.image_path, root)
     extract = pycolmap.extract_features
-    monkeypatch.setattr(
-        "pycolmap.extract_features",
-        lambda *files, image_names, **options: (
-            found.extend(image_names),
-            extract(*files, image_names=image_names, **options),
-        ),
-    )
+
+    def watched(*files, image_names, **options):
+        found.extend(image_names)
+        extract(*files, image_names=image_names, **options)
+
+    monkeypatch.setattr("pycolmap.extract_features", watched)
     command("suggest", root, *few)
     (view,) = read_json(site / "next/suggestions.json")["plan"]
     assert f"1: {view['way']}" in said(capsys)[0]
@@ -269,11 +266,8 @@ def test_photographs_alone_are_one_command_to_the_next_picture(
     assert read_json(site / "next/suggestions.json")["images"] == 9
     data = load_dataset(site / "dataset").frames
     assert data[0].name == "a new one"
-    turns = [
-        motion_between(one.camera, other.camera)[:3]
-        for pair in ((data[1], data[0]), (frames[0], frames[8]))
-        for one, other in [pair]
-    ]
+    pairs = (data[1], data[0]), (frames[0], frames[8])
+    turns = [motion_between(one.camera, other.camera)[:3] for one, other in pairs]
     assert np.degrees(np.linalg.norm(turns[0] - turns[1])) < 0.5
     kept = (site / "photographs").rename(tmp_path / "kept")
     (site / "photographs").symlink_to(kept)

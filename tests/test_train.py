@@ -111,10 +111,8 @@ def test_one_step_is_natural_on_the_gradient_of_the_objective(truth, cameras, ta
     settings = TrainSettings(passes=1, rates=rates_of(0.01), loss="squared")
     camera, target = cameras[0], targets[0]
     found = fit_gaussians(begun, [camera], [target], settings, start=start, lam=lam)
-    prior = sum(
-        weight * ((getattr(begun, name) - getattr(start, name)) ** 2).sum()
-        for name, weight in zip(LEARNED, lam.values(), strict=True)
-    )
+    away = [getattr(begun, name) - getattr(start, name) for name in LEARNED]
+    prior = sum(w * (part**2).sum() for w, part in zip(lam.values(), away, strict=True))
     expected = mean_square(begun, [camera], [target]) + prior / target.size
     assert found.losses == pytest.approx((expected, expected), rel=1e-4)  # the same, in the step
     steps = (found.gaussians.sh - begun.sh)[:, 0]

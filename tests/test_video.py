@@ -1,8 +1,10 @@
 """Films of a run: paths of cameras, the story of its views, and the files."""
 
 import resource
+import shutil
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,10 +17,9 @@ from refusals import fails, refused
 from mgs.reports.video import camera_path, path_among, write_film
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory, pristine):
-    root = tmp_path_factory.mktemp("film")
-    return tiny.write_run(root / "run", pristine, tiny.write_prior(root / "prior"))
+@pytest.fixture
+def run(seeded, tmp_path):
+    return Path(shutil.copytree(seeded, tmp_path / "run"))
 
 
 def test_a_turntable_goes_around_the_object_and_looks_at_it(loaded):

@@ -188,9 +188,8 @@ def viewing(*arguments):
     command = [sys.executable, "-m", "mgs", "view", *map(str, arguments), "--port", "0"]
     # A shell starts what runs in the background deaf to SIGINT, which is what ends the viewer.
     hearing = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hearing
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(command, **pipes, preexec_fn=hearing)
     try:
         line = process.stdout.readline()
         found = re.search(r"open (http://\S+) in a browser", line)

@@ -1,11 +1,11 @@
 """The viewer towards strangers: other websites, other machines, hostile names and messages."""
 
 import math
+from contextlib import closing
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import tiny
 
 from mgs.view import server
 from mgs.view.access import COOKIE, Access, plain
@@ -15,12 +15,9 @@ pytest.importorskip("viser", reason="viser is not installed")
 
 
 @pytest.fixture(scope="module")
-def viewer(tmp_path_factory):
-    root = tmp_path_factory.mktemp("view")
-    dataset, prior = tiny.write_dataset(root / "dataset"), tiny.write_prior(root / "prior")
-    made = Viewer(tiny.write_run(root / "run", dataset, prior), port=0)
-    yield made
-    made.close()
+def viewer(seeded):
+    with closing(Viewer(seeded, port=0)) as made:
+        yield made
 
 
 def connect(viewer: Viewer, **options):

@@ -37,9 +37,8 @@ def projected(gaussians, camera):
 
 def pairs_of(lists) -> set[tuple[int, int]]:
     """{(splat, block)}."""
-    place, splat, block, start, end = (
-        np.asarray(a) for a in (lists.place, lists.splat, lists.block, lists.start, lists.end)
-    )
+    names = "place", "splat", "block", "start", "end"
+    place, splat, block, start, end = (np.asarray(getattr(lists, name)) for name in names)
     splat = np.argsort(place)[splat]
     return {(int(j), int(b)) for b, s, e in zip(block, start, end, strict=True) for j in splat[s:e]}
 
@@ -135,10 +134,8 @@ def test_stale_lists_never_change_an_image(names, seed, drift, teleport):
         assert_cached_is_cold(g, camera, cache)
         if step in (2, 4):
             np.testing.assert_array_equal(fisher(g, camera, cache=cache), fisher(g, camera))
-        values = {
-            name: getattr(g, name) + drift * rng.normal(size=getattr(g, name).shape)
-            for name in names
-        }
+        arrays = {name: getattr(g, name) for name in names}
+        values = {name: a + drift * rng.normal(size=a.shape) for name, a in arrays.items()}
         if teleport:
             jump = rng.random(60) < 0.3
             there = behind if step % 2 else rng.uniform(-0.6, 0.6, (60, 3))
@@ -173,10 +170,8 @@ def test_each_camera_and_number_of_gaussians_has_its_own_lists():
         assert_cached_is_cold(make_gaussians(n, 4), cameras[0], cache)
 
 
-RING = [
-    make_camera(eye=(2.0 * np.cos(a), 2.0 * np.sin(a), 1.0))
-    for a in np.linspace(0, 2 * np.pi, 24, endpoint=False)
-]
+AZIMUTHS = 2 * np.pi * np.arange(24) / 24
+RING = [make_camera(eye=(2.0 * np.cos(a), 2.0 * np.sin(a), 1.0)) for a in AZIMUTHS]
 IN_ORDER = [np.arange(12)] * 5
 SHUFFLED = [np.random.default_rng(i).permutation(12) for i in range(6)]
 

@@ -320,9 +320,8 @@ def test_where_a_camera_has_no_derivative_a_line_says_so():
     motion = mi.Float64([0.0] * 6)
     dr.enable_grad(motion)
     fails("use mgs", fisher, gaussians, moved(camera, motion))
-    assert np.array_equal(
-        fisher(gaussians, moved(camera, dr.detach(motion))), fisher(gaussians, camera)
-    )
+    still = moved(camera, dr.detach(motion))
+    assert np.array_equal(fisher(gaussians, still), fisher(gaussians, camera))
     fails("origin", moved(camera, motion).seen_from, (1, 0, 0))
     frozen = dr.freeze(lambda x: render(gaussians, camera).rgb * x)
     with pytest.raises(RuntimeError) as error:

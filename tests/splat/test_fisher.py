@@ -179,15 +179,14 @@ def test_unseen_means_and_clamped_alphas_carry_no_information():
     camera, g = make_camera(), make_gaussians(16, 5, 1)
     g.means[3] = camera.position - 2 * camera.world_to_camera[2, :3]
     g.means[4] = camera.position
-    exact, block = (
-        fisher(g, camera, e, means="free", alpha_weight=2.0) for e in ("exact", "block")
-    )
+    options = {"means": "free", "alpha_weight": 2.0}
+    exact, block = (fisher(g, camera, e, **options) for e in ("exact", "block"))
     assert (exact[[3, 4]] == 0).all()
     assert (block[[3, 4]] == 0).all()
     assert (exact[5, -3:] > 0).all()
     shape = {"means": np.zeros((1, 3)), "log_scales": np.full((1, 3), 6.0)}
     wide = changed(g[:1], logit_opacities=[20.0], sh=0 * g.sh[:1], **shape)
-    assert (fisher(wide, camera, means="free", alpha_weight=2.0)[:, 12:] == 0).all()
+    assert (fisher(wide, camera, **options)[:, 12:] == 0).all()
 
 
 @pytest.mark.parametrize(
@@ -232,9 +231,8 @@ def test_weights_and_chosen_gaussians_against_brute_force(degree, means):
         size = scale_of(expected)
         assert np.abs(block - expected)[size > 0].max() <= 1e-5 * size.max()
         exact = fisher(g, camera, "exact", BACKGROUND, **options)
-        assert_close(
-            exact[:, : 3 * (degree + 1) ** 2], diagonal(expected)[:, : 3 * (degree + 1) ** 2]
-        )
+        K = 3 * (degree + 1) ** 2
+        assert_close(exact[:, :K], diagonal(expected)[:, :K])
         # Alone, Gaussian 5 would be hidden by nothing.
         for name, whole in (("exact", exact), ("block", block)):
             found = fisher(g, camera, name, BACKGROUND, chosen=[5, 2], **options)
