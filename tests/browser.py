@@ -1,7 +1,7 @@
 """A headless Chromium of this machine, driven by playwright."""
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -31,14 +31,7 @@ def chromium() -> Iterator[Any]:
 
 @contextmanager
 def opened(
-    browser: Any,
-    address: str,
-    width: int,
-    height: int,
-    scheme: str = "light",
-    known: Callable[[Any], bool] = lambda message: False,
-    scripts: bool = True,
-    serve: Callable[[Any], None] | None = None,
+    browser, address, width, height, scheme="light", known=lambda _: False, scripts=True, serve=None
 ) -> Iterator[tuple[Any, list[str]]]:
     """Open an address in a window of this size; yields the page and a list of what went wrong on
     it: console errors, exceptions, and requests to other hosts.
@@ -46,12 +39,8 @@ def opened(
     known: whether a ConsoleMessage of playwright is an error to pass over. scripts: whether the
     browser runs them. serve: answers each request (a Route of playwright) in place of a server.
     """
-    context = browser.new_context(
-        viewport={"width": width, "height": height},
-        color_scheme=scheme,
-        has_touch=width < 600,
-        java_script_enabled=scripts,
-    )
+    window = {"viewport": {"width": width, "height": height}, "has_touch": width < 600}
+    context = browser.new_context(**window, color_scheme=scheme, java_script_enabled=scripts)
     page, wrong = context.new_page(), []
     own = ("data:", "blob:", "file:", "about:", address, address.replace("http", "ws"))
 

@@ -1,5 +1,4 @@
-"""Shared set-up: one processor for each worker, the variant before any test module imports kernels,
-and common fixtures."""
+"""Shared set-up: one processor for each worker, the variant before kernels, common fixtures."""
 
 import gc
 import os

@@ -29,16 +29,14 @@ def command(*arguments) -> None:
 
 
 def study(name, *arguments, exit_code=0, **changes) -> None:
-    """Run `python -m studies.NAME ARGUMENTS`; fails unless it exits with this code. changes: of the
-    fields of the `Study`."""
+    """Run a study; fails unless it exits with this code. changes: of the fields of the `Study`."""
     with pytest.raises(SystemExit) as stop:
         replace(study_of(name), **changes)([str(argument) for argument in arguments])
     assert stop.value.code == exit_code
 
 
 def python(program: str, *arguments, env=(), **options) -> subprocess.CompletedProcess:
-    """Run the text of a program in a new process, and capture what it prints. env: variables beside
-    those of this process."""
+    """Run the text of a program in a new process, and capture what it prints."""
     command = [sys.executable, "-c", program, *map(str, arguments)]
     options = {"capture_output": True, "text": True, "timeout": 300} | options
     return subprocess.run(command, env=os.environ | dict(env), **options)

@@ -34,8 +34,7 @@ def refused(capsys, arguments: list, out: Path | None = None, study: str = "") -
 
 
 def fails(words: str, call: Callable[..., object], *arguments, **options) -> str:
-    """Check that a call raises an InputError of one line in which this pattern is found; return the
-    line."""
+    """Check that a call raises an InputError of one line with this pattern; return the line."""
     with pytest.raises(InputError, match=words or None) as error:
         call(*arguments, **options)
     assert "\n" not in str(error.value)

@@ -32,8 +32,7 @@ def slopes(gradient, most=1000, before=500, step=600):
 
 @pytest.fixture
 def mixed():
-    """200 Gaussians, the first 100 of 0.2 m, the others smaller than 0.1 m; and gradients: large at
-    every fourth."""
+    """Gaussians, the first half of 0.2 m, others below 0.1 m; gradients, large at every fourth."""
     model = surface_gaussians(200)
     model.log_scales[:] = np.log([0.05, 0.02, 0.01])
     model.log_scales[:100, 1] = np.log(0.2)

@@ -1,5 +1,4 @@
-"""Maps of information: the scalars against their formulas, the maps against a direct composite, the
-files read back."""
+"""Maps of information: scalars by their formulas, maps by a direct composite, files read back."""
 
 import numpy as np
 import pytest
@@ -46,16 +45,14 @@ def test_scalars_follow_their_formulas(tmp_path):
 
 
 def two_in_a_row() -> tuple[Gaussians, Camera]:
-    """Two Gaussians, 20 pixels wide, one 2 m and one 3 m before the camera; the near one is half
-    transparent."""
+    """Two Gaussians, 20 pixels wide, at 2 m and 3 m; the near one is half transparent."""
     means, scales, quats = [[0, 0, 0], [0, 1, 0]], np.zeros((2, 3)), np.eye(4)[[0, 0]]
     parts = (np.array(part, np.float32) for part in (means, scales, quats, [0, 9]))
     return Gaussians(*parts, sh_from_rgb(np.ones((2, 3)))), pinhole(40.0, 33, 25, (0, -2, 0))
 
 
 def test_maps_are_means_over_what_a_pixel_shows():
-    """At the centre the weights are 1/2 and nearly 1/2, so the map is the mean of the two values,
-    whatever their magnitude."""
+    """At the centre both weigh about 1/2: the map is the mean of any two values."""
     gaussians, camera = two_in_a_row()
     values = {"information": (1e-4, 3e-4), "large": (4e6, 0), "flat": (7.0, 7.0)}
     scalars = {name: np.array(pair) for name, pair in values.items()}

@@ -62,8 +62,7 @@ def posterior(points, views, degree, tau):
 
 @given(seeds, degrees, taus)
 def test_a_rank_one_update_gives_what_full_inverses_give(seed, degree, tau):
-    """D: decrease of log det S, times three channels, halved. I: decrease of the variance summed
-    over the dome."""
+    """D: 1.5 times the fall of log det S. I: fall of the variance summed over the dome."""
     points, pool, dome = scene(seed)
     taken, candidates = some(pool, [0, 1, 2]), [3, 4, 5, 6]
     before = posterior(points, taken, degree, tau)

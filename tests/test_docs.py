@@ -1,5 +1,4 @@
-"""README and docs/: commands, links, names and constants are those of the code; pages run as they
-stand, on small data."""
+"""README and docs/: commands, links, names and constants are right; pages run on small data."""
 
 import importlib.util
 import json

@@ -148,8 +148,7 @@ def test_evaluate(tmp_path):
 
 
 def random_view(rng):
-    """Truth [H,W,4] with alphas of 0, 1 and between, weight, mask, true depth with holes, and a
-    render's alpha and depth."""
+    """Truth [H,W,4] of any alphas, weight, mask, depth with holes; alpha and depth of a render."""
     shape = (6, 5)
     alpha = rng.choice([0.0, 0.3, 1.0], shape)
     truth = np.dstack([np.zeros((*shape, 3)), alpha])

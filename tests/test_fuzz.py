@@ -51,8 +51,7 @@ WORDS += [b'"../x"', b'"\\u0000"', b"list uchar int", b"vertex", b"face"]
 
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:
-    """Bytes of a file: truncated, with bytes flipped, with numbers or words in the place of others,
-    with a part repeated."""
+    """Bytes cut off, flipped or repeated, with numbers or words in the place of others."""
     found = bytearray(data)
     for _ in range(rng.integers(1, 5)):
         place = rng.integers(len(found) + 1)

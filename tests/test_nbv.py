@@ -1,5 +1,4 @@
-"""The loop in a folder with the operations of tests/tiny.py: one view or a batch at a time, nearby
-views, resumed runs."""
+"""The loop in a folder, on tests/tiny.py: single views, batches, nearby views, resumed runs."""
 
 import json
 import math
@@ -314,8 +313,7 @@ def test_cost_of_an_image_and_of_the_way_to_it(positions, here, travel, factor):
 @pytest.mark.parametrize("travel", [0.01, 1.5])
 @pytest.mark.parametrize("batch", [1, 2])
 def test_the_choice_is_the_best_gain_for_its_cost(loaded, tmp_path, travel, batch):
-    """The recorded score remains the policy's own. With travel = 0.01 m, the gain per metre
-    decides."""
+    """The recorded score is the policy's own. With 0.01 m, the gain per metre decides."""
     state = run(tmp_path / "run", loaded, travel=travel, batch=batch, budget=2)
     seeds = run(tmp_path / "seeds", loaded, budget=0)
     first = run(tmp_path / "first", loaded, travel=travel, budget=1)

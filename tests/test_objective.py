@@ -102,8 +102,7 @@ UNSEEN = np.zeros((20, 24, 4), np.float32)
 
 
 def test_a_start_in_the_memory_of_the_model_is_kept_apart():
-    """Otherwise a recorded step takes model and start for one array, and a later fit is pulled to
-    the wrong start."""
+    """Otherwise a recorded step takes both for one array, and later fits have a wrong start."""
     model = surface_gaussians(50)
     images = model, [surface_camera(model, 24, 20)], [UNSEEN]
     settings = TrainSettings(optimiser="adam", passes=1, rates={"colour": 0.01})

@@ -87,8 +87,7 @@ pytestmark = pytest.mark.usefixtures("coarse_priors")
 
 
 def read_only(tmp_path: Path) -> Path:
-    """A folder nobody may write to: root is not held back by permissions, so for root it is the
-    kernel's own."""
+    """A folder nobody may write to; for root, which permissions do not hold back, the kernel's."""
     if os.geteuid() == 0:
         return Path("/proc/mgs")
     folder = tmp_path / "locked"

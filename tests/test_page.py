@@ -1,5 +1,4 @@
-"""The report page: what stands in it, from runs that are finished, unfinished, unmeasured; and in a
-real browser."""
+"""The report page: what stands in it, whatever the runs; and in a real browser."""
 
 import json
 import re
@@ -25,8 +24,7 @@ from mgs.reports.page_plots import corners_at
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Two runs on stand-in operations: one finished and measured, one stopped two steps before its
-    end."""
+    """Two runs: one finished and measured, one stopped two steps before its end."""
     root = tmp_path_factory.mktemp("a <b> & c")  # to be escaped, in an address and in text
     tiny.write_dataset(root / "data/test", frames=3)
     dataset = load_dataset(tiny.write_dataset(root / "data"))
@@ -122,8 +120,7 @@ def test_the_page_is_the_same_every_time(page, runs):
 
 
 def test_uncertainty_falls_with_every_view(runs):
-    """The maps before and after a view are those of the exact information of the views until then,
-    as written out here."""
+    """Maps before and after a view are of the exact information of the views until then."""
     from mgs.policy.criteria import regularisation
     from mgs.splat import fisher, groups
 
@@ -178,8 +175,7 @@ def test_old_metrics_are_left_out(runs, tmp_path):
 
 
 def test_test_views_are_compared_and_their_metrics_shown(runs, tmp_path):
-    """Under names that cannot be mistaken for those of the dataset's own views; the first is the
-    most typical."""
+    """Under names unlike those of the dataset's own views; the first is the most typical."""
     metrics = read_json(runs[0] / "metrics.json")
     mean = metrics["test"]["psnr"]
     typical = min(metrics["test_views"], key=lambda view: abs(view["psnr"] - mean))

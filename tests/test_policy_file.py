@@ -83,10 +83,10 @@ def run(out, dataset, **values):
     return tiny.run(out, dataset, **({"budget": 3} | values))
 
 
-@pytest.mark.parametrize(
-    ("function", "same"),
-    [("poses", "farthest"), ("information", "d-optimal"), ("surface", "coverage")],
-)
+SAME = {"poses": "farthest", "information": "d-optimal", "surface": "coverage"}
+
+
+@pytest.mark.parametrize(("function", "same"), SAME.items())
 def test_arguments_are_passed_by_parameter_name(loaded, file, tmp_path, function, same):
     ours = run(tmp_path / "ours", loaded, policy=f"{file}:{function}")
     theirs = run(tmp_path / "theirs", loaded, policy=same)

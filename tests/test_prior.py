@@ -207,8 +207,7 @@ def test_visible_is_the_near_side():
 
 @pytest.mark.parametrize("far", [0.0, 1e6])
 def test_depth_of_a_box_is_exact(far):
-    """Against the slabs of the box in closed form; float32 even a thousand kilometres from the
-    origin."""
+    """Against the slabs of the box, in float32 even 1,000 km from the origin."""
     size, middle = np.array([1.0, 0.7, 0.5]), np.array([far, -far, 0.3])
     box = trimesh.creation.box(size)
     K = np.array([[80.0, 0, 30.2], [0, 75.0, 25.9], [0, 0, 1]])
@@ -297,8 +296,7 @@ def test_prior_round_trip_and_determinism(built, dataset, tmp_path):
 
 
 def test_one_frame_with_depth_gives_what_it_saw(tmp_path):
-    """Its cloud is open on the far side: Poisson closes it, and only what the frame saw is
-    sampled."""
+    """Poisson closes its open far side, and only what the frame saw is sampled."""
     dataset = synthetic.write_dataset(tmp_path)
     dataset = replace(dataset, frames=dataset.frames[:1])
     (tmp_path / "rock.glb").unlink()

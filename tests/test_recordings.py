@@ -162,15 +162,9 @@ POSES = {
 
 
 def write_bag(
-    path: Path,
-    dataset,
-    version: int = 2,
-    leave_out: str = "",
-    poses: tuple[str, ...] = ("mount", "tf"),
-    storage: str = "SQLITE3",
-    compressed: str = "",
-    depth: bool = True,
-) -> Path:
+    path, dataset, version=2, leave_out="", poses=("mount", "tf"), storage="SQLITE3", compressed="",
+    depth=True,
+):  # fmt: skip
     """Write a bag without the topics whose names contain `leave_out`. compressed: encoding of
     compressed depth. depth: with depth, and images that are no keyframes."""
     bag = Bag(path, version, storage)
@@ -203,13 +197,12 @@ def write_tum(root: Path, dataset) -> Path:
     """Folder as of the benchmark."""
     copy_images(dataset, root / "rgb", root / "depth", unit=1 / 5000)
     frames = list(enumerate(dataset.frames))
-    listed = {
+    poses = [pose_line(100.0 + k, frame) for k, frame in frames]
+    for kind, lines in {
         "rgb": [f"{100 + k} rgb/{k}.png" for k, _ in frames],
         "depth": [f"{100.01 + k} depth/{k}.png" for k, _ in frames],
-        "groundtruth": ["# timestamp tx ty tz qx qy qz qw"]
-        + [pose_line(100.0 + k, frame) for k, frame in frames],
-    }
-    for kind, lines in listed.items():
+        "groundtruth": ["# timestamp tx ty tz qx qy qz qw", *poses],
+    }.items():
         (root / f"{kind}.txt").write_text("\n".join(lines))
     K = opencv_K(dataset.frames[0].camera)
     (root / "calibration.txt").write_text(f"{K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]}")

@@ -52,8 +52,7 @@ def images_of(truth, start, views=VIEWS):
 def test_the_gain_is_the_logarithm_of_the_ratio_of_two_marginal_likelihoods(
     pixels, sigma, tau, seed
 ):
-    """In a linear model with one parameter it is exact: pixels = slope * parameter + noise, against
-    noise alone."""
+    """Exact in a linear model: pixels = slope * parameter + noise, against noise alone."""
     rng = np.random.default_rng(seed)
     slope = rng.normal(size=pixels)
     seen = slope * rng.normal(0, tau) + rng.normal(0, sigma, pixels)

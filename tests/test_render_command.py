@@ -34,8 +34,7 @@ def gaussians(degree: int, n: int = 40) -> Gaussians:
 
 
 def columns(g: Gaussians) -> dict[str, np.ndarray]:
-    """Properties of the 3DGS layout by its definition: f_rest holds all of red, then green, then
-    blue."""
+    """Properties of the 3DGS layout: f_rest holds all of red, then green, then blue."""
     named = {name: g.means[:, i] for i, name in enumerate("xyz")}
     named |= {f"f_dc_{c}": g.sh[:, 0, c] for c in range(3)}
     rest = g.sh.shape[1] - 1
@@ -46,8 +45,7 @@ def columns(g: Gaussians) -> dict[str, np.ndarray]:
 
 
 def foreign_ply(path, g: Gaussians, encoding: str = "ascii") -> None:
-    """Write a PLY as another tool might: properties shuffled, unknown properties, another element
-    first."""
+    """Write a PLY of another tool: shuffled, unknown properties, another element first."""
     rng, n = np.random.default_rng(g.sh_degree), len(g)
     named = columns(g) | {"red": rng.integers(0, 255, n, np.uint8), "confidence": rng.random(n)}
     named |= {"nx": np.zeros(n, np.float32), "f_rest_of_it": np.ones(n, np.float32)}
@@ -116,8 +114,7 @@ SH_AS_PUBLISHED = [
     lambda x, y, z: 1.445305721320277 * z * (x * x - y * y),
     lambda x, y, z: -0.5900435899266435 * x * (x * x - 3 * y * y),
 ]
-"""Real spherical harmonics with the signs of the 3DGS paper's code; directions from the camera to
-the Gaussian."""
+"""Real harmonics with the signs of 3DGS; directions from the camera to the Gaussian."""
 
 
 def test_harmonics_are_those_of_3dgs(tmp_path):
@@ -138,8 +135,7 @@ def test_harmonics_are_those_of_3dgs(tmp_path):
 
 
 def test_colour_spaces(folder):
-    """Our files are marked linear; the option overrules; the EXR is always linear, with alpha and
-    depth."""
+    """Ours are marked linear; the option overrules; an EXR is always linear."""
     model = gaussians(1)
     write_ply(folder / "ours.ply", model)
     foreign_ply(folder / "theirs.ply", model)

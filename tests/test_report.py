@@ -1,5 +1,4 @@
-"""Figures and tables from run folders: right numbers, right picture sizes, and a clear line where a
-file is missing."""
+"""Figures and tables from run folders: right numbers and sizes, a line where a file is missing."""
 
 import io
 import re
@@ -31,8 +30,7 @@ FIGURES = ("orbit", "gain", "coverage", "comparison", "psnr")
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Two runs of the real loop on stand-ins, on a dataset with three test views, evaluated with a
-    renderer of one grey."""
+    """Two runs on a dataset with three test views, evaluated with a renderer of one grey."""
     root = tmp_path_factory.mktemp("report")
     tiny.write_dataset(root / "data/test", frames=3)
     dataset = load_dataset(tiny.write_dataset(root / "data"))

@@ -65,15 +65,12 @@ def test_versions_are_compared_as_numbers(tmp_path):
     assert names == ["libLLVM.so.22.1", "libLLVM.so.19.1", "libLLVM-15.so.1", "libLLVM-9.so.1"]
 
 
-@pytest.mark.parametrize(
-    ("library", "message"),
-    [
-        ("/nowhere/libLLVM.so", "no such file"),
-        (__file__, "does not load"),
-        ("libm.so.6", "is another library"),
-    ]
-    + [(path, f"is version 1[0-8], older than {MIN_LLVM}") for path in OLD],
-)
+LIBRARIES = [("/nowhere/libLLVM.so", "no such file"), (__file__, "does not load")]
+LIBRARIES += [("libm.so.6", "is another library")]
+LIBRARIES += [(path, f"is version 1[0-8], older than {MIN_LLVM}") for path in OLD]
+
+
+@pytest.mark.parametrize(("library", "message"), LIBRARIES)
 def test_a_bad_library_is_named(monkeypatch, library, message):
     monkeypatch.setenv(runtime.LIBRARY_VARIABLE, library)
     assert runtime.LIBRARY_VARIABLE in fails(message, runtime.find_libllvm)

@@ -149,8 +149,7 @@ def test_coverage_is_the_area_that_the_outline_cuts_off(ball):
 
 
 def test_a_rock_of_one_colour_keeps_it():
-    """Its light is colour times coverage, whatever share of samples met it; so is its
-    continuation."""
+    """Light and its continuation are colour times coverage, whatever samples met it."""
     colour, coverage = np.array([0.1, 0.2, 0.4], np.float32), np.zeros((6, 7), np.float32)
     coverage[1:5, 2:6], coverage[0, 2:6] = 1, 0.25
     share = np.random.default_rng(0).binomial(4, coverage).astype(np.float32) / 4

@@ -23,8 +23,7 @@ PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
 def assert_close(read: Gaussians, model: Gaussians, ranges: np.ndarray) -> None:
-    """Check equality within half a step of each field. ranges [9]: of position, log-scale and
-    colour."""
+    """Check equality within half a step; ranges [9]: of position, log-scale and colour."""
     half = 0.5 * ranges / [2047, 1023, 2047, 2047, 1023, 2047, 255, 255, 255] * 1.001 + 1e-6
     assert (np.abs(read.means - model.means) <= half[:3]).all()
     assert (np.abs(read.log_scales - model.log_scales) <= half[3:6]).all()

@@ -69,15 +69,12 @@ def test_sensor_scale_and_missing_returns():
     assert np.allclose(np.diff(levels[1:]), QUANTUM * 4, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("degrees", "least", "most"), [(30, 0, 0.01), (75, 0.3, 0.7), (84, 0.85, 1)]
-)
-def test_grazing_returns_are_lost(degrees, least, most):
-    depth, camera = _wall(2.0, np.radians(degrees))
-    depth = np.where((depth > 0) & (depth < 5), depth, 0)
-    centre = np.s_[200:280, 300:340]
-    lost = (noisy_depth(depth, camera, np.random.default_rng(0)) == 0)[centre].mean()
-    assert least <= lost <= most
+def test_grazing_returns_are_lost():
+    for degrees, least, most in ((30, 0, 0.01), (75, 0.3, 0.7), (84, 0.85, 1)):
+        depth, camera = _wall(2.0, np.radians(degrees))
+        depth = np.where((depth > 0) & (depth < 5), depth, 0)
+        noisy = noisy_depth(depth, camera, np.random.default_rng(0))
+        assert least <= (noisy == 0)[200:280, 300:340].mean() <= most
 
 
 def test_noise_is_measured_and_filtered_without_blurring_edges():

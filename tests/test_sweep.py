@@ -103,8 +103,7 @@ def add_slowly(root, out, x):
 
 
 def write_process(root, out, **arguments):
-    """A task that finds its process, and whether another cell of the study had begun and not
-    ended."""
+    """A task that finds its process, and whether another cell has begun and not ended."""
     others = [folder for folder in out.parent.iterdir() if folder != out]
     beside = [folder.name for folder in others if not (folder / "result.json").exists()]
     return {"pid": os.getpid(), "beside": beside}
@@ -116,8 +115,7 @@ def die(root, out):
 
 
 def real_run(root, out, data, killed=False):
-    """A task: `mgs nbv`; its process is killed after the first choice of the first attempt, if
-    asked for."""
+    """A task: `mgs nbv`; if asked for, its first attempt is killed after its first choice."""
     from mgs.gaussians import ARRAYS
     from mgs.run.inputs import array_digest
     from mgs.run.nbv import resume_nbv, run_nbv
@@ -221,32 +219,27 @@ def test_what_a_cell_raises_in_a_worker_is_raised_and_what_is_done_is_kept(tmp_p
 
 
 def test_a_cell_that_kills_its_worker_again_and_again_is_one_clear_line(tmp_path, scheduler):
-    with pytest.raises(InputError, match="deadly: its worker was killed again and again"):
-        run_cells(tmp_path, [Cell("deadly", "test_sweep:die")], silent, scheduler=scheduler)
+    cells = [Cell("deadly", "test_sweep:die")]
+    fails("deadly: its worker", run_cells, tmp_path, cells, silent, scheduler=scheduler)
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x"])
 def test_a_scheduler_that_does_not_answer_is_one_clear_line(tmp_path, address, monkeypatch):
     monkeypatch.setattr(sweep, "CONNECT_SECONDS", 0.5)
-    with pytest.raises(InputError, match=f"^--scheduler {address}: no Dask scheduler answers"):
-        run_cells(tmp_path, [cell("a", x=1)], silent, scheduler=address)
+    cells, named = [cell("a", x=1)], f"^--scheduler {address}: no Dask"
+    fails(named, run_cells, tmp_path, cells, silent, scheduler=address)
 
 
-@pytest.mark.parametrize(
-    ("workers", "fault"), [(0, "has no worker"), (1, "has a worker with several threads")]
-)
+@pytest.mark.parametrize(("workers", "fault"), [(0, "has no worker"), (1, "several threads")])
 def test_a_scheduler_whose_workers_will_not_do_is_one_clear_line(
     tmp_path, workers, fault, monkeypatch
 ):
     monkeypatch.setattr(sweep, "CONNECT_SECONDS", 1)
-    options = {"processes": False, "dashboard_address": "127.0.0.1:0"}
-    with (
-        LocalCluster(
-            n_workers=workers, threads_per_worker=2, host="127.0.0.1", protocol="tcp://", **options
-        ) as cluster,
-        pytest.raises(InputError, match=fault),
-    ):
-        run_cells(tmp_path, [cell("a", x=1)], silent, scheduler=cluster.scheduler_address)
+    options = {"processes": False, "dashboard_address": "127.0.0.1:0", "threads_per_worker": 2}
+    options |= {"host": "127.0.0.1", "protocol": "tcp://"}
+    with LocalCluster(n_workers=workers, **options) as cluster:
+        place = {"scheduler": cluster.scheduler_address}
+        fails(fault, run_cells, tmp_path, [cell("a", x=1)], silent, **place)
 
 
 SLEEP = Cell("sleep", "test_sweep:sleep")
@@ -263,13 +256,11 @@ def test_a_lost_scheduler_is_one_line(tmp_path, caplog):
     file, here = ["--scheduler-file", place], {"PYTHONPATH": os.pathsep.join(sys.path)}
     of_scheduler = ["scheduler", *file, "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
     of_worker = ["worker", *file, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
+    options = {"env": os.environ | here, "stderr": subprocess.DEVNULL}
+    begun = [sys.executable, "-m"]
     scheduler, worker = (
-        subprocess.Popen(
-            [sys.executable, "-m", f"distributed.cli.dask_{name}", *arguments],
-            env=os.environ | here,
-            stderr=subprocess.DEVNULL,
-        )
-        for name, *arguments in (of_scheduler, of_worker)
+        subprocess.Popen([*begun, f"distributed.cli.dask_{name}", *rest], **options)
+        for name, *rest in (of_scheduler, of_worker)
     )
 
     def lose():

@@ -52,8 +52,7 @@ def same(a: Gaussians, b: Gaussians) -> bool:
 
 
 def derivative(start: Gaussians, camera: Camera, target: np.ndarray, i: int) -> float:
-    """Half the summed squared error, by the first colour coefficient of one Gaussian: central
-    difference."""
+    """Derivative of half the squared error by the first colour coefficient of a Gaussian."""
     values = []
     for step in (0.05, -0.05):
         sh = start.sh.copy()

@@ -113,8 +113,7 @@ def test_a_whole_scene_opens_at_a_camera(run, monkeypatch):
 
 
 def test_a_world_of_large_numbers_is_shown_smaller(run):
-    """Depth in a browser ends at 160: with 1,000 times the lengths of a run all would be behind
-    that."""
+    """Depth in a browser ends at 160, in front of a run of 1,000 times the lengths."""
     subject, factor = read_subject(run), 1000
     assert scaled(subject) is subject
     g, mesh = subject.gaussians, subject.mesh
@@ -183,8 +182,7 @@ def test_refusals(capsys, run, dataset, prior, tmp_path, monkeypatch):
 
 @contextmanager
 def viewing(*arguments):
-    """`mgs view ARGUMENTS` in a process of its own; gives its address. Ctrl-C must end it in
-    peace."""
+    """`mgs view` in a process of its own; gives its address. Ctrl-C must end it in peace."""
     command = [sys.executable, "-m", "mgs", "view", *map(str, arguments), "--port", "0"]
     # A shell starts what runs in the background deaf to SIGINT, which is what ends the viewer.
     hearing = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
@@ -268,8 +266,7 @@ def screenshot(tab) -> np.ndarray:
 
 
 def screen_becomes(tab, wanted, seconds=60.0) -> np.ndarray:
-    """A screenshot for which `wanted` is true; the last one if there is none until the time is
-    up."""
+    """A screenshot for which `wanted` is true; the last one if the time is up."""
     until = time.monotonic() + seconds
     while not wanted(picture := screenshot(tab)) and time.monotonic() < until:
         tab.wait_for_timeout(300)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from synthetic import pinhole, sphere
 
-from mgs import Camera, Checkpoint, Frame, Gaussians, Scene, TrainSettings, sh_from_rgb
+from mgs import Camera, Checkpoint, Frame, Gaussians, Scene, sh_from_rgb
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.data.meshes import Mesh
 from mgs.files import write_json
@@ -30,12 +30,8 @@ from mgs.run import recording
 from mgs.run.settings import NbvSettings
 
 FRAMES, POINTS, WIDTH, HEIGHT = 12, 40, 16, 12
-GROUPS = {
-    "colour": slice(0, 3),
-    "scale": slice(3, 6),
-    "rotation": slice(6, 10),
-    "opacity": slice(10, 11),
-}
+GROUPS = {"colour": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 10)}
+GROUPS["opacity"] = slice(10, 11)
 
 
 def orbit(frames: int = FRAMES) -> list[Camera]:
@@ -104,14 +100,7 @@ def estimate(gaussians: Gaussians, camera: Camera, estimator: str) -> np.ndarray
     return F[:, None] * np.eye(11, dtype=np.float32) if estimator == "block" else F
 
 
-def fit(
-    gaussians: Gaussians,
-    start: Gaussians,
-    cameras: list[Camera],
-    targets: list[np.ndarray],
-    train: TrainSettings,
-    on_pass,
-) -> Fit:
+def fit(gaussians: Gaussians, start: Gaussians, cameras, targets, train, on_pass) -> Fit:
     """Move each point's colour half way to the mean of its pixels."""
     on_pass(0, 1)
     total, weight = np.zeros((POINTS, 3)), np.full(POINTS, 1e-6)
@@ -175,8 +164,7 @@ def prior(up=(0, 0, 1)) -> Prior:
 
 
 def scene(dataset: Dataset, settings: NbvSettings, **parts) -> TinyScene:
-    """The scene of a dataset. parts: as in `TinyScene`; `capture`, `prior` and `keep` as in
-    `Scene`."""
+    """The scene of a dataset. parts: of `TinyScene`; `capture`, `prior`, `keep` of `Scene`."""
     of_scene = {key: parts.pop(key) for key in ("capture", "keep") if key in parts}
     of_scene = {"keep": VIEW_BYTES if settings.batch > 1 or settings.flies else 0} | of_scene
     made_from = parts.pop("prior", None) or prior()
@@ -238,14 +226,9 @@ def write_measured_run(out: Path, dataset: Dataset, grey: float, parts=(), **val
         one = np.ones((camera.height, camera.width))
         return np.full((*one.shape, 3), grey, np.float32), one, one
 
-    metrics = evaluate_model(
-        made.state.gaussians,
-        dataset.frames,
-        [frame.name for frame in made.taken],
-        test_frames=tests.frames if tests else (),
-        renderer=wall,
-        pictures=out / "renders",
-    )
+    options = {"test_frames": tests.frames if tests else (), "pictures": out / "renders"}
+    model, names = made.state.gaussians, [frame.name for frame in made.taken]
+    metrics = evaluate_model(model, dataset.frames, names, renderer=wall, **options)
     write_json(out / "metrics.json", {"policy": values["policy"]} | metrics)
     return out
 

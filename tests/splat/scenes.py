@@ -1,8 +1,6 @@
 """Random scenes for the splat tests, and comparisons."""
 
 import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -76,8 +74,7 @@ def make_clamped(seed, degree=0, n=16, antialiased=True, **style) -> Gaussians:
 
 
 def place(camera: Camera, pixels, depths) -> np.ndarray:
-    """World points [N,3] that the camera sees at these pixels [N,2] and z-depths [N] (negative:
-    behind it)."""
+    """World points [N,3] seen at these pixels [N,2] and z-depths [N] (negative: behind)."""
     pixels, z = np.asarray(pixels, np.float64), np.asarray(depths, np.float64)
     x, y = ((pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2] * z[:, None]).T
     pose = camera.camera_to_world
@@ -90,8 +87,7 @@ def double(gaussians: Gaussians) -> Gaussians:
 
 
 def difference(gaussians, tangents, camera, background, step=1e-6) -> dict[str, np.ndarray]:
-    """Derivative of the reference's images along tangents of parameters, by a central
-    difference."""
+    """Derivative of the reference's images along tangents, by a central difference."""
     ends = []
     for sign in (+1, -1):
         moved = double(gaussians)
@@ -135,22 +131,16 @@ def thread_count(count: int) -> Iterator[None]:
 
 def in_own_process(code: str, *arguments: str, **environment: str) -> str:
     """Output of Python code that runs in the folder `tests`."""
-    done = subprocess.run(
-        [sys.executable, "-c", "from mgs import runtime\n" + code, *arguments],
-        cwd=Path(__file__).parents[1],
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    from program import python
+
+    code = "from mgs import runtime\n" + code
+    done = python(code, *arguments, env=environment, cwd=Path(__file__).parents[1])
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
 def calm(make, camera: Camera, seed: int, least: float = 3e-5) -> Gaussians:
-    """The first scene make(seed), make(seed + 1000), ... without a pixel within `least` of a
-    decision."""
+    """The first of make(seed), make(seed + 1000), ... without a pixel this near to a decision."""
     for attempt in range(200):
         gaussians = make(seed + 1000 * attempt)
         if margins(gaussians, camera).min() > least:

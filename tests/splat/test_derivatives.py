@@ -180,8 +180,7 @@ def test_all_images_change_as_differences_say(degree, names):
 def test_tangents_and_gradients_are_of_one_jacobian(
     seed, degree, scale, stretch, logit, names, antialiased
 ):
-    """<u, J v> = <J^T u, v> for images u and tangents v: forward and reverse mode are two different
-    kernels."""
+    """<u, J v> = <J^T u, v>: forward and reverse mode are two different kernels."""
     camera, style = make_camera(), {"antialiased": antialiased}
     style |= {"log_scales": (scale - stretch, scale), "logits": (logit - 4, logit)}
     gaussians = make_gaussians(12, seed, degree, **style)

@@ -1,5 +1,4 @@
-"""Bitwise equal images, gradients and Fisher information: reruns, threads, processes,
-registers."""
+"""Bitwise equal images, gradients and information: reruns, threads, processes, registers."""
 
 import hashlib
 import json
@@ -30,8 +29,7 @@ def ones(gaussians, scale=1.0) -> dict[str, np.ndarray]:
 
 
 def results() -> dict[str, bytes]:
-    """Bytes of images, gradients and tangents by all parameters, and Fisher information by every
-    estimator."""
+    """Bytes of images, of gradients and tangents by all parameters, and of every information."""
     gaussians, camera = scene()
     model = scenes.with_gradients(gaussians)
     image = render(model, camera, BACKGROUND)

@@ -1,5 +1,4 @@
-"""Fisher information, also of means and with alpha as a fourth channel, against a float64 Jacobian
-per pixel and channel."""
+"""Fisher information, also of means and alpha, against a float64 Jacobian per pixel and channel."""
 
 from itertools import product
 
@@ -20,8 +19,7 @@ TOLERANCE = 1e-3
 FLOOR = 1e-6
 """Entries below this share of the largest are compared absolutely."""
 CORRELATION = {True: 2e-5, False: 1e-5}
-"""Tolerance of blocks, as a share of sqrt(H_ii H_jj), because columns have different units, by
-`antialiased`."""
+"""Tolerance of blocks, by `antialiased`, as a share of sqrt(H_ii H_jj): columns have own units."""
 
 
 def assert_close(found, expected, what=""):
