@@ -28,6 +28,13 @@ def command(*arguments) -> None:
     assert exit_code(*arguments) == 0
 
 
+def output(capsys, *arguments) -> str:
+    """What `mgs ARGUMENTS` alone prints, in one line; fails unless it exits with 0."""
+    capsys.readouterr()
+    command(*arguments)
+    return said(capsys)[0]
+
+
 def study(name, *arguments, exit_code=0, **changes) -> None:
     """Run a study; fails unless it exits with this code. changes: of the fields of the `Study`."""
     with pytest.raises(SystemExit) as stop:

@@ -20,6 +20,7 @@ def listing(root: Path) -> dict[str, bytes | None]:
 def refused(capsys, arguments: list, out: Path | None = None, study: str = "") -> str:
     """Run `mgs ARGUMENTS`, or a study of this name; check that one line is printed, the exit code
     is 2, and `out` is unchanged; return the line."""
+    capsys.readouterr()
     before, words = listing(out) if out else None, [str(argument) for argument in arguments]
     with pytest.raises(SystemExit) as stop:
         study_of(study)(words) if study else main(words)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from program import command
+from program import command, output
 from refusals import fails, refused
 from test_render_command import CAMERAS, gaussians
 
@@ -304,8 +304,7 @@ def test_the_command_writes_what_fits_and_programs_read_it(dataset, prior, tmp_p
     settings = {"prior": prior, "seeds": 4, "budget": 0, "train": {"passes": 5}}
     mgs.run_nbv(dataset, run, **settings)
     capsys.readouterr()
-    command("export", run, "--bytes", "2k")
-    printed = capsys.readouterr().out
+    printed = output(capsys, "export", run, "--bytes", "2k")
     alone = run / "export.mgs"
     assert alone.stat().st_size <= 2000
     assert f"{alone.stat().st_size:,} bytes" in printed

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from program import command
+from program import command, output
 from refusals import fails, refused
 from test_meshes import glb, parts_of
 from test_render_command import CAMERAS, gaussians
@@ -55,9 +55,9 @@ def colours(model: Gaussians, directions: np.ndarray) -> np.ndarray:
     return np.einsum("dk,nkc->ndc", sh_basis(directions, 3), model.sh)
 
 
-def written(tmp_path, kind: str, model: Gaussians):
+def written(tmp_path, kind: str, model: Gaussians, turn=to_y_up((0, 0, 1))):
     path = tmp_path / f"x{FORMATS[kind]}"
-    write_gaussians(path, model, kind, to_y_up((0, 0, 1)))
+    write_gaussians(path, model, kind, turn)
     return path
 
 
@@ -78,9 +78,7 @@ def test_a_model_comes_back(tmp_path, kind, degree):
 
 def test_a_glb_says_how_far_its_positions_reach(tmp_path):
     model = gaussians(0, n=30)
-    path = tmp_path / "x.glb"
-    write_gaussians(path, model, "glb", np.eye(3))
-    document, _ = parts_of(path)
+    document, _ = parts_of(written(tmp_path, "glb", model, np.eye(3)))
     position = document["meshes"][0]["primitives"][0]["attributes"]["POSITION"]
     reach = [document["accessors"][position][name] for name in ("min", "max")]
     assert np.array_equal(reach, [model.means.min(0), model.means.max(0)])
@@ -184,8 +182,7 @@ def glb_with(path, change) -> None:
 def test_the_transforms_of_nodes_are_applied(tmp_path, scale):
     """Means and covariances under any scale, colours by the direction in the node's own axes."""
     model, matrix = gaussians(3), tilted(scale)
-    path = tmp_path / "x.glb"
-    write_gaussians(path, model, "glb", np.eye(3))
+    path = written(tmp_path, "glb", model, np.eye(3))
     half = {"matrix": np.diag([0.5, 0.5, 0.5, 1]).ravel().tolist(), "children": [1]}
     inner = {"mesh": 0, "matrix": (np.diag([2, 2, 2, 1]) @ matrix).T.ravel().tolist()}
     glb_with(path, lambda content: content.update(nodes=[half, inner]))
@@ -199,16 +196,15 @@ def test_the_transforms_of_nodes_are_applied(tmp_path, scale):
 
 
 def test_shear_is_refused(tmp_path):
-    path = tmp_path / "x.glb"
-    write_gaussians(path, gaussians(0), "glb", np.eye(3))
+    path = written(tmp_path, "glb", gaussians(0), np.eye(3))
     sheared = {"mesh": 0, "matrix": tilted(1.0, shear=0.3).T.ravel().tolist()}
     glb_with(path, lambda content: content.update(nodes=[sheared]))
     fails("has shear", load_gaussians, path)
 
 
 def test_all_primitives_are_read(tmp_path):
-    path, model = tmp_path / "x.glb", gaussians(1)
-    write_gaussians(path, model, "glb", np.eye(3))
+    model = gaussians(1)
+    path = written(tmp_path, "glb", model, np.eye(3))
     shifted = [{"mesh": 0}, {"mesh": 0, "translation": [0, 0, 2]}]
 
     def twice(content):
@@ -222,9 +218,9 @@ def test_all_primitives_are_read(tmp_path):
 
 def test_a_model_that_is_not_z_up_comes_back_in_its_own_axes(tmp_path):
     model, up = gaussians(0), (0.6, 0.0, 0.8)
-    write_gaussians(tmp_path / "x.glb", model, "glb", to_y_up(up))
-    np.testing.assert_array_equal(load_gaussians(tmp_path / "x.glb").means, model.means)
-    np.testing.assert_allclose(upward(tmp_path / "x.glb"), up, atol=1e-12)
+    path = written(tmp_path, "glb", model, to_y_up(up))
+    np.testing.assert_array_equal(load_gaussians(path).means, model.means)
+    np.testing.assert_allclose(upward(path), up, atol=1e-12)
 
 
 RDF = struct.pack("<III", 0xADBE0003, 4, 6)
@@ -265,11 +261,10 @@ def test_float32_too_far_from_the_origin_is_noticed(tmp_path):
 
 
 def test_scales_that_are_logarithms_are_refused(tmp_path):
-    write_gaussians(tmp_path / "x.glb", gaussians(0, n=1), "glb", np.eye(3))
+    path = written(tmp_path, "glb", gaussians(0, n=1), np.eye(3))
     scale = np.exp(gaussians(0, n=1).log_scales).astype("<f4").tobytes()
-    data = (tmp_path / "x.glb").read_bytes()
-    (tmp_path / "x.glb").write_bytes(data.replace(scale, np.full(3, -2, "<f4").tobytes()))
-    fails("negative scales, which are probably logarithms", load_gaussians, tmp_path / "x.glb")
+    path.write_bytes(path.read_bytes().replace(scale, np.full(3, -2, "<f4").tobytes()))
+    fails("negative scales, which are probably logarithms", load_gaussians, path)
 
 
 def test_an_spz_that_unpacks_to_more_than_its_header_says(tmp_path):
@@ -323,8 +318,7 @@ def test_the_command_converts_and_keeps_what_is_there(tmp_path, capsys):
     model = gaussians(1)
     write_ply(tmp_path / "a.ply", model)
     given = ["export", tmp_path / "a.ply", "--sh", 3, "--out", tmp_path / "b.glb"]
-    command(*given)
-    assert "wrote 40 Gaussians" in capsys.readouterr().out
+    assert "wrote 40 Gaussians" in output(capsys, *given)
     read = load_gaussians(tmp_path / "b.glb")
     assert np.array_equal(read.means, model.means)
     assert read.sh.shape == (40, 16, 3)

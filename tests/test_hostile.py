@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import synthetic
 import tiny
-from program import command, said
+from program import command, output
 from refusals import fails, listing, refused
 
 from mgs import InputError, files, load_dataset, write_ply
@@ -108,8 +108,7 @@ def test_the_loser_is_told_who_works_there(capsys, dataset, prior, tmp_path):
 def test_a_finished_import_says_so(capsys, dataset, tmp_path):
     arguments = ["import", dataset, "--out", tmp_path / "out"]
     for words in ("wrote", "is finished already"):
-        command(*arguments)
-        assert words in said(capsys)[0]
+        assert words in output(capsys, *arguments)
     synthetic.edit(dataset, lambda data: data["frames"][2].update(timestamp=99))
     assert "a finished dataset of other" in refused(capsys, arguments, tmp_path / "out")
 

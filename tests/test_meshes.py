@@ -9,7 +9,7 @@ import pytest
 import synthetic
 import trimesh
 from PIL import Image
-from program import command, said
+from program import command, output
 from refusals import fails
 
 from mgs import Dataset, InputError, PriorSettings, load_prior, prior_from_mesh
@@ -49,8 +49,7 @@ def test_a_plain_ply_is_read_as_trimesh_reads_it(tmp_path, monkeypatch):
 
 def test_the_prior_of_a_glb_stands_upright(dataset, tmp_path, capsys):
     options = ["--mesh", dataset.root / "rock.glb", "--gaussians", 100, "--out", tmp_path / "p"]
-    command("prior", dataset.root, *options)
-    assert "turned from +Y up" in said(capsys)[0]
+    assert "turned from +Y up" in output(capsys, "prior", dataset.root, *options)
     assert np.abs(synthetic.level(load_prior(tmp_path / "p").points)).max() < 0.01
 
 

@@ -11,7 +11,7 @@ import pytest
 import synthetic
 import tiny
 import typer
-from program import command, said, steps
+from program import command, output, steps
 from refusals import a_file, listing, occupied, refused
 
 from mgs.cli.app import COMMANDS, app
@@ -217,17 +217,11 @@ def test_a_result_appears_whole(tmp_path, monkeypatch, name):
     assert not list(tmp_path.glob(".*"))
 
 
-def printed(capsys, *arguments) -> str:
-    """Everything that `mgs ARGUMENTS` prints, in one line."""
-    command(*arguments)
-    return said(capsys)[0]
-
-
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_word_of_a_help_text_is_printed(capsys, monkeypatch, name):
     """rich takes a word in brackets, such as [colour=1], for markup and leaves it out."""
     monkeypatch.setenv("COLUMNS", "1000")
-    text = printed(capsys, name, "--help")
+    text = output(capsys, name, "--help")
     made = typer.main.get_command(app).commands[name]
     for words in filter(None, [made.help, *(parameter.help for parameter in made.params)]):
         for paragraph in words.split("\n\n"):

@@ -435,7 +435,6 @@ def test_a_world_in_which_nothing_would_be_drawn_is_one_line(tmp_path, capsys):
     synthetic.write_dataset(tmp_path / "src", depth=False)
     command("import", tmp_path / "src", "--out", tmp_path / "d", "--unit", "0.002")
     command("prior", tmp_path / "d", "--gaussians", "300")
-    capsys.readouterr()
     message = "from it, and nothing nearer than 0.01 is drawn; import the data with `unit`"
     out = tmp_path / "run"
     assert message in refused(capsys, ["nbv", tmp_path / "d", "--out", out, "--budget", 1], out)
@@ -504,7 +503,6 @@ def test_a_fit_with_adaptive_density_is_a_run_as_3dgs(tmp_path, capsys, monkeypa
     for name, value in (("FROM", 0), ("STEPS", 10)):
         monkeypatch.setattr(density, f"ADAPTION_{name}", value)
     fitted = ["fit", tmp_path / "d", "--density", "adaptive", "--out", tmp_path / "run"]
-    capsys.readouterr()
     line = refused(capsys, [*fitted, "--set", "train.most_gaussians=0"], tmp_path / "run")
     assert "train.most_gaussians = 0: must be at least 1" in line
     more = "--passes 8 --set train.most_gaussians=310 --set train.rates.mean=0.01"

@@ -10,7 +10,7 @@ import synthetic
 from hypothesis import given
 from hypothesis import strategies as st
 from plyfile import PlyData
-from program import change_settings, command
+from program import change_settings, output
 from refusals import fails, refused
 from scipy.stats import multivariate_normal
 from splat.scenes import cameras_around
@@ -184,8 +184,7 @@ def run(tmp_path_factory):
 
 def test_a_run_is_refitted_beside_its_model(run, capsys):
     before = {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
-    command("simplify", run, "--method", "refit")
-    said = capsys.readouterr().out
+    said = output(capsys, "simplify", run, "--method", "refit")
     after = {file.name: file.read_bytes() for file in run.iterdir() if file.is_file()}
     refitted = after.pop(REFITTED)
     assert after == before
@@ -226,8 +225,7 @@ def test_a_run_is_pruned_beside_its_model(run, capsys):
         assert informed[kind]["informed"] == expected
     assert 0 < informed["rotation"]["informed"] < 1600
     whole = (run / "gaussians.ply").read_bytes()
-    command("simplify", run)
-    said = capsys.readouterr().out
+    said = output(capsys, "simplify", run)
     left = read_ply(run / "gaussians_pruned.ply")
     assert 0 < len(left) < 400
     assert f"400 Gaussians, {len(left)} stay" in said

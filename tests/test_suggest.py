@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import synthetic
-from program import command, said
+from program import command, output, said
 from pymavlink import mavutil, mavwp
 from refusals import refused
 
@@ -140,8 +140,7 @@ def test_places_behind_a_wall_are_left_out(run, site):
 
 def test_gains_of_a_model_without_a_surface_are_no_guide(run, monkeypatch, capsys):
     monkeypatch.setattr(Prior, "kind", "random")
-    command("suggest", run, "--dome", 5)
-    assert "nothing tells seen from unseen" in said(capsys)[0]
+    assert "nothing tells seen from unseen" in output(capsys, "suggest", run, "--dome", 5)
 
 
 def test_a_coarse_model_keeps_the_best(run, site, monkeypatch):
