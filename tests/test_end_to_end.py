@@ -9,7 +9,7 @@ import synthetic
 from program import command, python, said, steps, timeless
 
 from mgs import ListCache, initial_gaussians, load_dataset, load_prior, read_ply
-from mgs.cli import app, demo, progress
+from mgs.cli import app, demo, terminal
 from mgs.cli.app import COMMANDS, main
 from mgs.evaluation import psnr_measure
 from mgs.run.policies import POLICIES
@@ -74,7 +74,7 @@ def test_the_run_is_whole_and_learns_from_more_images(dataset, run):
 
 def test_a_fit_shows_a_view_before_its_end(dataset, run, tmp_path, capsys, monkeypatch):
     """Without a terminal, lines of progress are on the standard error."""
-    monkeypatch.setattr(progress, "SECONDS_BETWEEN", 0.0)
+    monkeypatch.setattr(terminal, "SECONDS_BETWEEN", 0.0)
     out = tmp_path / "fit"
     command("fit", dataset, "--out", out, "--prior", run / "prior", "--passes", 5)
     printed, lines = said(capsys)
