@@ -14,9 +14,10 @@ from mgs.cli.options import Settings, merged, not_none, parse_gaussians, parse_s
 from mgs.cli.terminal import Terminal, progress_bar
 from mgs.errors import InputError
 from mgs.files import check_writable
+from mgs.fit.settings import Frozen
 from mgs.run.policies import POLICIES
 from mgs.run.policy_file import in_file
-from mgs.run.settings import Frozen, NbvSettings, Positive, settings_in, validated
+from mgs.run.settings import NbvSettings, Positive, settings_in, validated
 
 if TYPE_CHECKING:
     from mgs.gaussians import Gaussians

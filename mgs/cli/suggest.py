@@ -14,8 +14,9 @@ from mgs.cli.options import Count, Settings, not_none, parse_gaussians, parse_se
 from mgs.cli.terminal import Terminal, progress_bar
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
+from mgs.fit.settings import Frozen
 from mgs.progress import listening
-from mgs.run.settings import FlightLimits, Frozen, Positive, SearchLimits, validated
+from mgs.run.settings import FlightLimits, Positive, SearchLimits, validated
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -40,10 +40,14 @@ def complete(given: Any, defaults: Mapping[str, float]) -> Any:
     return {**defaults, **given}
 
 
-class TrainSettings(BaseModel):
-    """Settings of `mgs.fit.fitting.fit_gaussians`."""
+class Frozen(BaseModel):
+    """Settings whose docstrings are their help."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class TrainSettings(Frozen):
+    """Settings of `mgs.fit.fitting.fit_gaussians`."""
 
     means: Literal["frozen", "free"] = "frozen"
     """Whether means are frozen, as in the paper, or free."""
@@ -85,10 +89,8 @@ class TrainSettings(BaseModel):
     _every_kind = field_validator("rates", mode="before")(lambda given: complete(given, RATES))
 
 
-class PoseNoise(BaseModel):
+class PoseNoise(Frozen):
     """Standard deviation of the error of poses that are refined."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     degrees: Positive = 0.25
     """Standard deviation of poses that are refined: of the turn about each axis, degrees."""
@@ -96,10 +98,8 @@ class PoseNoise(BaseModel):
     """The same of the position along each axis, as a share of the distance to the object."""
 
 
-class ModelSettings(BaseModel):
+class ModelSettings(Frozen):
     """How a model is fitted to the views taken, and how its information is measured."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     seed: Annotated[int, Field(ge=0)] = 0
     """Seed of all random draws."""

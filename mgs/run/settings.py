@@ -5,13 +5,14 @@ from pathlib import Path
 from reprlib import repr
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from mgs.errors import InputError, row_named
 from mgs.files import read_json, read_toml
 from mgs.fit.settings import (
     ALPHA_WEIGHT,
     MEAN_RATE,
+    Frozen,
     ModelSettings,
     PoseNoise,
     Positive,
@@ -22,12 +23,6 @@ from mgs.policy.criteria import MEAN_STD, PRIOR_STD
 from mgs.run.policy_file import check_policy
 
 ENOUGH = 0.95  # share of the gain that is enough by default (docs/certificate.md)
-
-
-class Frozen(BaseModel):
-    """Settings whose docstrings are their help."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
 class FlightLimits(Frozen):
