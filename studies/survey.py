@@ -5,6 +5,8 @@ from dataclasses import replace
 from studies import setups
 from studies.frame.program import study_of
 
+tables = setups.tables
+
 STUDY = replace(
     setups.STUDY,
     name="survey",
