@@ -186,7 +186,7 @@ def fit_gaussians(
             slopes = [dr.zeros(mi.Float, len(model)) for _ in range(2)]
             dr.make_opaque(slopes)
         if optimiser.uses_information and (changes or done % INFORMATION_PASSES == 0):
-            information = goal.largest_diagonal(model)
+            information = [_together(part) for part in goal.largest_diagonal(model)]
         parts = zip(kinds, goal.offsets(model), strict=True)
         shapes = {kind: offset.shape for kind, (offset, _) in parts}
         rates = _rates(settings, shapes, learns or {}, done, len(cameras))
@@ -205,6 +205,16 @@ def fit_gaussians(
     passes = len(losses) - 1
     lowest = min((loss for loss in losses[1:] if np.isfinite(loss)), default=losses[0])
     return Fit(best.map(np.asarray), lowest, tuple(losses), passes, passes * len(goal.photos), stop)
+
+
+def _together(information: Any) -> Any:
+    """Information of a kind of parameter by which its steps are measured. The K coefficients of a
+    colour [N,K,3] move a pixel together, so directional ones count K times."""
+    if len(information.shape) < 3 or information.shape[1] == 1:
+        return information
+    factors = np.ones(information.shape, np.float32)
+    factors[:, 1:] = factors.shape[1]
+    return mi.TensorXf(information.array * mi.Float(factors.ravel()), information.shape)
 
 
 def _rates(
