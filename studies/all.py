@@ -28,7 +28,7 @@ STAGES = {
     "table1": ("table1",),
     "flights": ("flights", "--rocks", "12"),
     "survey": ("survey", "--rocks", "8"),
-    "parsimony": ("parsimony",),
+    "parsimony": ("parsimony", "--rocks", "8"),
     "chart": ("chart",),
     "stress": ("stress", "--rocks", "8"),
     "table1-paper": ("table1", "--scale", "paper", "--batch", "5"),

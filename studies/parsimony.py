@@ -1,35 +1,34 @@
 """How much model a scene needs.
 
-Charts quality and cost against the number of Gaussians, the kinds of parameters that are learned,
-and the SH degree, and compares the automatic choice: N of `mgs prior --gaussians auto`, kinds and
-degree of `mgs refit`. A fit sees views one after the other, spread evenly around the rock, as in
-`mgs nbv`.
+Quality against the number of Gaussians, the kinds of parameters that are learned, and the SH
+degree, beside the automatic choices: the number of `mgs prior`, kinds and degree of `mgs simplify
+--method refit`, and its pruning. A fit sees VIEWS even views of a hemisphere, with the default
+settings of `mgs nbv`, and is judged inside the rock.
 """
 
-import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 import mgs
 from mgs.fit.evidence import lean_fit
 from mgs.fit.pruning import prune
-from mgs.fit.settings import RATES
-from mgs.learning import fit_views, images_of
+from mgs.learning import images_of
 from mgs.policy.criteria import PIXEL_NOISE
-from mgs.policy.poses import seed_views
 from mgs.splat import groups
-from studies.frame.case import Case, Rock, Size, judge
-from studies.frame.claim import Claim, Row, judged, single, verdict_table
-from studies.frame.output import Content, Panel, draw_panels, table, write_table
-from studies.frame.program import Study, Work, study_of
+from studies.frame.case import ROCKS, judge
+from studies.frame.claim import Row
+from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
+from studies.frame.program import WORKERS, Study, Work, study_of
 from studies.frame.sweep import Cell
+from studies.setups import SETUPS, SIZES, SetupSize, case_of, sized
 
-AUTO = "auto"
-"""Automatic number of Gaussians."""
+VIEWS = 8
+"""Images that are fitted."""
+
+COUNTS = (2500, 5000, 10_000, 20_000, 40_000)
+"""Fixed numbers of Gaussians."""
 
 LEARNED = {
     "colour": ("colour",),
@@ -41,91 +40,52 @@ LEARNED = {
 
 ALL = "+ rotation"
 
-NUMBER, KINDS, DEGREE = "number of Gaussians", "kinds learned", "SH degree"
-AUTOMATIC, PRUNED = "automatic", "pruned"
-"""Values of the column `choice`: what differs among fixed choices; number, kinds and degree chosen
-automatically; and the fit with the automatic number, pruned."""
+DEGREES = (1, 2)
+"""Degrees of the SH beside 0."""
 
 PRUNE_NOISE = (0.1, 0.2, 0.5)
 """Allowed change by pruning, over the noise of a pixel."""
 
-GREY = [0.2, 0.2, 0.2]
-VARIANTS: dict[str, dict[str, Any]] = {
-    "shining boulder": {"specular": 0.5, "roughness": 0.3},
-    "plain boulder": {"colours": [GREY, GREY], "dust": GREY},
-}
-"""Boulders with other values of keys of [rock] in the scene file."""
-
-SCENES = ("boulder", "strata", "pebbles", "contact-binary", *VARIANTS)
-"""The first two were used to choose the constants of the rule for N; the others test it."""
-
-CLOSE = 0.1
-"""Difference of quality, dB, up to which models count as equally good."""
+NUMBER, KINDS, DEGREE = "number of Gaussians", "kinds learned", "SH degree"
+DEFAULT, REFIT, PRUNED = "default", "refit", "pruned"
+"""Values of the column `choice`: what differs from the default, the refitted model, the pruned."""
 
 
-@dataclass(frozen=True)
-class ParsimonySize:
-    """Size of the study. counts: fixed numbers of Gaussians. views: images that are fitted, the
-    first `seeds` at once. degrees: of the SH."""
-
-    scenes: tuple[str, ...]
-    counts: tuple[int, ...]
-    images: Size
-    views: int
-    seeds: int = 4
-    degrees: tuple[int, ...] = (0, 1, 2)
-
-    def case(self, scene: str, gaussians: int | str) -> Case:
-        """Case of a scene with a prior of so many Gaussians."""
-        changes = {"rock": VARIANTS[scene]} if scene in VARIANTS else {}
-        rock, settings = Rock("boulder" if changes else scene), {"gaussians": gaussians, "seed": 0}
-        return Case(rock, self.images, settings, changes=changes, label=scene)
-
-
-SIZES = {
-    "quick": ParsimonySize(SCENES, (2500, 5000, 10_000, 20_000, 40_000), Size(160, 120, 16, 6), 8),
-    "full": ParsimonySize(
-        SCENES, (10_000, 20_000, 40_000, 80_000, 160_000), Size(320, 240, 32, 12), 12
-    ),
-}
-
-Fixed = tuple[str, int | str, str, int]
-"""Factor that varies, number of Gaussians, kinds learned, and SH degree of a fit."""
+def cells_of(size: SetupSize) -> list[Cell]:
+    """Cells of each rock: dataset, priors, fits, and the refit."""
+    cells: dict[str, Cell] = {}
+    for rock in size.rocks:
+        case = case_of(rock, SETUPS["hemisphere"], size)
+        choices = [(NUMBER, n, ALL, 0) for n in COUNTS] + [(DEFAULT, None, ALL, 0)]
+        choices += [(KINDS, None, learned, 0) for learned in LEARNED if learned != ALL]
+        choices += [(DEGREE, None, ALL, degree) for degree in DEGREES]
+        for choice, number, learned, degree in choices:
+            settings = case.settings if number is None else {"gaussians": number, "seed": 0}
+            more = {"learned": list(LEARNED[learned]), "degree": degree, "pruned": choice == DEFAULT}
+            name = f"fit/{rock.name}/{number or 'auto'}-{'-'.join(LEARNED[learned])}-{degree}"
+            *own, last = replace(case, settings=settings).with_task(
+                name, f"{__name__}:fit_and_judge", False, **more
+            )
+            about: Row = {"rock": rock.name, "scene": rock.scene, "choice": choice}
+            about |= {"asked": number or 0, "learned": learned, "degree": degree}
+            cells |= {cell.name: cell for cell in (*own, replace(last, about=about))}
+        last = case.with_task(f"refit/{rock.name}", f"{__name__}:refit_and_judge")[-1]
+        about = {"rock": rock.name, "scene": rock.scene, "choice": REFIT}
+        cells[last.name] = replace(last, about=about)
+    return list(cells.values())
 
 
-def fixed_choices(size: ParsimonySize) -> list[Fixed]:
-    """Fixed choices of number, kinds and degree, one factor at a time."""
-    choices: list[Fixed] = [(NUMBER, n, ALL, 0) for n in size.counts]
-    choices += [(KINDS, AUTO, learned, 0) for learned in LEARNED]
-    return choices + [(DEGREE, AUTO, ALL, degree) for degree in size.degrees]
+def scene_of(root: Path, dataset: str, prior: str) -> mgs.Scene:
+    """Scene with the default settings of a run."""
+    return mgs.Scene(mgs.load_dataset(root / dataset), mgs.load_prior(root / prior))
 
 
-def _fit_name(scene: str, gaussians: int | str, learned: str, degree: int) -> str:
-    return f"fit/{scene}/{gaussians}-{'-'.join(LEARNED[learned])}-degree-{degree}"
-
-
-def cells_of(size: ParsimonySize) -> list[Cell]:
-    """Cells of each scene: dataset, priors, fits, and the fit of `mgs refit`."""
-    cells: list[Cell] = []
-    shared: dict[str, Any] = {"alone": True, "views": size.views, "seeds": size.seeds}
-    for scene in size.scenes:
-        for _, n, learned, degree in fixed_choices(size):
-            arguments: dict[str, Any] = shared | {"learned": learned, "degree": degree}
-            if (n, learned, degree) == (AUTO, ALL, 0):
-                arguments["noises"] = list(PRUNE_NOISE)
-            name, task = _fit_name(scene, n, learned, degree), f"{__name__}:fit_and_judge"
-            cells += size.case(scene, n).with_task(name, task, **arguments)
-        task = f"{__name__}:fit_lean_and_judge"
-        cells += size.case(scene, AUTO).with_task(f"lean/{scene}", task, **shared)
-    return cells
-
-
-def views_in_order(positions: np.ndarray, centre: np.ndarray, views: int, seeds: int) -> list[int]:
-    """Indices of views evenly spaced in azimuth, ordered so that the first `seeds` are evenly
-    spaced too. positions: [C,3] of the cameras, +Z up; centre: [3]."""
-    spread = list(seed_views(positions, centre, views))
-    step = max(views // seeds, 1)
-    return [view for first in range(step) for view in spread[first::step]]
+def quality(model: mgs.Gaussians, dataset: mgs.Dataset, parameters: int) -> Row:
+    """PSNR on the test views, dB (of the whole frame, and of pixels that the rock covers wholly),
+    and the size of the model."""
+    metrics = judge(model, dataset)
+    numbers = {key: metrics[key] for key in ("psnr", "psnr_inside")}
+    return {"gaussians": len(model), "parameters": parameters} | numbers
 
 
 def fit_and_judge(
@@ -133,171 +93,109 @@ def fit_and_judge(
     out: Path,
     dataset: str,
     prior: str,
-    views: int,
-    seeds: int,
-    learned: str,
+    learned: Sequence[str],
     degree: int,
-    noises: Sequence[float] = (),
-) -> dict[str, Any]:
-    """Task: fit views one after the other; returns quality and cost, and the same of the model
-    pruned at each of `noises`."""
-    rates = {kind: rate if kind in LEARNED[learned] else 0.0 for kind, rate in RATES.items()}
-    train = mgs.TrainSettings(rates=rates)
-    settings = mgs.ModelSettings(sh=degree, train=train)
-    scene = mgs.Scene(mgs.load_dataset(root / dataset), mgs.load_prior(root / prior), settings)
-    spent = list[float]()
-    order = views_in_order(scene.positions(scene.frames), scene.centre, views, seeds)
-    for i in order:
-        scene.image(scene.frames[i])  # reads it, which is not timed
-    before, passes = None, 0
-    for count in range(seeds, views + 1):
-        began = time.perf_counter()
-        fit, _ = fit_views(scene, scene.frames, order[:count], before)
-        spent.append(time.perf_counter() - began)
-        passes, model = passes + fit.passes, fit.gaussians
-        nothing = np.zeros((0, 0))  # no view is chosen by information
-        before = mgs.State(scene.frames, tuple(order[:count]), seeds, model, nothing, nothing)
-    cameras = [scene.frames[i].camera for i in order]
-    kinds = groups(degree)
-    each = sum(kinds[kind].stop - kinds[kind].start for kind in LEARNED[learned])
-    pruned = []
-    for noise in noises:
-        left = prune(model, cameras, noise * PIXEL_NOISE)
-        row = {"noise": noise, "gaussians": len(left.kept), "actual": left.actual}
-        row |= {"predicted": left.predicted, "parameters": len(left.kept) * each}
-        pruned.append(row | _quality(model[left.kept], root / dataset))
-    return _quality(model, root / dataset) | {
-        "gaussians": len(model),
-        "parameters": len(model) * each,
-        "seconds": sum(spent),
-        "passes": passes,
-        "pruned": pruned,
+    pruned: bool,
+) -> dict[str, list[Row]]:
+    """Task: the row of a fit in which some kinds of parameters are learned. pruned: also of the
+    model without the Gaussians that change the images by less than each of PRUNE_NOISE."""
+    usual = scene_of(root, dataset, prior)
+    train = usual.settings.train
+    rates = {kind: rate if kind in learned else 0.0 for kind, rate in train.rates.items()}
+    changes = {"sh": degree, "train": train.model_copy(update={"rates": rates})}
+    scene = replace(usual, settings=usual.settings.model_copy(update=changes))
+    state = mgs.learn(scene, scene.seeds(VIEWS))
+    model, kinds = state.gaussians, groups(degree)
+    each = sum(kinds[kind].stop - kinds[kind].start for kind in learned)
+    rows = [quality(model, scene.dataset, each * len(model))]
+    cameras = [state.frames[i].camera for i in state.taken]
+    for noise in PRUNE_NOISE if pruned else ():
+        left = model[prune(model, cameras, noise * PIXEL_NOISE).kept]
+        row = quality(left, scene.dataset, each * len(left))
+        rows.append(row | {"choice": PRUNED, "noise": noise, "left": len(left) / len(model)})
+    return {"rows": rows}
+
+
+def refit_and_judge(root: Path, out: Path, dataset: str, prior: str) -> dict[str, list[Row]]:
+    """Task: the row of `mgs simplify --method refit` on the same views."""
+    scene = scene_of(root, dataset, prior)
+    frames = [scene.frames[i] for i in scene.seeds(VIEWS)]
+    lean = lean_fit(images_of(scene, frames), scene.settings)
+    row = quality(lean.gaussians, scene.dataset, lean.parameters)
+    return {"rows": [row | {"degree": lean.gaussians.sh_degree}]}
+
+
+def rows_of(work: Work) -> list[Row]:
+    """Rows with the PSNR over that of the default, and the share of its parameters."""
+    cells = [cell for cell in work.cells if cell.about]
+    rows = [cell.about | row for cell in cells for row in work.results[cell.name]["rows"]]
+    default = {row["rock"]: row for row in rows if row["choice"] == DEFAULT}
+    for row in rows:
+        usual = default[row["rock"]]
+        row |= {f"{key}_over": row[key] - usual[key] for key in ("psnr", "psnr_inside")}
+        row["share"] = row["parameters"] / usual["parameters"]
+    return rows
+
+
+def name_of(row: Row) -> str:
+    """Name of a choice in tables."""
+    words: dict[str, str] = {
+        NUMBER: f"{row['asked'] or 0:,} Gaussians",
+        KINDS: f"learns {(row['learned'] or '').replace('+', 'up to')}",
+        DEGREE: f"SH degree {row['degree']}",
+        PRUNED: f"pruned, {row.get('noise') or 0:g} sigma",
+        REFIT: "`refit`",
+        DEFAULT: "default",
     }
+    return words[row["choice"]]
 
 
-def fit_lean_and_judge(
-    root: Path, out: Path, dataset: str, prior: str, views: int, seeds: int
-) -> dict[str, Any]:
-    """Task: `mgs.fit.evidence.lean_fit` to as many views."""
-    settings = mgs.ModelSettings(train=mgs.TrainSettings())
-    scene = mgs.Scene(mgs.load_dataset(root / dataset), mgs.load_prior(root / prior), settings)
-    order = views_in_order(scene.positions(scene.frames), scene.centre, views, seeds)
-    frames = [scene.frames[i] for i in order]
-    images, began = images_of(scene, frames), time.perf_counter()
-    found = lean_fit(images, settings)
-    seconds = time.perf_counter() - began
-    return _quality(found.gaussians, root / dataset) | {
-        "gaussians": len(found.gaussians),
-        "parameters": found.parameters,
-        "seconds": seconds,
-        "degree": found.gaussians.sh_degree,
-        "shares": {kind: float(mask.mean()) for kind, mask in found.learned.items()},
-    }
+def tables(rows: Sequence[Row]) -> str:
+    """Tables of all choices, means over scenes, and of the automatic number and the refit of each
+    rock."""
+    columns: dict[str, Any] = {"model": "name"}
+    columns |= {"inside the rock (dB)": scene_mean("psnr_inside", ".2f", ends=False)}
+    columns |= {"over the default": scene_mean("psnr_inside_over", "+.2f")}
+    columns |= {"whole frame": scene_mean("psnr_over", "+.2f")}
+    columns |= {"parameters": scene_mean("share", ".0%", ends=False)}
+    text = table(columns, grouped([row | {"name": name_of(row)} for row in rows], "name"))
 
+    def of(group: Row, key: str, choice: str, **only: Any) -> Any:
+        some = {"choice": choice, **only}
+        return next(row[key] for row in group["of"] if some.items() <= row.items())
 
-def _quality(model: mgs.Gaussians, dataset: Path) -> dict[str, float]:
-    """PSNR on the test views, dB: of the whole frame, and of pixels that the rock covers wholly."""
-    found = judge(model, mgs.load_dataset(dataset))
-    return {"psnr": found["psnr"], "psnr_inside": found["psnr_inside"]}
-
-
-def rows_of(size: ParsimonySize, found: Mapping[str, Any], scene: str) -> list[Row]:
-    """A row for each fixed choice on a scene, for each pruned model, and for the automatic choice
-    with its comparison (`compared`)."""
-    rows: list[Row] = []
-    for choice, n, learned, degree in fixed_choices(size):
-        numbers = dict(found[_fit_name(scene, n, learned, degree)])
-        pruned = numbers.pop("pruned")
-        about = {"run": scene, "choice": choice, "asked": str(n)}
-        rows.append(about | {"learned": learned, "degree": degree} | numbers)
-        if choice == KINDS:
-            rows += [about | {"choice": PRUNED} | row for row in pruned]
-    auto = {"run": scene, "choice": AUTOMATIC, "asked": AUTO, **found[f"lean/{scene}"]}
-    return [*rows, auto | compared(rows, auto)]
-
-
-def compared(rows: Sequence[Row], auto: Row) -> Row:
-    """Comparison of the automatic choice with the fixed ones of a scene.
-
-    number: PSNR with the automatic N, all kinds learned, dB. best: largest PSNR of another fixed
-    choice. loss: how far the automatic choice is below it. smallest: fewest parameters of a fixed
-    choice within CLOSE of the best. over_smallest: parameters over these.
-    """
-
-    def is_number(row: Row) -> bool:
-        return (row["asked"], row["learned"], row["degree"]) == (AUTO, ALL, 0)
-
-    fixed = [row for row in rows if row["choice"] != PRUNED]
-    number = next(row for row in fixed if is_number(row))
-    others = [row for row in fixed if not is_number(row)]
-    best = max(row["psnr_inside"] for row in others)
-    smallest = min(row["parameters"] for row in others if row["psnr_inside"] >= best - CLOSE)
-    return {
-        "number": number["psnr_inside"],
-        "best": best,
-        "loss": best - auto["psnr_inside"],
-        "smallest": smallest,
-        "over_smallest": auto["parameters"] / smallest,
-    }
-
-
-CLAIMS = (
-    Claim(
-        "The automatic choice is at most 0.1 dB below the best fixed choice.",
-        single("loss", {"choice": AUTOMATIC}), "dB", "below", CLOSE, "scene",
-    ),
-    Claim(
-        "It has no more parameters than the smallest fixed choice within 0.1 dB of the best.",
-        single("over_smallest", {"choice": AUTOMATIC}), "times", "below", 1.0, "scene",
-    ),
-)  # fmt: skip
-
-COLUMNS: dict[str, Content] = {
-    "scene": "run",
-    "best fixed (dB)": "best:.2f",
-    "automatic (dB)": "psnr_inside:.2f",
-    "parameters": "parameters:,",
-    "smallest fixed within 0.1 dB": "smallest:,",
-    "holds": lambda row: _holds(row),
-}
-
-
-def _holds(row: Row) -> str:
-    if row["loss"] > CLOSE:
-        return "no: worse"
-    return "yes" if row["over_smallest"] <= 1 else "no: too many parameters"
+    columns = {"rock": "scene", "automatic number": lambda g: f"{of(g, 'gaussians', DEFAULT):,}"}
+    columns |= {"inside (dB)": lambda g: f"{of(g, 'psnr_inside', DEFAULT):.2f}"}
+    for n in COUNTS:
+        columns[f"{n:,}"] = lambda g, n=n: f"{of(g, 'psnr_inside_over', NUMBER, asked=n):+.2f}"
+    columns |= {"`refit`": lambda g: f"{of(g, 'psnr_inside_over', REFIT):+.2f}"}
+    columns |= {"its parameters": lambda g: f"{of(g, 'share', REFIT):.0%}"}
+    columns |= {"its SH degree": lambda g: str(of(g, "degree", REFIT))}
+    return f"{text}\n{table(columns, grouped(rows, 'scene'))}"
 
 
 def write(work: Work) -> list[Path]:
     """Write parsimony.csv, .json, .md and .png."""
-    size, results = work.size, work.results
-    rows = [row for scene in size.scenes for row in rows_of(size, results, scene)]
-    priors = {scene: results[size.case(scene, AUTO).prior_name] for scene in size.scenes}
-    claims = [judged(claim, rows) for claim in CLAIMS]
-    choices = [row for row in rows if row["choice"] == AUTOMATIC]
-    text = f"{table(COLUMNS, choices)}\n{verdict_table(claims)}"
-    draw(work.out / "parsimony.png", rows)
-    paths = write_table(work, "parsimony", rows, text, priors=priors, claims=claims)
-    return [*paths, work.out / "parsimony.png"]
+    rows, path = rows_of(work), work.out / "parsimony.png"
+    draw(path, rows)
+    return [*write_table(work, "parsimony", rows, tables(rows)), path]
 
 
 def draw(path: Path, rows: Sequence[Row]) -> None:
-    """Draw PSNR against the number of parameters, a panel for each scene."""
+    """Draw PSNR against the number of parameters, a panel for each rock."""
+    default = [row for row in rows if row["choice"] == DEFAULT]
+    joined = [row | {"choice": choice} for row in default for choice in (NUMBER, KINDS, PRUNED)]
+    shown = joined + [row for row in rows if row["choice"] in (NUMBER, KINDS, PRUNED, REFIT)]
     label, axes = "PSNR inside the rock (dB)", ("parameters", "psnr_inside")
     panels = [
-        Panel(*axes, "learned parameters", label, "choice", True, (("run", scene),), scene)
-        for scene in dict.fromkeys(row["run"] for row in rows)
+        Panel(*axes, "learned parameters", label, "choice", True, (("scene", scene),), scene)
+        for scene in dict.fromkeys(row["scene"] for row in rows)
     ]
-    title = "The automatic choice of parameters (star) beside fixed ones"
-    draw_panels(path, panels, rows, title)
+    draw_panels(path, panels, shown, "`refit` (star) beside fixed numbers and kinds of parameters")
 
 
 STUDY = Study(
-    "parsimony",
-    __doc__,
-    write,
-    SIZES,
-    lambda work: cells_of(work.size),
+    "parsimony", __doc__, write, SIZES, lambda work: cells_of(work.size), ROCKS | WORKERS, sized
 )
 
 if __name__ == "__main__":

@@ -11,13 +11,11 @@ from refusals import fails
 
 from mgs import PriorSettings
 from mgs.data.meshes import Mesh
-from mgs.policy.criteria import PIXEL_NOISE
 from mgs.prior.build import _samples, build_prior, prior_from_mesh
 from mgs.prior.resolution import PIXELS_OF_PHOTOGRAPHS, PIXELS_PER_SAMPLE, resolution
 from studies import parsimony
-from studies.frame.case import Size
-from studies.frame.claim import judged
 from studies.frame.output import read_rows
+from studies.setups import SetupSize
 
 
 def square():
@@ -96,69 +94,43 @@ def test_the_automatic_number_has_a_limit(data, monkeypatch):
     assert len(prior.points) + prior.backed == 100
 
 
-def test_views_are_spread_evenly_from_the_first_on():
-    angles = 2 * np.pi * np.arange(24) / 24
-    positions = np.stack([np.cos(angles), np.sin(angles), np.ones(24)], 1)
-    order = parsimony.views_in_order(positions, np.zeros(3), 12, 4)
-    assert sorted(order[:4]) == [0, 6, 12, 18]
-    assert sorted(order) == list(range(0, 24, 2))
+def test_tables_compare_choices_with_the_default():
+    def row(rock, choice, psnr, share, **more):
+        about = {"rock": rock, "scene": rock, "choice": choice, "gaussians": 1000, "degree": 0}
+        about |= {"asked": 0, "learned": parsimony.ALL, "share": share}
+        over = {"psnr_inside": 30 + psnr, "psnr_inside_over": psnr, "psnr_over": 0.0}
+        return about | over | more
 
-
-def test_the_automatic_choice_is_compared_with_the_smallest_that_is_as_good():
-    def rows(*changed):
-        fixed = {"learned": parsimony.ALL, "degree": 0, "choice": parsimony.NUMBER}
-        return [
-            fixed | dict(zip(("asked", "psnr_inside", "parameters"), values, strict=False)) | more
-            for *values, more in (
-                ("100", 25, 110, {}), ("200", 26.05, 220, {}), ("400", 26.1, 440, {}),
-                ("auto", 25.5, 500, {}), ("auto", 24, 90, {"learned": "colour"}),
-                ("auto", 30, 50, {"choice": parsimony.PRUNED, "learned": "colour"}), *changed,
-            )
-        ]  # fmt: skip
-
-    auto = {"psnr_inside": 26.0, "parameters": 200}
-    found = parsimony.compared(rows(), auto)
-    assert (found["best"], found["number"], found["smallest"]) == (26.1, 25.5, 220)
-    assert found["loss"] == pytest.approx(0.1)
-    assert found["over_smallest"] == pytest.approx(200 / 220)
-    kinds = rows(("auto", 26.05, 90, {"learned": "+ opacity"}))
-    assert parsimony.compared(kinds, auto)["smallest"] == 90
-    verdicts = [
-        judged(claim, [auto | found | {"run": run, "choice": parsimony.AUTOMATIC} for run in "ab"])
-        for claim in parsimony.CLAIMS
-    ]
-    assert [one["verdict"] for one in verdicts] == ["fails", "holds"]  # the loss is 0.1 + rounding
-    assert parsimony._holds(auto | found | {"loss": 0.0}) == "yes"
-    assert parsimony._holds(auto | found | {"loss": 0.2}) == "no: worse"
-    assert parsimony._holds({"loss": 0.0, "over_smallest": 2}) == "no: too many parameters"
+    rows = []
+    for rock, less in (("a", 0.5), ("b", 0.7)):
+        rows += [row(rock, parsimony.DEFAULT, 0.0, 1.0), row(rock, parsimony.REFIT, -less, 0.4)]
+        rows += [row(rock, parsimony.NUMBER, -less, 0.1, asked=n) for n in parsimony.COUNTS]
+        rows += [row(rock, parsimony.PRUNED, -0.1, 0.8, noise=0.2)]
+    choices, rocks = parsimony.tables(rows).split("\n\n")
+    refit = next(line for line in choices.splitlines() if "`refit`" in line)
+    assert "| 29.40 | -0.60 [-1.87, +0.67] |" in refit
+    assert refit.endswith("| 40% |")
+    assert "pruned, 0.2 sigma" in choices
+    assert rocks.splitlines()[-1].startswith("| b | 1,000 | 30.00 | -0.70 | -0.70 |")
 
 
 @pytest.mark.slow
-def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, ellipsoids):
-    size = parsimony.ParsimonySize(
-        ("boulder",), (60, 200), Size(48, 36, 12, 3), 4, seeds=3, degrees=(0, 1)
-    )
+def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, ellipsoids, monkeypatch):
+    monkeypatch.setattr(parsimony, "COUNTS", (60, 200))
+    size = SetupSize(48, 36, tests=3, fewer=3)
     out = tmp_path / "out"
     for _ in range(2):
-        study("parsimony", out, sizes={"quick": size})
+        study("parsimony", out, "--rocks", "1", sizes={"quick": size})
     assert len(list(out.glob("cells/dataset/**/result.json"))) == 1
-    record = json.loads((out / "parsimony.json").read_text())
-    assert len(read_rows(out / "parsimony.csv")) == len(record["rows"]) == 12
+    rows = read_rows(out / "parsimony.csv")
+    assert len(rows) == 2 + 1 + 3 + 2 + 3 + 1
     assert (out / "parsimony.png").stat().st_size > 10_000
-    rows = [row for row in record["rows"] if row["choice"] != parsimony.PRUNED]
-    by = {(one["asked"], one.get("learned"), one["degree"]): one for one in rows}
-    number = by["auto", parsimony.ALL, 0]
-    assert by["60", parsimony.ALL, 0]["parameters"] == 60 * 11
-    assert by["auto", "colour", 0]["parameters"] == 3 * number["gaussians"]
-    assert by["auto", parsimony.ALL, 1]["parameters"] == (12 + 8) * number["gaussians"]
-    assert by["200", parsimony.ALL, 0]["psnr_inside"] > by["60", parsimony.ALL, 0]["psnr_inside"]
-    auto = rows[-1]
-    assert auto["choice"] == parsimony.AUTOMATIC
-    assert 3 * auto["gaussians"] <= auto["parameters"] < number["parameters"]
-    kinds = {"colour", "directional", "scale", "rotation", "opacity"}
-    assert kinds - {"directional"} <= set(auto["shares"]) <= kinds
-    assert auto["number"] == number["psnr_inside"]
-    pruned = [row for row in record["rows"] if row["choice"] == parsimony.PRUNED]
-    assert all(one["actual"] <= one["noise"] * PIXEL_NOISE for one in pruned)
-    assert [one["noise"] for one in pruned] == list(parsimony.PRUNE_NOISE)
+    by = {(one["choice"], one["asked"] or one["learned"], one["degree"]): one for one in rows}
+    default = by[parsimony.DEFAULT, parsimony.ALL, 0]
+    assert by[parsimony.NUMBER, 60, 0]["parameters"] == 60 * 11
+    assert by[parsimony.KINDS, "colour", 0]["parameters"] == 3 * default["gaussians"]
+    assert by[parsimony.DEGREE, parsimony.ALL, 1]["parameters"] == 20 * default["gaussians"]
+    assert by[parsimony.NUMBER, 200, 0]["psnr_inside"] > by[parsimony.NUMBER, 60, 0]["psnr_inside"]
+    refit = next(one for one in rows if one["choice"] == parsimony.REFIT)
+    assert 3 * refit["gaussians"] <= refit["parameters"] < default["parameters"]
     assert "boulder" in capsys.readouterr().out
