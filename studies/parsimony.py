@@ -61,7 +61,11 @@ def cells_of(size: SetupSize) -> list[Cell]:
         choices += [(DEGREE, None, ALL, degree) for degree in DEGREES]
         for choice, number, learned, degree in choices:
             settings = case.settings if number is None else {"gaussians": number, "seed": 0}
-            more = {"learned": list(LEARNED[learned]), "degree": degree, "pruned": choice == DEFAULT}
+            more = {
+                "learned": list(LEARNED[learned]),
+                "degree": degree,
+                "pruned": choice == DEFAULT,
+            }
             name = f"fit/{rock.name}/{number or 'auto'}-{'-'.join(LEARNED[learned])}-{degree}"
             *own, last = replace(case, settings=settings).with_task(
                 name, f"{__name__}:fit_and_judge", False, **more
