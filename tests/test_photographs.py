@@ -497,6 +497,19 @@ def test_photographs_without_masks_are_fitted_whole_from_their_points(
     assert "has no surface on which to compare" in refused(capsys, arguments, tmp_path / "run")
 
 
+def test_an_object_in_masks_starts_with_few_gaussians_that_are_split(tmp_path, coarse_priors):
+    synthetic.write_dataset(tmp_path / "d", depth=False)
+    for kind, more in (("split", ()), ("fixed", ("--density", "fixed"))):
+        out = tmp_path / kind
+        fitted = ["fit", tmp_path / "d", "--gaussians", 500, "--passes", 8, "--out", out]
+        command(*fitted, *more)
+        prior, model = load_prior(out / "prior"), load_gaussians(out / "gaussians.ply")
+        assert read_json(out / "config.json")["settings"]["train"]["density"] == kind
+        start = 104 if kind == "split" else 500
+        assert len(prior.points) + prior.backed == start
+        assert 450 < len(model) <= 510
+
+
 def test_a_fit_with_adaptive_density_is_a_run_as_3dgs(tmp_path, capsys, monkeypatch):
     bare(tmp_path / "d")
     command("prior", tmp_path / "d", "--gaussians", "300")

@@ -22,6 +22,7 @@ from mgs.data.meshes import distances_to_mesh
 from mgs.data.world import World, unit_up
 from mgs.reports.suggestion import write_suggestion
 from mgs.run.candidates import Site, hidden, inside, place_poses, read_poses
+from mgs.run.nbv import start_fit
 from mgs.run.suggest import coarse_prior, suggest
 
 
@@ -114,6 +115,15 @@ def test_candidates_of_one_pose_are_one_and_those_that_see_nothing_none(run, sit
     result = suggest(open_run(run), [*ring, ("again", ring[1][1]), ("away", away)])
     assert len(result.ranking) == 3
     assert result.dropped == {"sees nothing of the object": 1, "the same as one before": 1}
+
+
+def test_a_model_of_split_gaussians_is_rated_by_all_of_them(tmp_path, site):
+    data = synthetic.write_rock(tmp_path / "d", synthetic.orbit_cameras(14, 48, 36)[:8], 300)
+    train = {"means": "free", "density": "split"}
+    split = mgs.resume_nbv(start_fit(data.root, tmp_path / "run", train=train))
+    assert len(split.gaussians) > 1.5 * len(split.prior.points)
+    found = suggest(split, place_poses("ring", 12, 2.6, (25, 35), site))
+    assert 180 < found.ranking[0].azimuth < 360
 
 
 def test_places_behind_a_wall_are_left_out(run, site):

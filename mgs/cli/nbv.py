@@ -221,8 +221,10 @@ def fit(
     - passes: Default: 30 with adaptive density or free means from photographs, else 10.
     - means: Default: free from photographs or with adaptive density, else frozen.
     - sh: Default: 3 with adaptive density, 1 with free means from photographs, else 0.
-    - density: The defaults of adaptive are those of 3DGS. Default: split of whole scenes without
-      --gaussians, else fixed.
+    - density: The defaults of adaptive are those of 3DGS. Default: split of photographs without a
+      prior (of whole scenes without --gaussians), else fixed.
+    - gaussians: Build a prior of this many Gaussians in the run, or of an object, with split, of a
+      fifth of them.
     """
     from mgs.run.nbv import start_fit
 

@@ -135,7 +135,8 @@ def _adaption_times(passes: int, images: int) -> list[int]:
     ]
 
 
-def _split_times(passes: int) -> list[int]:
+def split_times(passes: int) -> list[int]:
+    """Numbers of passes after which a fit of so many calls `split`."""
     step = max(1, round(passes / 2 / (SPLITS + 1)))
     return [step * k for k in range(1, SPLITS + 1) if step * k < passes]
 
@@ -143,7 +144,7 @@ def _split_times(passes: int) -> list[int]:
 DENSITIES: dict[str, Density | None] = {
     "fixed": None,
     "adaptive": Density(adapt, _adaption_times),
-    "split": Density(split, lambda passes, _: _split_times(passes)),
+    "split": Density(split, lambda passes, _: split_times(passes)),
 }
 
 

@@ -238,11 +238,13 @@ def _samples(
     total = gaussians if isinstance(gaussians, int) else None
     if resolved and resolved.samples * (1 + share) > MOST_GAUSSIANS:
         total = MOST_GAUSSIANS
+    total = total and max(2, round(total / settings.parts))
     count = None if total is None else total - round(total * share / (1 + share))
     if resolved:
         spacing = resolved.spacing
     else:
         spacing = settings.spacing or pixel / (settings.density or 1.0) ** 0.5
+    spacing *= settings.parts**0.5
     seed = derive_seed(settings.seed, "prior/samples")
     points, normals, spacing = sample_surface(mesh, seed, count=count, spacing=spacing)
     backed = round(share * len(points)) if total is None else total - len(points)

@@ -21,6 +21,7 @@ class PriorSettings:
     - backing: Gaussians behind the surface per sample (`mgs.prior.initial`), 0 to 1; the paper: 0.
     - poisson_depth: octree depth of the Poisson reconstruction, 3 to 12; by default its finest
       cells are at most 1.5 voxels.
+    - parts: number of Gaussians into which a fit will split each; there are as many times fewer.
     - seed: of all random draws.
 
     Raises InputError if a number is out of range, or `gaussians` and `spacing` are both given.
@@ -32,6 +33,7 @@ class PriorSettings:
     seed: int = 0
     backing: float = 0.5
     density: float | None = None
+    parts: float = 1.0
 
     @property
     def resolved_by_cameras(self) -> bool:

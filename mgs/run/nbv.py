@@ -17,6 +17,7 @@ from mgs.data.structure import CLOUD
 from mgs.data.visibility import has_masks
 from mgs.errors import InputError
 from mgs.files import THERE, Ours, atomic_folder, reading, write_json
+from mgs.fit.density import GROWTH, split_times
 from mgs.fit.settings import ModelSettings, as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE, Gaussians
 from mgs.learning import information, refine_poses, surface_information
@@ -114,6 +115,7 @@ def start_run(
     gaussians: int | Literal["auto"] | None = None,
     source: str | None = None,
     loose: float = 1.0,
+    parts: float = 1.0,
     force: bool = False,
     progress: Progress = no_progress,
     **settings: Any,
@@ -126,7 +128,7 @@ def start_run(
       exists, else a prior of `gaussians` built in the run (default: as many as cameras resolve).
     - source: what a prior built in the run is made from (`mgs.prior.photographs.choose_source`).
       "random" reads no mask but those of the seeds; means are then free and the prior loose.
-    - loose: as `NbvSettings.with_spacing`.
+    - loose: as `NbvSettings.with_spacing`. parts: as `PriorSettings`, of a prior built in the run.
     - force: replace an existing run.
     - settings: fields of `NbvSettings`. `policy` may also be a function (docs/howto/policy.md),
       whose source is kept in the run. Its default from random points is WITHOUT_SURFACE. The
@@ -176,7 +178,7 @@ def start_run(
     with atomic_folder(out, Ours(FILES, inputs) if holds_run(out) else None) as unfinished:
         surface = given or build_prior(
             dataset.survey(),
-            PriorSettings(gaussians=gaussians, seed=mission.seed),
+            PriorSettings(gaussians=gaussians, seed=mission.seed, parts=parts),
             source=source,
             shown=_seed_frames(dataset, mission) if source == "random" else None,
             on_stage=lambda stage: progress(f"prior: {stage}", 0, 1),
@@ -227,8 +229,9 @@ def start_fit(
     colours of degree FREE_SH and a looser prior, else frozen. With adaptive density, settings and
     degree are by default those of 3DGS (`as_3dgs`). Photographs without masks are fitted whole,
     from the points that came with the cameras and random ones, unless a prior is given: a surface
-    of the object cannot explain what is around it. Their Gaussians are then split where images need
-    more, unless their number is given. Arguments and errors as `start_run`."""
+    of the object cannot explain what is around it. Gaussians of a prior from photographs that is
+    built in the run are split where images need more: those of a whole scene unless their number is
+    given, those of an object into that number. Arguments and errors as `start_run`."""
     root, train = Path(dataset), dict(settings.pop("train", {}))
     data, folder = load_dataset(root), Path(prior) if prior is not None else root / "prior"
     ready = gaussians is None and (prior is not None or (folder / "prior.json").is_file())
@@ -242,15 +245,19 @@ def start_fit(
         train = {"passes": FREE_PASSES} | recipe | train | {"rates": rates}
         settings.setdefault("sh", MAX_SH_DEGREE)
     train.setdefault("means", "free" if kind in LOOSE else "frozen")
-    loose = 1.0
+    loose, parts = 1.0, 1.0
     few = (data.root / CLOUD).is_file() and not isinstance(gaussians, int)
-    if train["means"] == "free" and kind == "random" and few:
+    of_object = kind in LOOSE and kind != "random" and not ready and prior is None
+    if train["means"] == "free" and (of_object or (kind == "random" and few)):
         train.setdefault("density", "split")
+        if of_object and train["density"] == "split":
+            passes = train.get("passes", FREE_PASSES)
+            parts = (1 + GROWTH) ** len(split_times(passes)) if isinstance(passes, int) else 1.0
     if train["means"] == "free" and kind in LOOSE:
         loose = LOOSE[kind]
         train = FREE_TRAIN | train
         settings.setdefault("sh", FREE_SH[kind])
-    every = {"seeds": len(data), "budget": 0, "train": train, "loose": loose}
+    every = {"seeds": len(data), "budget": 0, "train": train, "loose": loose, "parts": parts}
     start: dict[str, Any] = {"prior": prior, "gaussians": gaussians, "source": whole}
     return start_run(root, out, progress=progress, **start, **settings | every)
 

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mgs.camera import Camera
 from mgs.colour import SH_C0
@@ -179,6 +180,7 @@ def _settings(run: Run, taken: int, views: int, given: dict[str, Any]) -> NbvSet
     fixed = {"seeds": taken, "budget": views, "batch": max(views, 2)}
     free = dict.fromkeys(["travel", "nearest", "stop_gain", "stop_uncertainty", "stop_psnr"])
     own = run.settings.model_dump()
+    own["train"]["density"] = "fixed"  # nothing is fitted
     limits = {"flight": own["flight"] | given.get("flight", {})}
     settings = validated(NbvSettings, own | free | given | limits | fixed)
     check_settings(settings, taken + views)
@@ -295,9 +297,11 @@ def _coarse_scene(
 ) -> tuple[_CoarseScene, State]:
     """Scene of the images taken, then the poses, with a coarse model; and its state, whose last
     view is the first image, where the flight starts."""
-    prior, rows = coarse_prior(run.prior)
-    thinning = len(prior.points) / len(run.prior.points)
-    model = _coarse(run.state.gaussians, rows, thinning)
+    whole = run.state.gaussians
+    own = run.prior if run.settings.train.density == "fixed" else _on_model(run.prior, whole)
+    prior, rows = coarse_prior(own)
+    thinning = len(prior.points) / len(own.points)
+    model = _coarse(whole, rows, thinning)
     width = max(round(images[0].camera.width * thinning**0.5), 1)
 
     def small(camera: Camera) -> Camera:
@@ -312,6 +316,12 @@ def _coarse_scene(
     H = information(scene, model, [frames[i] for i in taken])
     state = State(scene.frames, taken, count, model, H, H, skipped=count)
     return scene, replace(state, surface=surface_information(scene, state, taken))
+
+
+def _on_model(prior: Prior, model: Gaussians) -> Prior:
+    """A prior with a sample at each Gaussian of a model whose Gaussians are no longer its own."""
+    near = cKDTree(prior.points).query(model.means)[1]
+    return replace(prior, points=model.means, normals=prior.normals[near], backed=0)
 
 
 def coarse_prior(prior: Prior, most: int = COARSE) -> tuple[Prior, NDArray[np.int64]]:
