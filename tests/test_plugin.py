@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from program import python
-from splat.scenes import gradients_of, relative_error, slope, with_gradients
+from splat.scenes import gradients_of, relative_error, with_gradients
 from test_render_command import gaussians as any_gaussians
 
 import mgs.splat.plugins  # noqa: F401  registers mgs_splat
@@ -246,22 +246,22 @@ def test_forward_mode_is_that_of_the_api(ply, space):
     params, model, rng = mi.traverse(scene), gaussians(), np.random.default_rng(4)
     assert not np.any(scene.integrator().render_forward(scene, params)), "nothing changes yet"
     tangents = {n: rng.normal(size=getattr(model, n).shape).astype(np.float32) for n in ARRAYS}
-
-    def drawn(t):
-        for name, tangent in tangents.items():
-            params[f"integrator.{name}"] = params[f"integrator.{name}"] + t * mi.TensorXf(tangent)
-        params.update()
-        return mi.render(scene, params)
-
-    found = slope(drawn)
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    for name, tangent in tangents.items():
+        params[f"integrator.{name}"] = params[f"integrator.{name}"] + t * mi.TensorXf(tangent)
+    params.update()
+    image = mi.render(scene, params)
+    dr.forward(t)
+    found = np.asarray(dr.grad(image))
     assert found.shape == (HEIGHT, WIDTH, 5)
 
     expected = jvp(model, tangents, camera(scene), background)
     rgb = np.asarray(expected.rgb)
     if space == "srgb":
         blended = np.asarray(render(model, camera(scene), background).rgb)
-        steep = 2.4 / 1.055 * ((blended + 0.055) / 1.055) ** 1.4
-        rgb = rgb * np.where(blended <= 0.04045, 1 / 12.92, steep)
+        slope = 2.4 / 1.055 * ((blended + 0.055) / 1.055) ** 1.4
+        rgb = rgb * np.where(blended <= 0.04045, 1 / 12.92, slope)
     assert_near(found[..., :3], rgb)
     assert_near(found[..., 3], expected.alpha)
     assert_near(found[..., 4], expected.depth)
@@ -275,29 +275,35 @@ def test_the_sensor_is_differentiated(ply, film):
     whole, window = own.film or own, (*own.corner, own.width, own.height)
     degrees = 2 * np.degrees(np.arctan(np.tan(np.radians(FOV / 2)) * np.exp(-1e-6)))
     per_log_focal = float((degrees - FOV) / 1e-6)
-    params = mi.traverse(scene)
-    before, fov = params["sensor.to_world"], params["sensor.x_fov"]
     for i in range(7):
+        params, t = mi.traverse(scene), mi.Float(0)
+        dr.enable_grad(t)
+        x = [mi.Float64(0)] * 7
+        x[i] = mi.Float64(t)
+        motion = [mi.Float(part) for part in x]
+        before, fov = params["sensor.to_world"], params["sensor.x_fov"]
         axis, rate = np.eye(3)[i % 3] * (-1, -1, 1), 180 / np.pi
+        change = mi.Transform4f().rotate(axis, rate * motion[i]) if i < 3 else mi.Transform4f()
+        if 3 <= i < 6:
+            change = mi.Transform4f().translate(mi.Vector3f(*(float(a) * motion[i] for a in axis)))
+        params["sensor.to_world"] = before @ change
+        if i == 6:
+            params["sensor.x_fov"] = fov + per_log_focal * motion[6]
+        params.update()
+        image = mi.render(scene, params)
+        dr.forward(t)
+        found = np.asarray(dr.grad(image))
+        params["sensor.to_world"], params["sensor.x_fov"] = before, fov
+        params.update()
 
-        def of_plugin(t, i=i, axis=axis, rate=rate):
-            change = mi.Transform4f()
-            if i < 3:
-                change = change.rotate(axis, rate * t)
-            elif i < 6:
-                change = change.translate(mi.Vector3f(*(float(a) * t for a in axis)))
-            params["sensor.to_world"] = before @ change
-            params["sensor.x_fov"] = fov + per_log_focal * t if i == 6 else fov
-            params.update()
-            return mi.render(scene, params)
-
-        def of_api(t, i=i):
-            x = [mi.Float64(0)] * 7
-            x[i] = mi.Float64(t)
-            there = moved(whole, dr.concat(x[:6]), x[6])
-            return render(read_ply(ply), there.cropped(*window)).rgb
-
-        assert relative_error(slope(of_plugin), slope(of_api)) < 3e-4, i
+        s = mi.Float(0)
+        dr.enable_grad(s)
+        x = [mi.Float64(0)] * 7
+        x[i] = mi.Float64(s)
+        there = moved(whole, dr.concat(x[:6]), x[6])
+        drawn = render(read_ply(ply), there.cropped(*window)).rgb
+        dr.forward(s)
+        assert relative_error(found, dr.grad(drawn)) < 3e-4, i
 
 
 @pytest.mark.parametrize("around", [{"type": "aov", "aovs": "z:depth"}, {"type": "moment"}])

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from mgs.camera import Camera, look_at
@@ -115,15 +114,6 @@ def with_gradients(gaussians: Gaussians, names=ARRAYS) -> Gaussians:
 
 def gradients_of(model: Gaussians, names=ARRAYS) -> dict[str, np.ndarray]:
     return {name: np.asarray(dr.grad(getattr(model, name))) for name in names}
-
-
-def slope(make) -> np.ndarray:
-    """Derivative of make(t) by t at 0, in forward mode."""
-    t = mi.Float(0)
-    dr.enable_grad(t)
-    image = make(t)
-    dr.forward(t)
-    return np.asarray(dr.grad(image))
 
 
 @contextmanager
