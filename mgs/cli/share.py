@@ -207,7 +207,6 @@ def _export_compact(
     shared: bool,
     force: bool,
 ) -> None:
-    from mgs import runtime
     from mgs.reports.compacting import compact_run
     from mgs.run.folder import open_run
 
@@ -297,7 +296,6 @@ def video(
     - fps: Frames per second of a turntable. Default: 25.
     - width: Width of a picture in pixels. Default: the cameras' own.
     """
-    from mgs import runtime
     from mgs.reports.video import check_film, path_frames, story_frames, write_film
     from mgs.run.folder import open_run
 

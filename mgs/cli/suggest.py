@@ -6,15 +6,19 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 from pydantic import Field, field_validator
 from rich.table import Table
 
 from mgs import runtime
 from mgs.cli.options import Count, Settings, not_none, parse_gaussians, parse_settings, with_keys
 from mgs.cli.terminal import Terminal, progress_bar
+from mgs.data.dataset import load_dataset, read_records
+from mgs.data.flight_plan import Stop, check_plan_path, parse_origin, write_flight_plan
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
 from mgs.fit.settings import Frozen
+from mgs.policy.criteria import GAIN_UNIT
 from mgs.progress import listening
 from mgs.run.settings import FlightLimits, Positive, SearchLimits, validated
 
@@ -103,7 +107,6 @@ def suggest(
     - prior: Folder of `mgs prior`. Default: DATASET/prior, or one built now.
     - gaussians N|auto: Build a prior of this many Gaussians.
     """
-    from mgs.data.flight_plan import check_plan_path, parse_origin
     from mgs.data.on_site import holds_photographs
 
     console = Terminal()
@@ -167,8 +170,6 @@ def _placed(photographs: Path, site: Path, console: Terminal) -> Path:
 
 def _place(source: Path) -> Any:
     """Place of the world's origin, as the import of photographs with GPS wrote it; else None."""
-    from mgs.data.dataset import read_records
-    from mgs.data.flight_plan import parse_origin
     from mgs.run.folder import holds_run, open_run
 
     root = open_run(source).settings.dataset if holds_run(source) else source
@@ -178,7 +179,6 @@ def _place(source: Path) -> Any:
 
 def _run(source: Path, scratch: Path, settings: dict[str, Any], progress: Any) -> Run:
     """The run itself, or a new one in `scratch`, fitted to all images of a dataset."""
-    from mgs.data.dataset import load_dataset
     from mgs.run.folder import holds_run, open_run
     from mgs.run.nbv import resume_nbv, start_run
 
@@ -198,8 +198,6 @@ def _candidates(
     run: Run, poses: Path | None, dome: int | None, asked: Candidates
 ) -> tuple[Sequence[Named], float, tuple[float, float] | None]:
     """Candidates, their least distance from the mesh, and their elevations."""
-    import numpy as np
-
     from mgs.data.meshes import distances_to_mesh
     from mgs.run.candidates import MOST_POSES, Site, place_poses, read_poses
 
@@ -227,8 +225,6 @@ def _candidates(
 
 def _crossed(run: Run, result: Suggestion) -> str:
     """Say which leg crosses the object, if one does."""
-    import numpy as np
-
     from mgs.run.candidates import inside
     from mgs.run.suggest import taken_in_order
 
@@ -246,9 +242,6 @@ def _crossed(run: Run, result: Suggestion) -> str:
 
 def _write_plan(path: Path, run: Run, result: Suggestion, place: Any, limits: FlightLimits) -> None:
     """Write a flight plan; home is on the ground under the first image."""
-    import numpy as np
-
-    from mgs.data.flight_plan import Stop, write_flight_plan
     from mgs.run.suggest import taken_in_order
 
     home = taken_in_order(run)[0].camera.position
@@ -262,9 +255,6 @@ def _write_plan(path: Path, run: Run, result: Suggestion, place: Any, limits: Fl
 
 
 def _print(console: Terminal, result: Suggestion, run: Run, crossed: str, place: Any) -> None:
-    from mgs.data.flight_plan import Stop
-    from mgs.policy.criteria import GAIN_UNIT
-
     if run.prior.kind == "random":
         lacks = "the model has no surface of an object: nothing tells seen from unseen"
         cure = "import with masks or depth, or fit with `prior`"

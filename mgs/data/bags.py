@@ -16,7 +16,7 @@ from mgs.data.shots import Shot, Source, poses_agree
 from mgs.data.tracks import Spacing, Track, posed, rigid
 from mgs.errors import InputError
 from mgs.files import atomic_path, parsing, read_bytes, reading
-from mgs.images import read_values, write_png
+from mgs.images import read_values, write_exr, write_png
 
 STORAGE = (".mcap", ".db3")  # endings of the files of a ROS 2 bag
 KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -328,8 +328,6 @@ def _unpack_depth(reader: Any, unpack: Path, frame: str, shots: dict[float, Shot
     """Write the depth image nearest in time to each keyframe, and add it to the keyframe; notes for
     the user. Only images in the frame of the colour images count: others are not aligned with
     them."""
-    from mgs.images import write_exr
-
     times, gaps = np.array(list(shots)), dict.fromkeys(shots, SYNCHRONOUS)
     notes = dict[str, None]()
     for topic, message in messages(reader, *KINDS):

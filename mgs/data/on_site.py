@@ -4,6 +4,8 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from PIL import Image
+
 from mgs.data.dataset import Dataset
 from mgs.data.importers import import_source
 from mgs.data.photographs import photographs_in
@@ -63,8 +65,6 @@ def dataset_at(folder: Path, site: Path) -> tuple[Dataset, Sequence[str]]:
 def _copy_reduced(path: Path, copy: Path) -> None:
     """Write a JPEG with at most WIDEST pixels along its longer side and its EXIF data; link what is
     no JPEG, or cannot be read."""
-    from PIL import Image
-
     if copy.exists() and copy.stat().st_mtime_ns >= path.stat().st_mtime_ns:
         return
     copy.parent.mkdir(parents=True, exist_ok=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame
@@ -88,8 +89,6 @@ class Album:
 
     def _small(self, image: np.ndarray) -> np.ndarray:
         """The window of an image, uint8 [H,W,3] or float32 [H,W], at most as wide as the album."""
-        from PIL import Image
-
         picture = Image.fromarray(np.ascontiguousarray(image[self.window]))
         if picture.width > self.width:
             height = max(1, round(picture.height * self.width / picture.width))
@@ -99,8 +98,6 @@ class Album:
 
 def web_picture(pixels: np.ndarray) -> str:
     """Encode sRGB pixels, uint8 [h,w,3], as the WebP address of an <img>."""
-    from PIL import Image
-
     picture = Image.fromarray(np.ascontiguousarray(pixels))
     return data_uri(picture, "WEBP", quality=QUALITY, method=4)
 

@@ -13,6 +13,7 @@ from mgs.data.dataset import write_transforms
 from mgs.data.frames import Frame
 from mgs.data.world import World
 from mgs.files import write_json
+from mgs.plotting import NO_GRID, crop, drawing
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.reports.diagnostics import VISIBLE, picture, run_scalars, show_map, view_maps
 from mgs.reports.page_plots import CURVES
@@ -74,8 +75,6 @@ def draw_suggestion(path: str | Path, run: Run, suggestion: Suggestion) -> None:
     """Draw the site from above, for the first planned views what the model shows from there and how
     uncertain it is, and the curve of the certificate. Raises InputError if the figure cannot be
     written."""
-    from mgs.plotting import NO_GRID, crop, drawing
-
     views = suggestion.plan[:MOST_PICTURES]
     scalars = {"uncertainty": run_scalars(run)["uncertainty"]}
     curve = suggestion.certificate.curve if suggestion.certificate else []

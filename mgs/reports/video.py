@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 from scipy.ndimage import gaussian_filter1d
 
 from mgs.camera import Camera, look_at
@@ -159,8 +160,6 @@ def _write_mp4(path: Path, frames: Film, count: int, rate: float) -> None:
 
 
 def _write_animation(path: Path, frames: Film, seconds: Sequence[float], gif: bool) -> None:
-    from PIL import Image
-
     pictures = [Image.fromarray(frame) for frame in frames]
     if gif:
         pictures = [picture.quantize(256, Image.Quantize.MAXCOVERAGE) for picture in pictures]
