@@ -7,6 +7,7 @@ too: the gain that the best view under the fault has without it, over the larges
 part frees the means on few views, with and without a prior on the parameters.
 """
 
+import gc
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -145,6 +146,7 @@ class Lab:
             row[f"choice {name}"] = float(usual[np.argmax(scores[name])] / usual.max())
         row |= {"lost": self.clean["psnr"] - row["psnr"]}
         self.rows.append(row | {f"sign {name}": value for name, value in signs.items()})
+        gc.collect()  # a scene and its caches refer to each other
 
     def rng(self, fault: str, size: float) -> np.random.Generator:
         """Random generator of a fault of this rock."""
