@@ -62,7 +62,7 @@ FIT_FAULTS = {SHORT: ((5, 2, 1), "{:g}"), ONE_POSE: ((0.25, 1.0, 4.0), "{:g}° a
 """Sizes of faults of the fit and of a single view, and their words."""
 
 WORDS = {name: fault.words for name, fault in (IMAGE_FAULTS | PRIOR_FAULTS).items()}
-WORDS |= {name: words for name, (_, words) in FIT_FAULTS.items()} | {ANOTHER: "draw {:g}"}
+WORDS |= {name: words for name, (_, words) in FIT_FAULTS.items()} | {ANOTHER: "{:g}"}
 """Formats of sizes with their units."""
 
 
@@ -235,17 +235,15 @@ def by_size(cell: Any) -> Any:
     return lambda group: " / ".join(cell(one) for one in grouped(group["of"], "size"))
 
 
-def middle(cell: Any) -> Any:
-    """Content of a column for a row of one fault: the content of its second size."""
-    return lambda group: cell(grouped(group["of"], "size")[1])
-
-
 def sizes(group: Row) -> str:
-    """The sizes of a fault, with the unit once."""
-    words = WORDS[group["fault"]]
-    each = [words.format(one["size"]) for one in grouped(group["of"], "size")]
-    unit = words[words.index("}") + 1 :]
-    return " / ".join([*(text.removesuffix(unit) for text in each[:-1]), each[-1]])
+    """The sizes of a fault, with the unit once; of other rocks' priors, how many."""
+    before, _, after = WORDS[group["fault"]].partition("{")
+    unit = after[after.index("}") + 1 :]
+    each = [WORDS[group["fault"]].format(one["size"]) for one in grouped(group["of"], "size")]
+    if group["fault"] == ANOTHER:
+        return f"{len(each)} rocks"
+    short = [text.removeprefix(before).removesuffix(unit) for text in each]
+    return f"{before}{' / '.join(short)}{unit}"
 
 
 def warned(group: Row) -> str:
@@ -271,8 +269,7 @@ def tables(rows: Sequence[Row]) -> str:
     both = grouped([row for row in rows if row["part"] == "faults"], "fault")
     clean, spoiled = both[0]["of"], [row for group in both[1:] for row in group["of"]]
     columns: dict[str, Any] = {"fault": "fault", "sizes": sizes}
-    columns |= {"cost (dB)": by_size(scene_mean("lost", ".1f", ends=False))}
-    columns |= {"of the middle": middle(scene_mean("lost", ".1f"))}
+    columns |= {"cost (dB)": by_size(scene_mean("lost", ".1f"))}
     columns |= {"runs warned of": by_size(warned), "by": most_warned}
     columns |= {"`d-optimal` keeps": by_size(kept("d-optimal"))}
     columns |= {"`directional-i` keeps": by_size(kept("directional-i"))}
