@@ -24,6 +24,7 @@ from mgs.prior.initial import colours_of, initial_gaussians, pixel_on
 from mgs.progress import Stage, report
 from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups, render
+from mgs.splat.information import fisher_of_colours
 from mgs.survey.fusion import focus
 
 Value = TypeVar("Value")
@@ -260,6 +261,10 @@ class Scene:
         means = self.settings.train.means
         return fisher(model, camera, estimator, cache=self.cache, means=means)
 
+    def fisher_of_colours(self, model: Gaussians, camera: Camera) -> np.ndarray:
+        """Columns of colours of the exact `fisher`, in less time."""
+        return fisher_of_colours(model, camera, self.cache)
+
     def information(self, state: State, view: int, estimator: str | None = None) -> np.ndarray:
         """Information of a view about the model of a state [N,P].
 
@@ -287,8 +292,11 @@ class Scene:
         def exact(camera: Camera) -> np.ndarray:
             return self.fisher(start, camera, "exact")[:count, :columns]
 
+        def colour(camera: Camera) -> np.ndarray:
+            return self.fisher_of_colours(start, camera)[:count]
+
         points, lam = start.means[:count], float(self.surface_lam[0])
-        return Visibility(state.cameras, exact, points, self.centre, lam)
+        return Visibility(state.cameras, exact, colour, points, self.centre, lam)
 
     def positions(self, frames: Sequence[Frame]) -> np.ndarray:
         """Camera centres [V,3], metres."""

@@ -129,7 +129,7 @@ def test_the_dome_stands_around_the_rock():
 
 
 def updated(points, pool, dome):
-    surface = Visibility([], lambda camera: camera, points, np.zeros(3), LAM)
+    surface = Visibility([], None, lambda camera: camera, points, np.zeros(3), LAM)
     surface.pool, surface.dome = pool, dome
     return surface.gains
 

@@ -147,6 +147,9 @@ class TinyScene(Scene):
             return self.parts.get("fisher", fisher)(model, camera)
         return self.parts.get("estimate", estimate)(model, camera, estimator)
 
+    def fisher_of_colours(self, model, camera):
+        return self.fisher(model, camera)[:, :3]
+
     def render(self, model, camera):
         return self.parts["render"](model, camera)
 

@@ -29,6 +29,7 @@ class Visibility:
     Arguments:
     - cameras: of the run.
     - exact(camera): exact information about the Gaussians before any training [N,P].
+      colour(camera): its columns of the colours.
     - points: their means [N,3], metres. centre: middle of the rock [3]. lam: lambda of colours.
 
     Attributes:
@@ -44,14 +45,15 @@ class Visibility:
         self,
         cameras: Sequence[Camera],
         exact: Callable[[Camera], Array],
+        colour: Callable[[Camera], Array],
         points: Array,
         centre: Array,
         lam: float,
     ) -> None:
-        self.cameras, self.exact = cameras, exact
+        self.cameras, self.colour = cameras, colour
         self.points, self.centre, self.lam = points, centre, lam
         self.positions = np.array([camera.position for camera in cameras])
-        self.seen = cache(lambda frame: squared_weights(exact(cameras[frame])))
+        self.seen = cache(lambda frame: squared_weights(colour(cameras[frame])))
         self.planned, self.path = cache(self._planned), cache(self._path)
         self.states: dict[Model, PoolGains] = {}
         # A copy, because the kernel returns part of a larger array.
@@ -133,7 +135,7 @@ class Visibility:
     @cached_property
     def dome(self) -> Views:
         cameras = dome_cameras(self.cameras[0], self.positions, self.centre)
-        seen = np.stack([squared_weights(self.exact(camera)) for camera in cameras])
+        seen = np.stack([squared_weights(self.colour(camera)) for camera in cameras])
         return Views(np.array([camera.position for camera in cameras]), seen)
 
 

@@ -24,6 +24,7 @@ from mgs.memory import check_room, padded
 from mgs.splat import kernels
 from mgs.splat.derivatives import (
     ByMean,
+    Geometry,
     Moments,
     Polynomial,
     by_means,
@@ -252,14 +253,37 @@ def _columns(
 ) -> list[Any]:
     """Columns of `exact`, differentiable by the camera and the sums."""
     g = geometry(gaussians, camera, splats)
-    # Colour: Y_k^2 sum w^2, 0 where the channel is clamped at 0.
-    channels = list(zip(sums.w2, g.positive, strict=True))
-    columns = [w2 * basis * basis * positive for basis in g.basis for w2, positive in channels]
+    columns = _colour_columns(g, sums.w2)
     # Log-scales, quaternion: sum of |s|^2 (m_k + M_k^T phi)^2. Opacity: (1 - o)^2 sum |s|^2.
     columns += [dr.maximum(product_sum(m, m, sums.squared), 0) for m in g.shape]
     columns.append(g.logit * g.logit * sums.squared[0, 0])
     # Means: sum over channels of (s_c q + w g_c)^2.
     return columns + [dr.maximum(means_product(mean, mean, sums), 0) for mean in by_mean]
+
+
+def _colour_columns(g: Geometry, w2: list[Any]) -> list[Any]:
+    """Y_k^2 sum w^2 of each coefficient and channel, 0 where the channel is clamped at 0."""
+    channels = list(zip(w2, g.positive, strict=True))
+    return [each * basis * basis * positive for basis in g.basis for each, positive in channels]
+
+
+@one_at_a_time
+def fisher_of_colours(
+    gaussians: Gaussians, camera: Camera, cache: ListCache | None = None
+) -> np.ndarray:
+    """Columns of the colours of `fisher` by the estimator "exact", the same numbers in less time:
+    float32 [N,3K], of more than no Gaussians. Raises InputError as `render`."""
+    model = as_drjit(gaussians).map(dr.detach)
+    splats, lists, packed = splats_and_lists(model, camera, cache)
+    (w2,) = sums_by_splat(lists, kernels.squared_weights(lists, packed), 1)
+    device = camera_array(camera.seen_from(model.origin))
+    return np.asarray(_colours(model, device, splats, w2))[:, : 3 * model.sh.shape[1]]
+
+
+@frozen(lambda gaussians, *others: gaussians.recorded)
+def _colours(gaussians: Gaussians, camera: Any, splats: Any, w2: Any) -> Any:
+    columns = _colour_columns(geometry(gaussians, camera, splats), [w2] * 3)
+    return _interleaved(dict(enumerate(columns)), len(columns), len(gaussians))
 
 
 @one_at_a_time

@@ -456,6 +456,26 @@ def fisher(
 
 
 @frozen(recorded_sizes)
+def squared_weights(lists: BlockLists, packed: Any) -> Any:
+    """The first sum of `fisher`, w^2, alone: one pass, in which colours are not read."""
+    lane, T = lanes(lists)
+
+    def visit(_pair: Any, _splat: Splats, rows: list[PixelRow], pixels: Any) -> Any:
+        new, alive, total = [], mi.Bool(False), mi.Float(0)
+        for pixel, (transmittance,) in enumerate(pixels):
+            raw = rows[pixel // lane.columns].raw_alpha[pixel % lane.columns]
+            raw = computed_after(raw, [total] if pixel else [])
+            _, w, after, room = blend(raw, transmittance)
+            new.append([after])
+            alive |= room
+            total = dr.fma(w, w, total)
+        return new, alive, [total]
+
+    by_pair = walk_and_store(lists, packed, lane, [[t] for t in T], visit, 1)
+    return sums_by_place(lists, by_pair, 1, mi.Float64)
+
+
+@frozen(recorded_sizes)
 def fisher_jvp(
     lists: BlockLists, packed: Any, packed_tangents: Any, out: Any, d_out: Any, background: Any
 ) -> Any:

@@ -49,6 +49,8 @@ def assert_right(g, camera, background=BACKGROUND, means="frozen", alpha_weight=
     expected = reference.fisher_block(g, camera, background, **options)
     exact = fisher(g, camera, "exact", background, **options)
     block = fisher(g, camera, "block", background, **options)
+    colours = exact[:, groups(g.sh_degree)["colour"]]
+    np.testing.assert_array_equal(information.fisher_of_colours(g, camera), colours)
     what = f"degree {g.sh_degree}, means {means}, alpha {alpha_weight}"
     for name, columns in groups(g.sh_degree, means).items():
         for found in (exact, diagonal(block)):
