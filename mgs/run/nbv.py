@@ -253,6 +253,8 @@ def start_fit(
         if of_object and train["density"] == "split":
             passes = train.get("passes", FREE_PASSES)
             parts = (1 + GROWTH) ** len(split_times(passes)) if isinstance(passes, int) else 1.0
+            if isinstance(gaussians, int):
+                train.setdefault("most_gaussians", gaussians)
     if train["means"] == "free" and kind in LOOSE:
         loose = LOOSE[kind]
         train = FREE_TRAIN | train
