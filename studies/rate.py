@@ -161,12 +161,12 @@ def draw_sent(run: Run, out: Path) -> dict[str, Any]:
     """Draw OUT/sent.png of a run, as `picture`."""
     frame = test_views_of(run.dataset).frames[0]
     truth, part = frame.target()[0][..., :3], crop(frame.mask())
-    files = {name: compact_run(run, SENT[-1], shared=name == WITH).file for name in (WITH, ALONE)}
+    files = {name: compact_run(run, SENT[-1], shared=name == WITH).data for name in (WITH, ALONE)}
     shown = list[tuple[str, str, np.ndarray]]()
     for name, file in files.items():
         path = out / f"{len(shown)}.mgs"
         for sent in SENT:
-            path.write_bytes(bytes(file)[:sent])
+            path.write_bytes(file[:sent])
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", Notice)
                 model = load_gaussians(path, run.settings.prior if name == WITH else None)

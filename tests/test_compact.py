@@ -16,14 +16,18 @@ from test_render_command import CAMERAS, gaussians
 
 import mgs
 from mgs import jvp, load_prior, open_run, render, vjp
+from mgs.colour import srgb_from_linear
 from mgs.compact import allocate, coder, container, decode
 from mgs.compact.columns import columns_of, gaussians_of, gradient_of, start_of
 from mgs.compact.encode import Encoder
 from mgs.compact.tree import DEPTH, cells_of, code_descendants, codes_of, tree_of
+from mgs.data.frames import Frame
 from mgs.data.world import PLUS_Z
 from mgs.errors import InputError, Notice
+from mgs.evaluation import render_view
 from mgs.rotation import rotmat_from_quat
 from mgs.splat_files import load_gaussians, upward
+from mgs.splat_places import from_source
 
 pytest.importorskip("constriction")
 FILE = Path(__file__).parent / "corpus" / "MGS" / "one.mgs"
@@ -323,13 +327,32 @@ def test_the_command_writes_what_fits_and_programs_read_it(dataset, prior, tmp_p
     other = replace(points, points=points.points + 0.01)
     mgs.save_prior(tmp_path / "other", other)
     fails("another prior", load_gaussians, shared, tmp_path / "other")
+    opened = open_run(run)
+    views = opened.taken
+    truth = [
+        (srgb_from_linear(rgba[..., :3]), weight > 0) for rgba, weight in map(Frame.target, views)
+    ]
+    for kind, limit in (("compressed-ply", 1100), ("spz", 600)):
+        for option, value in (("--bytes", limit), ("--psnr", 22)):
+            path = tmp_path / f"{kind}{option}"
+            command("export", run, "--to", kind, option, value, "--out", path)
+            model = from_source(load_gaussians(path), opened.dataset.world)
+            drawn = [srgb_from_linear(render_view(model, frame.camera)[0]) for frame in views]
+            pairs = zip(drawn, truth, strict=True)
+            quality = np.mean([mgs.psnr(image[mask], true[mask]) for image, (true, mask) in pairs])
+            assert f"{quality:.2f} dB in the file" in " ".join(capsys.readouterr().out.split())
+            assert quality >= 22
+            assert 10 < len(model) < len(whole)
+            assert option == "--psnr" or 0.9 * limit < path.stat().st_size <= limit
     for options, message in (
         (["--bytes", "x"], "expected a number of bytes"),
         (["--bytes", "9", "--psnr", "3"], "one of"),
         (["--to", "mgs"], "one of"),
+        (["--to", "spz", "--bytes", "20"], "ask for more bytes"),
+        (["--to", "colmap", "--bytes", "2k"], "leave out other"),
         (["--bytes", "200"], "ask for more bytes"),
         (["--psnr", "90"], "ask for less"),
-        (["--shared-prior"], "leave it out"),
+        (["--shared-prior", "--to", "spz"], "leave it out"),
     ):
         assert message in refused(capsys, ["export", run, *options, "--force"])
     command("export", run, "--psnr", "12", "--shared-prior", "--force")

@@ -129,7 +129,7 @@ def view(
 
 def export(
     models: list[Path],
-    to: Literal["glb", "spz", "ply", "compressed-ply", "mgs", "nerfstudio", "colmap"] = "glb",
+    to: Literal["glb", "spz", "ply", "compressed-ply", "mgs", "nerfstudio", "colmap"] | None = None,
     out: Path | None = None,
     colour_space: Literal["srgb", "linear"] = "srgb",
     sh: Annotated[int | None, typer.Option(min=0, max=3)] = None,
@@ -146,29 +146,34 @@ def export(
     All formats can also be read, so the command converts between them, too.
 
     - models RUN|SPLATS...: Folders that `mgs nbv` wrote, or PLY, GLB, SPZ, MGS.
-    - to: glb: glTF with KHR_gaussian_splatting; spz: needs gsply; compressed-ply: 4 times smaller
-      than ply; mgs: as few bytes as a link allows, of a run, with --bytes or --psnr (the default
-      with these). nerfstudio, colmap: the run's views, a folder to train on.
+    - to: glb (default): glTF with KHR_gaussian_splatting; spz: needs gsply; compressed-ply: 4 times
+      smaller than ply; mgs (default with --bytes or --psnr, which it needs): as few bytes as a link
+      allows. nerfstudio, colmap: the run's views, a folder to train on.
     - out: File to write. Default: export.* in the run; for a file, beside it.
     - colour_space: Colours to write: sRGB, as viewers expect, or linear RGB, as they were fitted.
       Those of a linear run are fitted once more, blended in sRGB.
     - sh: Raise the SH degree, for programs that read degree 3 only.
     - views: Views of nerfstudio and colmap: those taken, or all.
-    - most N|Nk|NM: Write the best model of at most so many bytes, as in 40k.
-    - psnr: Write the smallest model of so many dB in the views taken.
-    - shared_prior: With these: the reader has the run's prior, and no positions are written.
+    - most N|Nk|NM: Write the best model of a run of at most so many bytes, as in 40k. Formats other
+      than mgs get fewer Gaussians, fitted once more.
+    - psnr: Write the smallest model of a run of so many dB in the views taken.
+    - shared_prior: For mgs: the reader has the run's prior, and no positions are written.
     - prior: Folder of the prior that an mgs file was written with, to read it.
     """
     from mgs.reports.exporting import read_model, to_y_up
     from mgs.splat_files import FORMATS, write_gaussians
 
-    if to == "mgs" or most is not None or psnr is not None:
-        if to not in ("glb", "mgs") or (most is None) == (psnr is None):
-            raise InputError("--to mgs: needs one of --bytes and --psnr, which are for it")
-        _export_compact(models, out, most, psnr, shared_prior, force)
-        return
-    if shared_prior:
+    limited = most is not None or psnr is not None
+    to = to or ("mgs" if limited else "glb")
+    if shared_prior and to != "mgs":
         raise InputError("--shared-prior: is for --to mgs; leave it out")
+    if to == "mgs" or limited:
+        if (most is None) == (psnr is None):
+            raise InputError(f"--to {to}: needs one of --bytes and --psnr")
+        if to in ("nerfstudio", "colmap") or sh is not None or colour_space == "linear":
+            raise InputError("--bytes, --psnr: are for models as they are; leave out other options")
+        _export_compact(models, to, out, most, psnr, shared_prior, force)
+        return
     if to in ("nerfstudio", "colmap"):
         _export_views(models, to, out, views == "all", force)
         return
@@ -201,25 +206,30 @@ def _hidden(model: Path) -> str:
 
 def _export_compact(
     runs: list[Path],
+    to: str,
     out: Path | None,
     most: str | None,
     psnr: float | None,
     shared: bool,
     force: bool,
 ) -> None:
-    from mgs.reports.compacting import compact_run
+    from mgs.reports.compacting import compact_run, thin_run
     from mgs.run.folder import open_run
+    from mgs.splat_files import FORMATS
 
     size = None if most is None else _bytes(most)
-    targets = _targets(runs, [run / "export.mgs" for run in runs], out, force)
+    ending = FORMATS.get(to, ".mgs")
+    targets = _targets(runs, [run / f"export{ending}" for run in runs], out, force)
     runtime.start()
     for run, path in targets:
         with progress_bar() as bar:
-            result = compact_run(open_run(run), size, psnr, shared, bar)
-        data = bytes(result.file)
+            if to == "mgs":
+                result = compact_run(open_run(run), size, psnr, shared, bar)
+            else:
+                result = thin_run(open_run(run), to, size, psnr, bar)
+        data, count, (before, after) = result.data, result.count, result.psnr
         with atomic_path(path) as temporary:
             temporary.write_bytes(data)
-        count, (before, after) = len(result.file.model), result.psnr
         values = f"PSNR of the views taken: {before:.2f} dB in the run, {after:.2f} dB in the file"
         echo(f"wrote {count:,} Gaussians to {path} ({len(data):,} bytes); {values}")
 

@@ -18,6 +18,7 @@ from mgs.splat.walking import sums_by_splat
 
 # They hide and replace each other: removing two changes more than the sum of both.
 NEIGHBOURS = 8  # nearest Gaussians of which no two are removed in the same round
+SHARE = 1 / 8  # most of the Gaussians that one round of `fewest` removes
 ROUNDS = 8  # most rounds. Each spends half of the change that is still allowed, then measures it.
 
 
@@ -80,6 +81,18 @@ def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float) -> Prun
         indices, predicted, actual = fewer, predicted + float(cost[cheap].sum()), change
     scale = max(covered, 1e-30)
     return Pruned(indices, noise, float(np.sqrt(predicted / scale)), float(np.sqrt(actual / scale)))
+
+
+def fewest(gaussians: Gaussians, cameras: Sequence[Camera], count: int) -> np.ndarray:
+    """Indices [count] of the Gaussians that are left when those that change the images least are
+    removed, in rounds of at most SHARE of the rest (`prune`)."""
+    indices = np.arange(len(gaussians))
+    while len(indices) > count:
+        rest = gaussians[indices]
+        cheap = _cheapest_apart(removal_cost(rest, cameras), rest.means, np.inf)
+        most = min(len(indices) - count, max(1, int(SHARE * len(indices))))
+        indices = np.delete(indices, cheap[:most])
+    return indices
 
 
 def _images(gaussians: Gaussians, cameras: Sequence[Camera]) -> tuple[list[np.ndarray], float]:

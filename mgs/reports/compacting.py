@@ -3,6 +3,8 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -13,21 +15,28 @@ from mgs.errors import InputError
 from mgs.evaluation import psnr_over
 from mgs.gaussians import Gaussians
 from mgs.policy.criteria import PRUNE_NOISE
+from mgs.reports.exporting import as_imported, in_srgb, to_y_up
 from mgs.run.folder import Run
+from mgs.scene import Scene
 from mgs.seeds import generator
+from mgs.splat_files import FORMATS, load_gaussians, write_gaussians
+from mgs.splat_places import from_source
 
 SCALES = (1e-3, 1.0)  # of steps: rms error of an image, (pixel value) per coefficient
 HALVINGS = 9  # halvings of that range, in its logarithm: steps are found to 1.4 %
 VIEWS = 16  # most views, evenly spread over those taken, in which errors are weighed
 STEP = 1e-4  # linear RGB, by which the slope of sRGB is measured
+CLOSE = 50  # searches for a PSNR end at numbers of Gaussians that differ by 1/CLOSE
 NOISES = (PRUNE_NOISE, 4 * PRUNE_NOISE)  # by pruning, if positions are sent: the better
 
 
 @dataclass(frozen=True)
 class Compacted:
-    """A compact model. psnr: mean of the views taken, dB, of the run's model and of this one."""
+    """A file and its number of Gaussians. psnr: mean of the views taken, dB, of the run's model and
+    of this one."""
 
-    file: Compact
+    data: bytes
+    count: int
     psnr: tuple[float, float]
 
 
@@ -43,19 +52,9 @@ def compact_run(
     shared: the receiver has the run's prior, so positions are not sent. say(stage): called as a
     stage starts. Raises InputError if neither can be reached, for a shared prior whose Gaussians
     were moved or changed by the fit, and as `Run.state`."""
-    from mgs.splat import ListCache
-
-    cache, whole = ListCache(), run.state.gaussians
-    exposure, views = run.settings.exposure, range(len(run.taken))
-    quality = psnr_over(run.taken, cache, exposure, run.dataset.world)
-
-    def measured(model: Gaussians) -> float:
-        return float(np.nanmean(quality(model, views)["psnr_corrected" if exposure else "psnr"]))
-
-    before, results = measured(whole), list[tuple[Compact, float]]()
-    if psnr is not None and not psnr < before:
-        own = f"{run.folder} itself has {before:.2f} dB in the views it took"
-        raise InputError(f"psnr {psnr:g}: {own}; ask for less")
+    measured = _measure(run)
+    before, results = measured(run.gaussians), list[tuple[Compact, float]]()
+    _check_reachable(run, psnr, before)
     for encoder in encoders(run, shared, say):
         say("choosing steps")
         file = _fitted(encoder, size, None if psnr is None else lambda m: measured(m) >= psnr)
@@ -66,7 +65,79 @@ def compact_run(
         raise InputError(f"{run.folder}: {least}; ask for more bytes or a lower psnr")
     rank = (lambda pair: pair[1]) if size else (lambda pair: -len(pair[0]))
     file, after = max(results, key=rank)
-    return Compacted(file, (before, after))
+    return Compacted(bytes(file), len(file.model), (before, after))
+
+
+def _measure(run: Run) -> Callable[[Gaussians], float]:
+    """A function model -> mean PSNR of the views taken, dB."""
+    from mgs.splat import ListCache
+
+    exposure, views = run.settings.exposure, range(len(run.taken))
+    quality = psnr_over(run.taken, ListCache(), exposure, run.dataset.world)
+    key = "psnr_corrected" if exposure else "psnr"
+    return lambda model: float(np.nanmean(quality(model, views)[key]))
+
+
+def _check_reachable(run: Run, psnr: float | None, before: float) -> None:
+    if psnr is not None and not psnr < before:
+        own = f"{run.folder} itself has {before:.2f} dB in the views it took"
+        raise InputError(f"psnr {psnr:g}: {own}; ask for less")
+
+
+def thin_run(
+    run: Run,
+    kind: str,
+    size: int | None = None,
+    psnr: float | None = None,
+    say: Callable[[str], None] = lambda stage: None,
+) -> Compacted:
+    """Make a file of another format (`mgs.splat_files.FORMATS`) with as many Gaussians as fit into
+    `size` bytes, or as few as have `psnr` dB in the views taken.
+
+    All Gaussians of such a file take the same bytes, so those go that change the views taken least.
+    The rest is fitted to these once more, with itself as the prior. say: as in `compact_run`.
+    Raises InputError if neither can be reached, and as `Run.state`."""
+    from mgs.fit.fitting import fit_gaussians
+    from mgs.fit.pruning import fewest
+
+    scene, frames, world = Scene(run.dataset, run.prior, run.settings), run.taken, run.dataset.world
+    cameras = [frame.camera for frame in frames]
+    gains = scene.measured_exposure(frames) if run.settings.exposure else None
+    targets, lam = scene.targets(frames, gains), run.settings.lam_by_kind(scene.groups)
+    train = run.settings.train.model_copy(update={"density": "fixed"})
+    measured = _measure(run)
+
+    def fitted(count: int) -> tuple[Gaussians, bytes]:
+        """The Gaussians that are left, before their fit, and the file of them after it."""
+        say(f"fitting {count:,} Gaussians")
+        some = rest[fewest(rest, cameras, count)]
+        fit = fit_gaussians(some, cameras, targets, train, cache=scene.cache, lam=lam)
+        return some, written(fit.gaussians)
+
+    def written(model: Gaussians) -> bytes:
+        write_gaussians(path, as_imported(run, model), kind, to_y_up(world.up))
+        return path.read_bytes()
+
+    def quality() -> float:
+        """PSNR of the file that was written last."""
+        return measured(from_source(load_gaussians(path), world))
+
+    with TemporaryDirectory() as folder:
+        path, rest = Path(folder) / f"x{FORMATS[kind]}", in_srgb(run.gaussians[run.shown])
+        data, before = written(rest), measured(run.gaussians)
+        _check_reachable(run, psnr, quality())
+        after, least = quality(), 0
+        while size is not None and len(data) > size:
+            if not (count := len(rest) * size // len(data)):
+                raise InputError(f"{run.folder}: its header takes more bytes; ask for more bytes")
+            (rest, data), after = fitted(count), quality()
+        while psnr is not None and len(rest) - least > max(1, len(rest) // CLOSE):
+            some, smaller = fitted((least + len(rest)) // 2)
+            if (value := quality()) >= psnr:
+                rest, data, after = some, smaller, value
+            else:
+                least = len(some)
+    return Compacted(data, len(rest), (before, after))
 
 
 def encoders(
