@@ -275,7 +275,10 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
     elements = {"chunk": chunks, "vertex": packed}
     if rest:
         higher = np.transpose(g.sh[:, 1:], (0, 2, 1)).reshape(n, rest)
-        steps = np.clip(np.floor((higher / 8 + 0.5) * 256), 0, 255)
+        # 0 lies between two steps. Taking the upper one everywhere would tint the whole model.
+        steps = (higher / 8 + 0.5) * 256
+        steps -= (steps == np.floor(steps)) & (np.add.outer(range(n), range(rest)) % 2 > 0)
+        steps = np.clip(np.floor(steps), 0, 255)
         elements["sh"] = {f"f_rest_{i}": (step, "u1") for i, step in enumerate(steps.T)}
     write_columns(path, elements, [ANTIALIASED_COMMENT] * gaussians.antialiased)
 
