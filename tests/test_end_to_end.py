@@ -148,6 +148,13 @@ def test_demo_shows_the_table_and_the_pictures_and_can_be_repeated(tmp_path, cap
     pictures = [line.split()[-1] for line in lines if line.startswith(begin) and "demo/" in line]
     assert sum(picture.endswith(".png") for picture in pictures) >= 7
     assert all(Path(picture).exists() for picture in pictures if picture.endswith(".png"))
+    alone = ("--prior", out / "prior", "--budget", "1", "--set", "evaluate_every=1")
+    command("nbv", out / "dataset", *alone, "--policy", "random", "--out", tmp_path / "alone")
+    first, shared, own = (
+        steps(path) for path in (out / "d-optimal", out / "random", tmp_path / "alone")
+    )
+    assert timeless(shared) == timeless(own)
+    assert ["fit" in run[0]["seconds"] for run in (first, shared, own)] == [True, False, True]
     kept = {path: path.read_bytes() for path in out.glob("*/steps.jsonl")}
     assert len(kept) == len(policies)
     command("demo", out)

@@ -32,8 +32,11 @@ def test_a_run_from_a_prior_in_memory_goes_on_from_its_folder(dataset, tmp_path)
         mgs.nbv(scene, mgs.Uniform(), out=tmp_path / out, seeds=3, budget=budget)
     config = tmp_path / "short/config.json"
     config.write_text(config.read_text().replace('"budget": 1', '"budget": 2'))
-    again = mgs.resume_nbv(tmp_path / "short").state
-    assert again.gaussians == mgs.open_run(tmp_path / "whole").state.gaussians
+    again, whole = mgs.resume_nbv(tmp_path / "short"), mgs.open_run(tmp_path / "whole")
+    assert again.gaussians == whole.state.gaussians
+    like = mgs.scene_of(again)
+    assert mgs.scene_of(again, like=like) is like
+    assert mgs.scene_of(whole, like=like) is not like  # its prior is another folder
 
 
 def test_a_run_that_blends_srgb(dataset, prior, tmp_path):

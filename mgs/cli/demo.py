@@ -3,7 +3,7 @@
 import shlex
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -30,6 +30,10 @@ def demo(out: Annotated[Path, typer.Argument()] = Path("demo"), seed: Seed = 0) 
 
     - out: Folder for everything; the same command again continues or shows it.
     """
+    from mgs.cli.nbv import resume_and_print, start_and_print
+    from mgs.run.folder import open_run
+    from mgs.run.nbv import scene_of
+
     runtime.start()
     console, started = Terminal(), time.monotonic()
     dataset, prior, report = out / "dataset", out / "prior", out / "report"
@@ -42,12 +46,14 @@ def demo(out: Annotated[Path, typer.Argument()] = Path("demo"), seed: Seed = 0) 
     def heading(text: str) -> None:
         console.rule(f"{text}   {time.monotonic() - started:.0f} s", align="left")
 
+    def show(*words: object) -> None:
+        console.print(f"$ mgs {shlex.join(map(str, words))}", soft_wrap=True)
+
     def run(*words: object) -> None:
         from mgs.cli.app import app
 
-        line = [str(word) for word in words]
-        console.print(f"$ mgs {shlex.join(line)}", soft_wrap=True)
-        app(line, prog_name="mgs", standalone_mode=False)
+        show(*words)
+        app([str(word) for word in words], prog_name="mgs", standalone_mode=False)
 
     heading(f"1/4 a photoreal orbit: 32 frames with depth and masks, and {TEST_VIEWS} test views")
     if not (dataset / "transforms.json").is_file():
@@ -56,12 +62,18 @@ def demo(out: Annotated[Path, typer.Argument()] = Path("demo"), seed: Seed = 0) 
     if not (prior / "prior.json").is_file():
         run("prior", dataset, "--out", prior, "--gaussians", GAUSSIANS, "--seed", seed)
     heading(f"3/4 next best views by {len(runs)} policies, 4 seeds and {BUDGET} views each")
-    settings = ["--budget", BUDGET, "--seed", seed, "--set", "evaluate_every=1"]
+    options = ["--budget", BUDGET, "--seed", seed, "--set", "evaluate_every=1"]
+    settings: dict[str, Any] = {"prior": prior, "budget": BUDGET, "seed": seed, "evaluate_every": 1}
+    scene = None  # of all runs, so that the fit to the seeds is made once
     for policy, folder in zip(POLICIES, runs, strict=True):
         if (folder / "config.json").is_file():
-            run("nbv", "--resume", folder)
+            show("nbv", "--resume", folder)
+            this = open_run(folder)
         else:
-            run("nbv", dataset, "--prior", prior, *settings, "--policy", policy, "--out", folder)
+            show("nbv", dataset, "--prior", prior, *options, "--policy", policy, "--out", folder)
+            this = start_and_print(dataset, folder, console, policy=policy, **settings)
+        scene = scene_of(this, like=scene)
+        resume_and_print(this, console, like=scene)
     run("eval", *runs)
     run("diagnose", runs[0], "--force")
     heading("4/4 the report")

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from mgs.gaussians import Gaussians
     from mgs.run.folder import Checkpoint, Run
     from mgs.run.live import Live
+    from mgs.scene import Scene
 
 NAMES = f"Names (docs/nbv.md): {', '.join(POLICIES)}."
 
@@ -156,11 +157,16 @@ def start_and_print(
 
 
 def resume_and_print(
-    run: Path | Run, console: Terminal, policy: str | None = None, live: Live | None = None
+    run: Path | Run,
+    console: Terminal,
+    policy: str | None = None,
+    live: Live | None = None,
+    like: Scene | None = None,
 ) -> None:
     """Run or resume the loop of a run with a line for each step, evaluate, print the quality.
 
     policy: FILE.py:FUNCTION where the run has a policy of the user's own. live: of its pictures.
+    like: as in `mgs.run.nbv.scene_of`.
     """
     from mgs.cli.printing import print_run, step_lines
     from mgs.reports.evaluation import drawn_test_view, evaluate_run
@@ -183,7 +189,7 @@ def resume_and_print(
                 path, psnr = drawn_test_view(run, model)
                 progress.print(f"pass {done} of {most}: {psnr:.2f} dB, {path}")
 
-        state = resume_nbv(run, on_step, progress, policy, live, on_pass).state
+        state = resume_nbv(run, on_step, progress, policy, live, on_pass, like).state
         watched = partial(progress, "evaluating")
         metrics = evaluate_run(run.folder, pictures=False, progress=watched)
     print_run(run.folder, state, metrics, console)

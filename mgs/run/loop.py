@@ -28,7 +28,8 @@ def select_views(
     as `choose` and `learn`."""
     if state is None:
         seeds, frames = first_views(scene, mission)
-        state = learn(scene, seeds, frames=frames)
+        key = "seeds", tuple(seeds), frames
+        state = scene.once(key, lambda: learn(scene, seeds, frames=frames))
         yield state
     while not finished(scene, state, mission):
         planned, choices, refused = choose_batch(scene, state, policy, mission)

@@ -334,6 +334,7 @@ def resume_nbv(
     policy: str | Callable[..., Any] | None = None,
     live: Live | Transport | None = None,
     on_pass: OnPass = lambda done, most, model: None,
+    like: Scene | None = None,
 ) -> Run:
     """Continue a run from its last finished step to its end; return it, with its state.
 
@@ -345,6 +346,7 @@ def resume_nbv(
       left, those that were given up are asked for again.
     - on_pass: called as on_pass(done, most, model) after each pass of a fit; the model has Dr.Jit
       fields.
+    - like: as in `scene_of`; `on_pass` is then the scene's own.
 
     A finished run is returned as it is. Raises InputError if the folder holds no run, its inputs
     are missing or changed, another process works on it, a fit diverged, or `policy` is not the
@@ -354,7 +356,9 @@ def resume_nbv(
     check_named(run, policy)
     live = live if live is None or isinstance(live, Live) else Live(live)
     scores = None if policy is None else policy_of(policy)
-    scene, retry = replace(scene_of(run, live), on_pass=on_pass), bool(live)
+    scene, retry = scene_of(run, live, like), bool(live)
+    if scene is not like:
+        scene = replace(scene, on_pass=on_pass)
     state = recording.run(
         run.folder, run.settings, scene, scores, on_step=on_step, progress=progress, retry=retry
     )
@@ -381,9 +385,15 @@ def check_named(run: Run, policy: str | Callable[..., Any] | None) -> None:
         raise InputError(f"{run.folder}: its policy is a program, {own}; to run it: {resume}")
 
 
-def scene_of(run: Run, live: Live | None = None) -> Scene:
-    """Scene of a run, with its settings. live: how images are captured that are not rendered."""
+def scene_of(run: Run, live: Live | None = None, like: Scene | None = None) -> Scene:
+    """Scene of a run, with its settings. live: how images are captured that are not rendered.
+    like: scene of another run; returned, with all that it has computed, if the settings of the two
+    runs differ only in the policy and all images exist."""
     settings, dataset = run.settings, run.dataset
+    if like is not None and not dataset.on_demand:
+        one, other = (each.model_dump(exclude={"policy"}) for each in (settings, like.settings))
+        if one == other:
+            return like
     keep = VIEW_BYTES if settings.batch > 1 or settings.flies else 0
     scene = Scene(dataset, run.prior, settings, keep=keep)
     if not dataset.on_demand:
