@@ -12,8 +12,8 @@ from argparse import ArgumentParser
 from collections.abc import Sequence
 from pathlib import Path
 
-from studies.frame.claim import Row
 from studies.frame.output import read_rows
+from studies.frame.statistics import Row
 
 RESULTS = Path(__file__).parent.parent / "docs/results"
 

@@ -30,7 +30,6 @@ from mgs.run.settings import NbvSettings, validated
 from mgs.splat import render
 from studies import policies as others
 from studies.frame.case import test_views_of
-from studies.frame.claim import Row, interval
 from studies.frame.output import (
     Content,
     Panel,
@@ -41,6 +40,7 @@ from studies.frame.output import (
     write_table,
 )
 from studies.frame.program import Study, Work, at_least, study_of
+from studies.frame.statistics import Row, interval
 from studies.frame.sweep import CELLS, Cell
 from studies.setups import before_any_fit, choose_views
 

@@ -18,7 +18,6 @@ from mgs.policy import certificate, poses
 from mgs.policy.relaxation import Relaxation
 from mgs.run.policies import DIRECTIONAL_D, Directional
 from studies.frame.case import ROCKS, Rock
-from studies.frame.claim import Row
 from studies.frame.output import (
     Content,
     Panel,
@@ -31,6 +30,7 @@ from studies.frame.output import (
     write_table,
 )
 from studies.frame.program import WORKERS, Study, Work, study_of
+from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
 from studies.setups import (
     SETUPS,

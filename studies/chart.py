@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import mgs
-from mgs.fit.settings import COLOURS_ALONE, PASSES, WARM_PASSES
+from mgs.fit.settings import PASSES, WARM_PASSES
 from mgs.plotting import drawing
 from studies.frame.case import Case, Rock, Size, judge, test_views_of
-from studies.frame.claim import Claim, Row, judged, pareto_front, verdict_table
-from studies.frame.output import Content, group_styles, logarithmic, table, write_table
+from studies.frame.output import Content, group_styles, grouped, logarithmic, table, write_table
 from studies.frame.program import Study, Work, at_least, names_of, study_of
+from studies.frame.statistics import Row, pareto_front
 from studies.frame.sweep import Cell, Results
 from studies.frame.timing import REFERENCE, span, timed, with_seconds
 
@@ -44,11 +44,6 @@ QUALITIES = ("psnr", "ssim", "psnr_mask", "ssim_mask")
 
 LATER_PASSES = {2: 2, 5: 3, 10: 5, 20: 10, 40: 20}
 """Passes of later fits of a run, by passes of the first."""
-
-EQUAL_TIME, LOSS = 1.05, 0.1
-"""Factor up to which times count as equal, and loss in dB up to which a preset is as good as the
-best run of equal time."""
-
 
 PRESETS: dict[str, dict[str, Any]] = {
     "fast": {"passes": 5, "warm_passes": 3, "density": 1 / 4},
@@ -138,7 +133,7 @@ class Point:
         return f"{self.kind}/{'-'.join(parts)}"
 
     def settings(self, seeds: int) -> dict[str, Any]:
-        """Settings of `mgs nbv`, without COLOURS_ALONE."""
+        """Settings of `mgs nbv`."""
         seeds = seeds if self.policy else self.images
         return {
             "policy": self.policy or "uniform",
@@ -153,7 +148,7 @@ class Point:
         """Command line that makes this model."""
         given = self.settings(seeds)
         passes = given.pop("train")["passes"]
-        given |= {"train.passes": passes, "train.alpha_weight": 0}
+        given |= {"train.passes": passes}
         words = ["mgs", "nbv", str(dataset), "--prior", str(prior), "--out", "RUN"]
         for key, value in given.items():
             words += ["--set", f"{key}={value}"]
@@ -204,7 +199,7 @@ def cells_of(size: ChartSize) -> list[Cell]:
     return cells
 
 
-def rows_of(size: ChartSize, kind: str, root: Path, results: Results, unit: float) -> list[Row]:
+def rows_of(size: ChartSize, kind: str, results: Results, unit: float) -> list[Row]:
     """A row for each point of a kind: factors, settings, results, command, and whether it is on the
     front of seconds against PSNR and SSIM among points of as many images. unit: seconds of the
     reference."""
@@ -216,7 +211,7 @@ def rows_of(size: ChartSize, kind: str, root: Path, results: Results, unit: floa
         row: Row = {"factors": "; ".join(names), "preset": presets.get(point, "")}
         row |= asdict(point) | results[point.name]
         row |= {"gaussians": results[case.prior_name]["gaussians"]}
-        where = root / case.dataset, root / case.prior
+        where = Path(case.dataset), Path(case.prior)  # below the study's folder
         rows.append(row | {"command": point.command(*where, size.seeds)})
     rows = with_seconds(rows, unit)
     for count in {row["images"] for row in rows}:
@@ -240,11 +235,10 @@ def measure(
 ) -> dict[str, Any]:
     """Task: time a run, files included, and judge its model. Returns times (`timed`), qualities and
     passes of all fits together."""
-    given = settings | {"train": settings["train"] | COLOURS_ALONE}
 
     def run() -> mgs.Checkpoint:
         shutil.rmtree(out / "run", ignore_errors=True)
-        return mgs.run_nbv(root / dataset, out / "run", prior=root / prior, **given).state
+        return mgs.run_nbv(root / dataset, out / "run", prior=root / prior, **settings).state
 
     state, times = timed(run, repeats, tuple(reference))
     shutil.rmtree(out / "run")
@@ -256,25 +250,6 @@ def measure(
     }
 
 
-def preset_losses(rows: Sequence[Row]) -> list[float]:
-    """Effects: PSNR that each preset loses against the best run of equal time with other numbers of
-    Gaussians and passes, dB."""
-    grid = {"number and passes", "preset"}
-    runs = [row for row in rows if grid & set(row["factors"].split("; "))]
-    losses = []
-    for row in runs:
-        if row["preset"]:
-            equal = [one for one in runs if one["seconds"] <= EQUAL_TIME * row["seconds"]]
-            losses.append(max(one["psnr"] for one in equal) - row["psnr"])
-    return losses
-
-
-PRESET_CLAIM = Claim(
-    "A recommended setting loses at most 0.1 dB against the best run of equal time.",
-    preset_losses, "dB", "below", LOSS, "preset",
-)  # fmt: skip
-
-
 def _settings_text(row: Row) -> str:
     passes = f"{row['passes']} passes" + (f", then {row['warm_passes']}" if row["policy"] else "")
     name = f"**{row['preset']}**: " if row["preset"] else ""
@@ -283,14 +258,16 @@ def _settings_text(row: Row) -> str:
     return name + ", ".join(part for part in parts if part)
 
 
-COLUMNS: dict[str, Content] = {
-    "on the front, or a preset": _settings_text,
-    "images": "images",
-    "seconds": span,
-    "PSNR (dB)": "psnr:.2f",
-    "SSIM": "ssim:.4f",
-    "PSNR, rock (dB)": "psnr_mask:.2f",
-}
+def tables(rows: Sequence[Row]) -> str:
+    """Table of fits, then of runs, on the fronts or with a preset."""
+    columns: dict[str, Content] = {"on the front, or a preset": _settings_text, "images": "images"}
+    columns |= {"seconds": span, "PSNR (dB)": "psnr:.2f", "SSIM": "ssim:.4f"}
+    columns |= {"PSNR, rock (dB)": "psnr_mask:.2f"}
+    texts = []
+    for one in grouped(rows, "kind"):
+        shown = [row for row in one["of"] if row["front"] or row["preset"]]
+        texts.append(table(columns, sorted(shown, key=lambda r: (r["images"], r["seconds"]))))
+    return "\n".join(texts)
 
 
 def check_dataset(dataset: Path) -> None:
@@ -308,33 +285,30 @@ def sized(size: ChartSize, options: Namespace) -> ChartSize:
 
 
 def write(work: Work) -> list[Path]:
-    """Write KIND.csv, .json, .md and .png for each kind."""
-    size, results, paths = work.size, work.results, list[Path]()
+    """Write chart.csv, .json, .md and .png."""
+    size, results = work.size, work.results
     unit = float(np.median([one["reference"] for one in results.values() if "reference" in one]))
-    for kind in size.kinds:
-        rows = rows_of(size, kind, work.out, results, unit)
-        claims = [judged(PRESET_CLAIM, rows)] if kind == "run" else []
-        shown = [row for row in rows if row["front"] or row["preset"]]
-        text = table(COLUMNS, sorted(shown, key=lambda row: (row["images"], row["seconds"])))
-        text += f"\n{verdict_table(claims)}" if claims else ""
-        more = {"repeats": size.repeats, "reference_seconds": unit, "claims": claims}
-        paths += [*write_table(work, kind, rows, text, **more), work.out / f"{kind}.png"]
-        draw(paths[-1], {kind: rows})
-    return paths
+    rows = [
+        {"kind": kind} | row for kind in size.kinds for row in rows_of(size, kind, results, unit)
+    ]
+    draw(work.out / "chart.png", rows)
+    more = {"repeats": size.repeats, "reference_seconds": unit}
+    return [*write_table(work, "chart", rows, tables(rows), **more), work.out / "chart.png"]
 
 
 TITLES = {"fit": "What a second buys: single fits", "run": "What a second buys: whole runs"}
 """Titles of the figures of the kinds."""
 
 
-def draw(path: Path, kinds: Mapping[str, Sequence[Row]]) -> None:
+def draw(path: Path, rows: Sequence[Row]) -> None:
     """Draw seconds against PSNR, a panel for each kind of KINDS, for points of the usual number of
     images: by the last of their factors, with the best of each time and the names of presets.
 
     Raises InputError if the file cannot be written.
     """
-    names = list(dict.fromkeys(_factor(row) for rows in kinds.values() for row in rows))
+    names = list(dict.fromkeys(map(_factor, rows)))
     looks = dict(zip(names, group_styles(names), strict=True))
+    kinds = {one["kind"]: one["of"] for one in grouped(rows, "kind")}
     with drawing(path, 0.6 + 4.2 * len(kinds), 4.6) as figure:
         panels = figure.subplots(1, len(kinds), squeeze=False)[0]
         for axes, (kind, rows) in zip(panels, kinds.items(), strict=True):
@@ -362,7 +336,7 @@ def _draw_kind(axes: "Axes", rows: Sequence[Row], looks: Mapping[str, dict[str, 
         axes.errorbar(x, [row["psnr"] for row in of], xerr=[x - low, high - x], **look)
     for row in rows:
         at = row["seconds"], row["psnr"]
-        axes.annotate(row["preset"], at, (6, -12), textcoords="offset points")
+        axes.annotate(row["preset"] or "", at, (6, -12), textcoords="offset points")
     logarithmic(axes)
     axes.margins(0.08)
     axes.set(xlabel=f"seconds, {most} images", ylabel="PSNR on the test views (dB)")

@@ -18,9 +18,9 @@ from mgs.learning import refine_poses
 from mgs.policy.criteria import PRIOR_STD
 from mgs.seeds import generator
 from studies.frame.case import ROCKS
-from studies.frame.claim import Row
 from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
 from studies.frame.program import WORKERS, Options, Study, Work, study_of
+from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
 from studies.setups import (
     SETUPS,

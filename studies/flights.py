@@ -23,7 +23,6 @@ from mgs.run.flight import flight_of, reachable
 from mgs.run.policies import DIRECTIONAL_D
 from mgs.run.settings import FlightLimits
 from studies.frame.case import ROCKS
-from studies.frame.claim import Row
 from studies.frame.output import (
     Content,
     Panel,
@@ -35,6 +34,7 @@ from studies.frame.output import (
     write_table,
 )
 from studies.frame.program import WORKERS, Study, Work, study_of
+from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
 from studies.policies import angle
 from studies.setups import (

@@ -18,9 +18,9 @@ import mgs
 from mgs.gaussians import LEARNED
 from mgs.run.policies import Policy
 from studies.frame.case import ROCKS
-from studies.frame.claim import Row
 from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
 from studies.frame.program import WORKERS, Study, Work, study_of
+from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
 from studies.setups import SETUPS, SIZES, SetupSize, case_of, shared_scene, sized
 

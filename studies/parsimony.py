@@ -18,9 +18,9 @@ from mgs.learning import images_of
 from mgs.policy.criteria import PIXEL_NOISE
 from mgs.splat import groups
 from studies.frame.case import ROCKS, judge
-from studies.frame.claim import Row
 from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
 from studies.frame.program import WORKERS, Study, Work, study_of
+from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
 from studies.setups import SETUPS, SIZES, SetupSize, case_of, sized
 

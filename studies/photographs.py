@@ -19,9 +19,9 @@ from mgs.files import read_csv
 from mgs.run.nbv import start_fit
 from studies.chart import check_dataset
 from studies.frame.case import judge
-from studies.frame.claim import Row
 from studies.frame.output import Content, Panel, draw_panels, table, write_table
 from studies.frame.program import Study, Work, study_of
+from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
 
 NAME = "photographs"

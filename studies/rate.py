@@ -31,9 +31,9 @@ from mgs.run.folder import Run
 from mgs.run.nbv import start_fit
 from mgs.splat_files import FORMATS, load_gaussians, write_gaussians
 from studies.frame.case import FRESH, ROCKS, Case, Rock, Size, judge, rocks_of, test_views_of
-from studies.frame.claim import Claim, Row, judged, pareto_front, single, verdict_table
 from studies.frame.output import Content, Panel, draw_panels, table, write_table
 from studies.frame.program import Study, Work, study_of
+from studies.frame.statistics import Row, pareto_front
 from studies.frame.sweep import Cell
 
 WITH, ALONE, JPEG, SOG = "mgs, mesh at the receiver", "mgs", "JPEG, fitted at home", "SOG"
@@ -217,16 +217,6 @@ def share(rows: Sequence[Row], run: str, one: str, other: str) -> float:
     return float(np.exp(np.mean(logs[0] - logs[1])))
 
 
-CLAIMS = (
-    Claim(
-        "With the mesh at the receiver, mgs needs at most a sixth of SPZ's bytes at equal PSNR.",
-        single("with_mesh", {}), "of SPZ", "below", 1 / 6, "rock",
-    ),
-    Claim(
-        "Without it, at most a third.", single("alone", {}), "of SPZ", "below", 1 / 3, "rock",
-    ),
-)  # fmt: skip
-
 COLUMNS: dict[str, Content] = {
     "rock": "run",
     "mgs with mesh / SPZ": "with_mesh:.3f",
@@ -251,8 +241,7 @@ def write(work: Work) -> list[Path]:
     for run in dict.fromkeys(row["run"] for row in rows):
         found = {key: share(rows, run, *pair) for key, pair in pairs.items()}
         shares.append({"run": run} | {k: None if np.isnan(v) else v for k, v in found.items()})
-    claims = [judged(claim, shares) for claim in CLAIMS]
-    text = f"{table(COLUMNS, shares)}\n{verdict_table(claims)}"
+    text = table(COLUMNS, shares)
     labels = "kB", "psnr", "kB", "PSNR, test views (dB)", "coder", True
     panels = [
         Panel(*labels, only=(("run", row["run"]), ("front", True)), title=row["run"])
@@ -261,7 +250,7 @@ def write(work: Work) -> list[Path]:
     drawn = [row for row in rows if row["kB"]]
     draw_panels(work.out / "rate.png", panels, drawn, "Best files of each coder")
     shutil.copyfile(work.out / "cells/picture/sent.png", work.out / "sent.png")
-    paths = write_table(work, "rate", rows, text, shares=shares, claims=claims)
+    paths = write_table(work, "rate", rows, text, shares=shares)
     return [*paths, work.out / "rate.png", work.out / "sent.png"]
 
 

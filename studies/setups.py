@@ -26,7 +26,6 @@ from mgs.run.inputs import policy_record
 from mgs.run.loop import finished
 from mgs.run.policies import Policy
 from studies.frame.case import FRESH, NAMESAKE, ROCKS, Case, Rock, Size, rocks_of, test_views_of
-from studies.frame.claim import Row, holm, interval, permutation_p
 from studies.frame.output import (
     Panel,
     draw_matrix,
@@ -38,6 +37,7 @@ from studies.frame.output import (
     write_table,
 )
 from studies.frame.program import WORKERS, Options, Study, Work, study_of
+from studies.frame.statistics import Row, holm, interval, permutation_p
 from studies.frame.sweep import Cell, results_so_far
 
 Results = Mapping[str, Mapping[str, Any]]

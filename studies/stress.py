@@ -25,9 +25,9 @@ from mgs.run.settings import NbvSettings
 from mgs.seeds import generator
 from studies.faults import IMAGE_FAULTS, PRIOR_FAULTS, captured, pose_noise
 from studies.frame.case import ROCKS, judge
-from studies.frame.claim import Row
 from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
 from studies.frame.program import WORKERS, Study, Work, study_of
+from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
 from studies.paper import FREE
 from studies.setups import SETUPS, SIZES, SetupSize, case_of, sized

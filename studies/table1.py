@@ -36,9 +36,9 @@ from mgs.prior.points import scattered
 from mgs.run import policy_file
 from mgs.run.inputs import policy_record
 from studies.frame.case import Case, Rock, Size, test_views_of
-from studies.frame.claim import Row
 from studies.frame.output import table, write_table
 from studies.frame.program import Study, Work, at_least, study_of
+from studies.frame.statistics import Row
 from studies.frame.sweep import Cell, cell_folder
 from studies.setups import RANDOM, RING
 

@@ -1,4 +1,4 @@
-"""Statistics and verdicts of studies, against known answers and brute force; tables and plots."""
+"""Statistics of studies, against known answers and brute force; tables and plots."""
 
 from itertools import product
 
@@ -7,19 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from studies.frame.claim import (
+from studies.frame.output import grouped, scene_mean, table, with_interval
+from studies.frame.statistics import (
     MOST_ROCKS,
-    Claim,
     holm,
     interval,
-    judged,
-    paired,
     pareto_front,
     permutation_p,
-    single,
-    verdict_table,
 )
-from studies.frame.output import grouped, scene_mean, table, with_interval
 
 numbers = st.floats(-10, 10, allow_nan=False).map(lambda x: round(x, 3))
 
@@ -66,40 +61,6 @@ def test_a_point_is_on_the_front_unless_another_beats_it(points):
         beaten = any(c <= cost and g >= gain and (c, g) != (cost, gain) for c, g in points)
         assert on[i] != beaten
     assert pareto_front([1, np.nan, 2], [1, 5, 2]).tolist() == [True, False, True]
-
-
-def claim(side, bound=1.0):
-    return Claim("it is so", lambda rows: [row["x"] for row in rows], "dB", side, bound)
-
-
-@pytest.mark.parametrize(
-    ("values", "above", "below"),
-    [
-        ([2.0, 2.1, 1.9], "holds", "fails"),
-        ([0.0, 0.1, -0.1], "fails", "holds"),
-        ([0.0, 2.0, 1.1], "depends", "depends"),
-        ([5.0], "depends", "depends"),
-        ([], "depends", "depends"),
-        ([1.0, 1.0], "holds", "holds"),  # on the bound itself
-    ],
-)
-def test_a_verdict_follows_from_the_interval_alone(values, above, below):
-    rows = [{"x": value} for value in values]
-    assert judged(claim("above"), rows)["verdict"] == above
-    assert judged(claim("below"), rows)["verdict"] == below
-    assert judged(claim("above"), rows)["runs"] == len(values)
-    assert f"| it is so | **{above}** |" in verdict_table([judged(claim("above"), rows)])
-
-
-def test_runs_are_paired_by_their_name():
-    rows = [
-        {"run": run, "kind": kind, "v": value}
-        for run, kind, value in (
-            ("a", "x", 3.0), ("a", "y", 1.0), ("b", "x", 9.0), ("c", "y", 1.0), ("c", "x", 1.5)
-        )
-    ]  # fmt: skip
-    assert paired("v", {"kind": "x"}, {"kind": "y"})(rows) == [2.0, 0.5]
-    assert single("v", {"kind": "x"})(rows) == [3.0, 9.0, 1.5]
 
 
 def test_columns_are_formats_or_functions_and_missing_values_are_dashes():

@@ -15,8 +15,8 @@ from typing import Any
 import mgs
 from mgs.files import atomic_folder
 from mgs.run.inputs import file_digest
-from studies.frame.claim import MOST_ROCKS
 from studies.frame.program import Options, at_least
+from studies.frame.statistics import MOST_ROCKS
 from studies.frame.sweep import CELLS, Cell
 
 MESH_SCENE = "boulder"

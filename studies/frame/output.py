@@ -20,8 +20,8 @@ from mgs.provenance import versions
 from mgs.reports.figures import POLICY_STYLE, STYLES
 from mgs.reports.tables import markdown
 from mgs.runtime import processor
-from studies.frame.claim import Row, interval
 from studies.frame.program import Work
+from studies.frame.statistics import Row, interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -118,12 +118,14 @@ def write_table(work: Work, name: str, rows: Sequence[Row], text: str, **more: A
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Read the rows that `write_table` wrote as CSV. Numbers are numbers; an empty cell is None."""
+    """Read the rows that `write_table` wrote as CSV: numbers, True and False, None where empty."""
     with open(path, newline="", encoding="utf-8") as file:
         return [{key: _value(text) for key, text in row.items()} for row in csv.DictReader(file)]
 
 
 def _value(text: str) -> Any:
+    if text in ("True", "False"):
+        return text == "True"
     for kind in (int, float):
         with suppress(ValueError):
             return kind(text)

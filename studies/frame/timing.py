@@ -13,7 +13,7 @@ import numpy as np
 
 from mgs import runtime
 from mgs.memory import padded
-from studies.frame.claim import Row
+from studies.frame.statistics import Row
 
 REFERENCE = 10_000, 320, 240
 """Gaussians, width and height of the reference, which renders REFERENCE_CALLS times with gradients.
