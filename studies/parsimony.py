@@ -144,8 +144,8 @@ def rows_of(work: Work) -> list[Row]:
 def name_of(row: Row) -> str:
     """Name of a choice in tables."""
     words: dict[str, str] = {
-        NUMBER: f"{row['asked'] or 0:,} Gaussians",
-        KINDS: f"learns {(row['learned'] or '').replace('+', 'up to')}",
+        NUMBER: f"{row.get('asked') or 0:,} Gaussians",
+        KINDS: f"learns {(row.get('learned') or '').replace('+', 'up to')}",
         DEGREE: f"SH degree {row['degree']}",
         PRUNED: f"pruned, {row.get('noise') or 0:g} sigma",
         REFIT: "`refit`",
