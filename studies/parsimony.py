@@ -126,7 +126,10 @@ def refit_and_judge(root: Path, out: Path, dataset: str, prior: str) -> dict[str
     frames = [scene.frames[i] for i in scene.seeds(VIEWS)]
     lean = lean_fit(images_of(scene, frames), scene.settings)
     row = quality(lean.gaussians, scene.dataset, lean.parameters)
-    return {"rows": [row | {"degree": lean.gaussians.sh_degree}]}
+    row |= {"degree": lean.gaussians.sh_degree}
+    if lean.left_out:
+        row |= {"left_out": lean.left_out.gain, "left_out_error": lean.left_out.error}
+    return {"rows": [row]}
 
 
 def rows_of(work: Work) -> list[Row]:

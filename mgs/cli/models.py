@@ -169,7 +169,7 @@ def _refitted(result: "RefittedRun") -> list[str]:
     tried = "SH degree 0: no other was tried"
     if left_out:
         more = "more" if left_out.pays else "not more"
-        gain = f"degree 1 gains {left_out.gain:+.3f} dB, {more} than its standard error of"
+        gain = f"degree 1 gains {left_out.gain:+.3f} dB, {more} than twice its standard error of"
         tried = f"SH degree {degree}: on views left out, neighbours together, {gain}"
         tried += f" {left_out.error:.3f}"
     lines.append(tried)

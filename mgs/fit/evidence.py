@@ -56,8 +56,8 @@ class LeftOut:
 
     @property
     def pays(self) -> bool:
-        """Whether the gain is larger than its standard error."""
-        return self.gain > self.error
+        """Whether the gain is larger than two standard errors."""
+        return self.gain > 2 * self.error
 
 
 @dataclass(frozen=True)

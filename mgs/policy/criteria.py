@@ -14,7 +14,7 @@ Score = Callable[[Array, Array, Array], float]
 PIXEL_NOISE = 0.02  # sigma_e, std of a pixel's residual, linear RGB (34 dB); chosen
 PRUNE_NOISE = PIXEL_NOISE / 5  # rms change by `mgs simplify`, linear RGB: about 0.1 dB; chosen
 DIRECTIONAL_STD = 0.03  # tau of colours of degrees above 0: rocks look alike from all sides
-LEARN_LOSS = 0.05  # rise of the objective, dB, that a refit may cause (docs/parsimony.md)
+LEARN_LOSS = 0.5  # rise of the objective, dB, that a refit may cause (docs/parsimony.md)
 
 PRIOR_STD = {"colour": 1.0, "scale": 0.125, "rotation": 0.0625, "opacity": 2.0}
 """tau: standard deviation of each parameter around its start, in its own unit. Those of scale and
