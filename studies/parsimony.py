@@ -46,7 +46,10 @@ DEGREES = (1, 2)
 PRUNE_NOISE = (0.1, 0.2, 0.5)
 """Allowed change by pruning, over the noise of a pixel."""
 
-NUMBER, KINDS, DEGREE = "number of Gaussians", "kinds learned", "SH degree"
+LOSSES = (0.05, 1.0, 2.0)
+"""Other values of `mgs simplify --loss`, with colours of degree 0, dB."""
+
+NUMBER, KINDS, DEGREE, LOSS = "number of Gaussians", "kinds learned", "SH degree", "refit's loss"
 DEFAULT, REFIT, PRUNED = "default", "refit", "pruned"
 """Values of the column `choice`: what differs from the default, the refitted model, the pruned."""
 
@@ -121,15 +124,21 @@ def fit_and_judge(
 
 
 def refit_and_judge(root: Path, out: Path, dataset: str, prior: str) -> dict[str, list[Row]]:
-    """Task: the row of `mgs simplify --method refit` on the same views."""
+    """Task: rows of `mgs simplify --method refit` on the same views, by default and with LOSSES."""
     scene = scene_of(root, dataset, prior)
     frames = [scene.frames[i] for i in scene.seeds(VIEWS)]
-    lean = lean_fit(images_of(scene, frames), scene.settings)
+    images = images_of(scene, frames)
+    lean = lean_fit(images, scene.settings)
     row = quality(lean.gaussians, scene.dataset, lean.parameters)
     row |= {"degree": lean.gaussians.sh_degree}
     if lean.left_out:
         row |= {"left_out": lean.left_out.gain, "left_out_error": lean.left_out.error}
-    return {"rows": [row]}
+    rows = [row]
+    for loss in LOSSES:
+        other = lean_fit(images, scene.settings, sh="0", loss=loss)
+        row = quality(other.gaussians, scene.dataset, other.parameters)
+        rows.append(row | {"choice": LOSS, "loss": loss, "degree": 0})
+    return {"rows": rows}
 
 
 def rows_of(work: Work) -> list[Row]:
@@ -152,6 +161,7 @@ def name_of(row: Row) -> str:
         DEGREE: f"SH degree {row['degree']}",
         PRUNED: f"pruned, {row.get('noise') or 0:g} sigma",
         REFIT: "`refit`",
+        LOSS: f"`refit --loss {row.get('loss') or 0:g} --sh 0`",
         DEFAULT: "default",
     }
     return words[row["choice"]]
@@ -191,8 +201,10 @@ def write(work: Work) -> list[Path]:
 def draw(path: Path, rows: Sequence[Row]) -> None:
     """Draw PSNR against the number of parameters, a panel for each rock."""
     default = [row for row in rows if row["choice"] == DEFAULT]
-    joined = [row | {"choice": choice} for row in default for choice in (NUMBER, KINDS, PRUNED)]
-    shown = joined + [row for row in rows if row["choice"] in (NUMBER, KINDS, PRUNED, REFIT)]
+    joined = [
+        row | {"choice": choice} for row in default for choice in (NUMBER, KINDS, PRUNED, LOSS)
+    ]
+    shown = joined + [row for row in rows if row["choice"] in (NUMBER, KINDS, PRUNED, LOSS, REFIT)]
     label, axes = "PSNR inside the rock (dB)", ("parameters", "psnr_inside")
     panels = [
         Panel(*axes, "learned parameters", label, "choice", True, (("scene", scene),), scene)

@@ -123,7 +123,7 @@ def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, ellipsoids, mo
         study("parsimony", out, "--rocks", "1", sizes={"quick": size})
     assert len(list(out.glob("cells/dataset/**/result.json"))) == 1
     rows = read_rows(out / "parsimony.csv")
-    assert len(rows) == 2 + 1 + 3 + 2 + 3 + 1
+    assert len(rows) == 2 + 1 + 3 + 2 + 3 + 1 + 3
     assert (out / "parsimony.png").stat().st_size > 10_000
     by = {(one["choice"], one["asked"] or one["learned"], one["degree"]): one for one in rows}
     default = by[parsimony.DEFAULT, parsimony.ALL, 0]
