@@ -208,8 +208,8 @@ def fit_gaussians(
 
 
 def _together(information: Any) -> Any:
-    """Information of a kind of parameter by which its steps are measured. The K coefficients of a
-    colour [N,K,3] move a pixel together, so directional ones count K times."""
+    """Metric of a kind of parameter, by its information with that of the prior. The K coefficients
+    of a colour [N,K,3] move a pixel together, so directional ones step 1/K as far."""
     if len(information.shape) < 3 or information.shape[1] == 1:
         return information
     factors = np.ones(information.shape, np.float32)
