@@ -36,6 +36,9 @@ KINDS = ("fit", "run")
 SCENE = "boulder"
 """Scene of the charts."""
 
+BASE = "d-optimal"
+"""Policy of runs in which other settings vary."""
+
 DENSITY = 1 / 8
 """Density of the default prior (`PriorSettings`): about that of `mgs demo`."""
 
@@ -157,7 +160,7 @@ class Point:
 
 def factors(size: ChartSize) -> dict[str, list[Point]]:
     """Points by factor; a point may be in several."""
-    fit, run = Point(size.count), Point(size.count, policy="d-optimal")
+    fit, run = Point(size.count), Point(size.count, policy=BASE)
     return {
         "number of Gaussians": [replace(fit, density=d) for d in size.densities],
         "passes": [replace(fit, passes=p) for p in size.passes],
@@ -165,7 +168,7 @@ def factors(size: ChartSize) -> dict[str, list[Point]]:
         "number and passes of a fit": [
             replace(fit, density=d, passes=p) for d in size.densities for p in size.passes
         ],
-        "policy": [replace(run, policy=name) for name in ("d-optimal", *size.policies)],
+        "policy": [replace(run, policy=name) for name in (BASE, *size.policies)],
         "estimator": [replace(run, estimator=name) for name in size.estimators],
         "number and passes": [
             replace(run, density=d, passes=p, warm_passes=LATER_PASSES[p])
@@ -178,7 +181,7 @@ def factors(size: ChartSize) -> dict[str, list[Point]]:
 
 def preset_points(size: ChartSize) -> dict[str, Point]:
     """Runs with PRESETS."""
-    run = Point(size.count, policy="d-optimal")
+    run = Point(size.count, policy=BASE)
     return {name: replace(run, **row) for name, row in size.presets.items()}
 
 
@@ -258,8 +261,46 @@ def _settings_text(row: Row) -> str:
     return name + ", ".join(part for part in parts if part)
 
 
+WORDS = {
+    "gaussians": "{:,} Gaussians",
+    "passes": "{} passes",
+    "images": "{} images",
+    "policy": "policy {}",
+    "estimator": "estimator {}",
+}
+"""Settings of a point, in words."""
+
+
+def changes(rows: Sequence[Row]) -> list[Row]:
+    """Rows that differ from the base of their kind in one of WORDS, with the change in words, the
+    times over that of the base, and the differences of PSNR, dB."""
+    changed = []
+    for one in grouped(rows, "kind"):
+        about = {"density": DENSITY, "passes": PASSES, "estimator": "exact"}
+        about |= {"policy": BASE if one["kind"] == "run" else None}
+        about |= {"images": Counter(row["images"] for row in one["of"]).most_common(1)[0][0]}
+        alike = [{**row, "policy": row["policy"] or None} for row in one["of"]]
+        base = next(row for row in alike if about.items() <= row.items())
+        for row in alike:
+            keys = [key for key in WORDS if row[key] != base[key]]
+            if len(keys) == 1:
+                words = f"{one['kind']}: {WORDS[keys[0]].format(row[keys[0]])}"
+                row |= {"change": words, "times": row["seconds"] / base["seconds"]}
+                row |= {f"{key}_more": row[key] - base[key] for key in ("psnr", "psnr_mask")}
+                changed.append(row)
+    return changed
+
+
 def tables(rows: Sequence[Row]) -> str:
-    """Table of fits, then of runs, on the fronts or with a preset."""
+    """Table of single changes; of fits, then of runs, on the fronts or with a preset."""
+    columns: dict[str, Content] = {"change": "change", "times the seconds": "times:.2f"}
+    columns |= {"PSNR (dB)": "psnr_more:+.2f", "rock (dB)": "psnr_mask_more:+.2f"}
+    text = table(columns, changes(rows))
+    return f"{text}\n{fronts(rows)}"
+
+
+def fronts(rows: Sequence[Row]) -> str:
+    """Tables of the points on the fronts or with a preset, of each kind."""
     columns: dict[str, Content] = {"on the front, or a preset": _settings_text, "images": "images"}
     columns |= {"seconds": span, "PSNR (dB)": "psnr:.2f", "SSIM": "ssim:.4f"}
     columns |= {"PSNR, rock (dB)": "psnr_mask:.2f"}
