@@ -182,8 +182,7 @@ def tables(rows: Sequence[Row]) -> str:
         return next(row[key] for row in group["of"] if some.items() <= row.items())
 
     columns = {"rock": "scene", "automatic number": lambda g: f"{of(g, 'gaussians', DEFAULT):,}"}
-    columns |= {"inside (dB)": lambda g: f"{of(g, 'psnr_inside', DEFAULT):.2f}"}
-    for n in COUNTS:
+    for n in COUNTS[2:]:
         columns[f"{n:,}"] = lambda g, n=n: f"{of(g, 'psnr_inside_over', NUMBER, asked=n):+.2f}"
     columns |= {"`refit`": lambda g: f"{of(g, 'psnr_inside_over', REFIT):+.2f}"}
     columns |= {"its parameters": lambda g: f"{of(g, 'share', REFIT):.0%}"}

@@ -260,19 +260,21 @@ def most_warned(group: Row) -> str:
 
 
 def kept(policy: str) -> Any:
-    """Content: mean share of the gain that the choice keeps, per cent."""
-    return scene_mean(f"choice {policy}", ".0%", ends=False)
+    """Content: mean share of the gain that the choice keeps at each size, per cent."""
+    share = by_size(scene_mean(f"choice {policy}", ".0%", ends=False))
+    return lambda group: share(group).replace("%", "")
 
 
 def tables(rows: Sequence[Row]) -> str:
-    """Tables of faults, warnings and few views; means over scenes with 95 % intervals."""
+    """Tables of faults, warnings and few views; means over scenes, for few views with 95 %
+    intervals."""
     both = grouped([row for row in rows if row["part"] == "faults"], "fault")
     clean, spoiled = both[0]["of"], [row for group in both[1:] for row in group["of"]]
     columns: dict[str, Any] = {"fault": "fault", "sizes": sizes}
-    columns |= {"cost (dB)": by_size(scene_mean("lost", ".1f"))}
+    columns |= {"cost (dB)": by_size(scene_mean("lost", ".1f", ends=False))}
     columns |= {"runs warned of": by_size(warned), "by": most_warned}
-    columns |= {"`d-optimal` keeps": by_size(kept("d-optimal"))}
-    columns |= {"`directional-i` keeps": by_size(kept("directional-i"))}
+    columns |= {"`d-optimal` keeps (%)": kept("d-optimal")}
+    columns |= {"`directional-i` keeps (%)": kept("directional-i")}
     text = table(columns, both[1:])
 
     groups = {

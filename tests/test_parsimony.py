@@ -111,7 +111,7 @@ def test_tables_compare_choices_with_the_default():
     assert "| 29.40 | -0.60 [-1.87, +0.67] |" in refit
     assert refit.endswith("| 40% |")
     assert "pruned, 0.2 sigma" in choices
-    assert rocks.splitlines()[-1].startswith("| b | 1,000 | 30.00 | -0.70 | -0.70 |")
+    assert rocks.splitlines()[-1].startswith("| b | 1,000 | -0.70 | -0.70 | -0.70 | -0.70 | 40% |")
 
 
 @pytest.mark.slow
