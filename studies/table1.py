@@ -29,7 +29,7 @@ import mgs
 from mgs.camera import extent_of
 from mgs.data.dataset import target_of
 from mgs.fit.fitting import fit_gaussians
-from mgs.fit.settings import COLOURS_ALONE, as_3dgs
+from mgs.fit.settings import as_3dgs
 from mgs.memory import IMAGE_BYTES, Deferred, kept_within
 from mgs.prior.initial import round_gaussians
 from mgs.prior.points import scattered
@@ -184,8 +184,7 @@ def begun_run(root: Path, out: Path, dataset: str, prior: str, settings: dict[st
     run = out / "run"
     if (run / "config.json").is_file():
         return mgs.open_run(run)
-    train = {**COLOURS_ALONE, **settings.get("train", {})}
-    return mgs.start_run(root / dataset, run, prior=root / prior, **settings | {"train": train})
+    return mgs.start_run(root / dataset, run, prior=root / prior, **settings)
 
 
 def time_policy(

@@ -22,7 +22,6 @@ PASSES, WARM_PASSES = 10, 5
 # Default of `TrainSettings.alpha_weight` in a run whose frames all have a mask or alpha. A chosen
 # constant (docs/fit.md, An opaque surface).
 ALPHA_WEIGHT = 0.1
-COLOURS_ALONE = {"alpha_weight": 0.0}  # values of `TrainSettings`, as in the paper
 
 Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
 # A number that others are divided by, bounded so that the results neither overflow nor vanish.
@@ -166,5 +165,5 @@ def as_3dgs(extent: float) -> dict[str, Any]:
         "sh_steps": 1000,
         "directional_rate": 1 / 20,
         "antialiased": False,
-        **COLOURS_ALONE,
+        "alpha_weight": 0.0,
     }
