@@ -14,6 +14,7 @@ from program import study
 from refusals import occupied, refused
 
 from mgs.files import read_json, write_json
+from mgs.fit.settings import ALPHA_WEIGHT
 from mgs.run.folder import read_checkpoint
 from mgs.survey import flight
 from mgs.survey.flight import SurveySettings, fly
@@ -249,7 +250,7 @@ def test_a_run_and_3dgs_are_timed_alone_and_measured_on_all_views(tmp_path, monk
     run, free = (results[one.name] for one in runs)
     folder = cell_folder(tmp_path, runs[0].name) / "run"
     settings = json.loads((folder / "config.json").read_text())["settings"]
-    assert settings["train"]["alpha_weight"] == 0, "studies fit colours alone"
+    assert settings["train"]["alpha_weight"] == ALPHA_WEIGHT, "as a run by default"
     steps = read_checkpoint(folder).steps
     assert run["seconds"] == pytest.approx(sum(sum(step["seconds"].values()) for step in steps))
     choices = [step["seconds"]["score"] for step in steps[1:]]
