@@ -21,7 +21,7 @@ from mgs.data.clouds import SparseCloud, write_cloud
 from mgs.data.meshes import distances_to_mesh
 from mgs.data.world import World, unit_up
 from mgs.reports.suggestion import write_suggestion
-from mgs.run.candidates import Site, hidden, inside, place_poses, read_poses
+from mgs.run.candidates import Site, hidden, inside, place_poses, read_poses, refusals
 from mgs.run.nbv import start_fit
 from mgs.run.suggest import coarse_prior, suggest
 
@@ -146,6 +146,18 @@ def test_places_behind_a_wall_are_left_out(run, site):
     assert found.dropped["behind what the images show"] >= 2
     assert len(found.ranking) + sum(found.dropped.values()) == 12
     assert not any(255 < view.azimuth < 285 for view in found.ranking)
+
+
+def test_the_far_side_of_an_object_alone_is_not_behind_a_wall(site):
+    ball = np.random.default_rng(0).normal(size=(3000, 3))
+    radius = np.linalg.norm(site.prior.points - site.centre, axis=1).max()
+    ball = site.centre + radius * ball / np.linalg.norm(ball, axis=1)[:, None]
+    angles = np.radians(np.linspace(-30, 30, 9))
+    eyes = site.centre + 3 * radius * np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
+    taken = [synthetic.pinhole(50, 64, 48, eye, site.centre) for eye in eyes]
+    ring = place_poses("ring", 12, 3 * radius, (0, 4), site)
+    assert hidden(np.stack([camera.position for _, camera in ring]), taken, ball).any()
+    assert "behind what the images show" not in refusals(ring, taken, replace(site, points=ball))
 
 
 def test_gains_of_a_model_without_a_surface_are_no_guide(run, monkeypatch, capsys):
