@@ -265,5 +265,5 @@ def test_a_run_that_cannot_be_refitted_is_one_line(run, tmp_path):
     fails("nowhere", refit_run, tmp_path / "run")
     train = {"density": "adaptive", "means": "free"}
     change_settings(tmp_path / "run", budget=0, train=train)
-    fails("needs a run with train", refit_run, tmp_path / "run")
+    fails("--density fixed", refit_run, tmp_path / "run")
     assert not (tmp_path / "run" / REFITTED).exists()

@@ -100,7 +100,7 @@ def refit_run(
         raise InputError("learn all and sh 0 leave nothing to choose; leave out one of them")
     opened = open_run(run)
     if opened.settings.train.density != "fixed":
-        needs = "refitting needs a run with train.density fixed"
+        needs = "fit anew with `mgs fit --density fixed` to refit"
         raise InputError(f"{opened.folder}: its fit changed the Gaussians of the prior; {needs}")
     path = check_writable(opened.folder / REFITTED)
     own, settings, prior = opened.state.gaussians, opened.settings, opened.prior
