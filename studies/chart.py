@@ -40,7 +40,7 @@ BASE = "d-optimal"
 """Policy of runs in which other settings vary."""
 
 DENSITY = 1 / 8
-"""Density of the default prior (`PriorSettings`): about that of `mgs demo`."""
+"""Density of the base: a tenth of the automatic one, for short times."""
 
 QUALITIES = ("psnr", "ssim", "psnr_mask", "ssim_mask")
 """Metrics of the test views in rows."""
