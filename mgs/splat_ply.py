@@ -277,7 +277,8 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
         higher = np.transpose(g.sh[:, 1:], (0, 2, 1)).reshape(n, rest)
         # 0 lies between two steps. Taking the upper one everywhere would tint the whole model.
         steps = (higher / 8 + 0.5) * 256
-        steps -= (steps == np.floor(steps)) & (np.add.outer(range(n), range(rest)) % 2 > 0)
+        odd = (np.arange(n)[:, None] & 1) != (np.arange(rest) & 1)
+        steps -= (steps == np.floor(steps)) & odd
         steps = np.clip(np.floor(steps), 0, 255)
         elements["sh"] = {f"f_rest_{i}": (step, "u1") for i, step in enumerate(steps.T)}
     write_columns(path, elements, [ANTIALIASED_COMMENT] * gaussians.antialiased)

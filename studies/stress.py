@@ -152,7 +152,7 @@ class Lab:
         """Random generator of a fault of this rock."""
         return generator(0, f"stress/{self.name}/{fault}/{size}")
 
-    def spoiled(self, change: Any, size: float, views: Sequence[int], fault: str) -> list[Any]:
+    def with_fault(self, change: Any, size: float, views: Sequence[int], fault: str) -> list[Any]:
         """All frames, those of some views changed."""
         rng, frames = self.rng(fault, size), enumerate(self.data.frames)
         return [change(f, size, rng) if i in views else f for i, f in frames]
@@ -171,7 +171,7 @@ def faults(
     lab = Lab(root, dataset, prior)
     for fault, (change, sizes, _) in IMAGE_FAULTS.items():
         for size in sizes:
-            lab.add(fault, size, frames=lab.spoiled(change, size, lab.taken, fault))
+            lab.add(fault, size, frames=lab.with_fault(change, size, lab.taken, fault))
     for fault, (change, sizes, _) in PRIOR_FAULTS.items():
         for size in sizes:
             lab.add(fault, size, change(lab.prior, size, lab.rng(fault, size)))
@@ -180,7 +180,7 @@ def faults(
     for passes in FIT_FAULTS[SHORT][0]:
         lab.add(SHORT, passes, passes=passes)
     for size in FIT_FAULTS[ONE_POSE][0]:
-        lab.add(ONE_POSE, size, frames=lab.spoiled(pose_noise, size, lab.taken[:1], ONE_POSE))
+        lab.add(ONE_POSE, size, frames=lab.with_fault(pose_noise, size, lab.taken[:1], ONE_POSE))
     return {"rows": lab.rows}
 
 
@@ -246,20 +246,20 @@ def sizes(group: Row) -> str:
     return f"{before}{' / '.join(short)}{unit}"
 
 
-def warned(group: Row) -> str:
+def count_of_warnings(group: Row) -> str:
     """Number of runs with a warning."""
     return str(sum(bool(row["warnings"]) for row in group["of"]))
 
 
-def most_warned(group: Row) -> str:
-    """The warnings that most runs of the two larger sizes raise, at least half of them."""
-    last = grouped(group["of"], "size")[1:]
+def commonest_warnings(group: Row) -> str:
+    """Warnings that at least half of the runs of the two larger sizes raise, or of all rocks."""
+    last = grouped(group["of"], "size")[group["fault"] != ANOTHER :]
     runs = [row for one in last for row in one["of"]]
     count = Counter(name for row in runs for name in (row["warnings"] or "").split())
     return ", ".join(name for name, many in count.most_common() if 2 * many >= len(runs)) or "–"
 
 
-def kept(policy: str) -> Any:
+def share_of_gain(policy: str) -> Any:
     """Content: mean share of the gain that the choice keeps at each size, per cent."""
     share = by_size(scene_mean(f"choice {policy}", ".0%", ends=False))
     return lambda group: share(group).replace("%", "")
@@ -272,9 +272,9 @@ def tables(rows: Sequence[Row]) -> str:
     clean, spoiled = both[0]["of"], [row for group in both[1:] for row in group["of"]]
     columns: dict[str, Any] = {"fault": "fault", "sizes": sizes}
     columns |= {"cost (dB)": by_size(scene_mean("lost", ".1f", ends=False))}
-    columns |= {"runs warned of": by_size(warned), "by": most_warned}
-    columns |= {"`d-optimal` keeps (%)": kept("d-optimal")}
-    columns |= {"`directional-i` keeps (%)": kept("directional-i")}
+    columns |= {"runs warned of": by_size(count_of_warnings), "by": commonest_warnings}
+    columns |= {"`d-optimal` keeps (%)": share_of_gain("d-optimal")}
+    columns |= {"`directional-i` keeps (%)": share_of_gain("directional-i")}
     text = table(columns, both[1:])
 
     groups = {
@@ -283,7 +283,9 @@ def tables(rows: Sequence[Row]) -> str:
         "a fault that costs more": [row for row in spoiled if row["lost"] > FAILURE],
     }
     several = [{"with": name, "of": of, "runs": len(of)} for name, of in groups.items()]
-    text += f"\n{table({'runs with': 'with', 'runs': 'runs', 'warned of': warned}, several)}"
+    text += (
+        f"\n{table({'runs with': 'with', 'runs': 'runs', 'warned of': count_of_warnings}, several)}"
+    )
 
     few = grouped([row for row in rows if row["part"] == "few_views"], "views", "means")
     columns = {"views": "views", "means": "means", "PSNR (dB)": scene_mean("psnr", ".2f", False)}

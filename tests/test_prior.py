@@ -8,14 +8,13 @@ import synthetic
 import trimesh
 from refusals import fails
 from scipy.spatial import cKDTree
-from sklearn.cluster import DBSCAN
 
 from mgs import Camera, Dataset, InputError, PriorSettings, look_at
 from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.raycast import mesh_depth
 from mgs.data.visibility import visible
 from mgs.prior.build import build_prior, load_prior, outline_error, prior_and_cloud, save_prior
-from mgs.prior.segmentation import Plane, dbscan, ground_plane, rock_cluster
+from mgs.prior.segmentation import Plane, ground_plane, rock_cluster
 from mgs.prior.surface import poisson_mesh, sample_surface
 from mgs.prior.truth import error_to_truth
 from mgs.survey.fusion import Cloud, focus
@@ -96,16 +95,6 @@ def test_no_part_of_a_rock_is_lost(tmp_path, shape, masked):
         others = [np.linalg.norm(place, axis=1) > 1.1 for place in others]
         open_sides = surface[np.all(others, axis=0) & (surface[:, 2] > 0.05)]
         assert np.median(cKDTree(found.points).query(open_sides)[0]) < found.spacing
-
-
-@pytest.mark.parametrize("eps", [0.02, 0.05, 0.1])
-def test_clusters_are_those_of_scikit_learn(eps):
-    rng = np.random.default_rng(0)
-    parts = [rng.normal(c, 0.2 * rng.random(), (300, 3)) for c in rng.uniform(-0.5, 0.5, (5, 3))]
-    points = rng.permutation(np.concatenate(parts))
-    for least in (4, 8, 20):
-        expected = DBSCAN(eps=eps, min_samples=least).fit_predict(points)
-        np.testing.assert_array_equal(dbscan(points, eps, least), expected)
 
 
 def test_parts_of_an_overhang_are_kept_together(dataset, built):

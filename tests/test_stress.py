@@ -89,7 +89,7 @@ def test_faults_are_measured_against_the_fit_without(root):
     shifted = faults.shifted(lab.prior, 0.4, lab.rng("shifted prior", 0.4))
     lab.add("shifted prior", 0.4, shifted)
     lab.add(stress.ANOTHER, 0, load_prior(root / FOLDERS["prior"]))
-    blurred = lab.spoiled(faults.defocus, 2.0, lab.taken, "defocus")
+    blurred = lab.with_fault(faults.defocus, 2.0, lab.taken, "defocus")
     lab.add("defocus", 2.0, frames=blurred)
     clean, moved, same, soft = lab.rows
     assert clean["lost"] == same["lost"] == 0, "the prior of the same rock"

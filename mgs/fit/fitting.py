@@ -212,9 +212,9 @@ def _together(information: Any) -> Any:
     of a colour [N,K,3] move a pixel together, so directional ones step 1/K as far."""
     if len(information.shape) < 3 or information.shape[1] == 1:
         return information
-    factors = np.ones(information.shape, np.float32)
-    factors[:, 1:] = factors.shape[1]
-    return mi.TensorXf(information.array * mi.Float(factors.ravel()), information.shape)
+    count = information.shape[1]
+    factors = np.where(np.arange(count) > 0, count, 1).astype(np.float32)
+    return information * mi.TensorXf(factors[None, :, None])
 
 
 def _rates(

@@ -4,8 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mgs.data.dataset import Dataset
@@ -110,23 +108,6 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
     return Plane(sign * model.normal, sign * model.offset, sigma, tolerance)
 
 
-def dbscan(points: np.ndarray, eps: float, least: int) -> np.ndarray:
-    """Cluster of each point of [N,3], or -1, by DBSCAN (Ester et al. 1996). Equal to scikit-learn's
-    with min_samples `least`, whose import takes longer than the clusters."""
-    pairs = cKDTree(points).query_pairs(eps, output_type="ndarray")
-    core = np.bincount(pairs.ravel(), minlength=len(points)) + 1 >= least
-    ends = core[pairs]
-    inner, rim = pairs[ends.all(1)], pairs[ends.sum(1) == 1]
-    graph = coo_array((np.ones(len(inner), bool), inner.T), (len(points),) * 2)
-    part = connected_components(graph, directed=False)[1]
-    labels = np.full(len(points), len(points))
-    labels[core] = np.unique(part[core], return_inverse=True)[1]
-    # A point at the rim of several clusters belongs to the first.
-    outer, centre = np.where(core[rim[:, :1]], rim[:, ::-1], rim).T
-    np.minimum.at(labels, outer, labels[centre])
-    return np.where(labels < len(points), labels, -1)
-
-
 def rock_cluster(
     points: np.ndarray,
     voxel: float,
@@ -136,7 +117,8 @@ def rock_cluster(
     sparse: float = 0.0,
     belongs: Callable[[np.ndarray, np.ndarray], bool] = lambda part, rock: False,
 ) -> tuple[np.ndarray, float, int]:
-    """Find the rock among points above the ground [N,3], by `dbscan`.
+    """Find the rock among points above the ground [N,3], by DBSCAN (Ester et al. 1996,
+    scikit-learn).
 
     voxel: distance between neighbours, metres. target: [3] point that the cameras look at, metres.
     name: of the cloud, for messages. weight: points [N,3] -> weights [N]. sparse: distance between
@@ -147,6 +129,8 @@ def rock_cluster(
     clusters). Raises InputError if there is no cluster, or two that do not belong together are
     equally large and about equally near.
     """
+    from sklearn.cluster import DBSCAN
+
     thin, cell = points, voxel
     while cell < sparse or len(thin) > CLUSTER_POINTS:
         cell = max(1.25 * cell, sparse)
@@ -157,7 +141,7 @@ def rock_cluster(
             "aim the cameras at one"
         )
     eps = 2 * float(np.median(cKDTree(thin).query(thin, CLUSTER_NEIGHBOURS + 1)[0][:, -1]))
-    labels = dbscan(thin, eps, CLUSTER_NEIGHBOURS)
+    labels = DBSCAN(eps=eps, min_samples=CLUSTER_NEIGHBOURS).fit_predict(thin)
     count = int(labels.max()) + 1
     if count == 0:
         raise InputError(

@@ -1,5 +1,4 @@
-"""What the viewer shows, read from a run or a file; and its layers, as colours of Gaussians and as
-images of the kernel."""
+"""Subject of the viewer, read from a run or a file, and its layers, as colours or as images."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
