@@ -321,7 +321,8 @@ def test_dark_pictures_of_12_bits_are_noticed(data, capsys):
         pixels = np.asarray(Image.open(frame.image_path)).astype(np.uint16)
         cv2.imwrite(str(frame.image_path), pixels * 16)
     command("import", data.root, "--out", data.root.with_name("out"))
-    assert "use 12 of 16 bits, so the pictures are nearly black" in said(capsys)[1]
+    text = said(capsys)[1]
+    assert "use 12 of 16 bits, so the pictures are nearly black; multiply them by 16" in text
 
 
 def test_cameras_of_metashape_that_are_disabled_are_left_out(data, tmp_path):

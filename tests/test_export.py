@@ -140,6 +140,8 @@ def test_a_model_far_from_the_origin(tmp_path):
         shifted = CAMERAS[0].seen_from(np.negative(place))
         drawn = render(near, CAMERAS[0]), render(read, shifted)
         np.testing.assert_allclose(*(np.asarray(image.rgb) for image in drawn), atol=2e-5)
+    pixels = shifted.project(np.add(near.means, place))[0]
+    np.testing.assert_allclose(pixels, CAMERAS[0].project(near.means)[0], atol=1e-4)
     exact = reference.render(far, shifted)["rgb"]
     np.testing.assert_allclose(exact, reference.render(near, CAMERAS[0])["rgb"], atol=1e-5)
     with pytest.warns(Notice, match="count from 448262, 5411932, 412"):

@@ -245,17 +245,19 @@ def test_distortion_is_undone(tmp_path, model):
     synthetic.edit(tmp_path / "src", lambda data: data.update(values, camera_model=model))
     copy = _import(tmp_path / "src", tmp_path / "copy").frames[0]
     own = Lens.of("", model, source.camera.K, values)
-    assert np.allclose(copy.camera.K, undistorter(source.camera, own)[0].K)
+    straight, undo = undistorter(source.camera, own)
+    assert np.allclose(copy.camera.K, straight.K)
+    assert np.array_equal(copy.depth(), undo(source.depth(), False))
     assert np.isin(copy.depth(), source.depth()).all()  # never blended
     assert 0.3 < copy.mask().sum() / source.mask().sum() < 3
 
 
-@pytest.mark.parametrize(("steps", "unit"), [(1000, None), (4000, 0.00025), (1, 1.0)])
+@pytest.mark.parametrize(("steps", "unit"), [(1000, None), (4000, 0.00025), (0.5, 2.0)])
 def test_depth_is_in_millimetres_or_the_units_that_are_named(dataset, tmp_path, steps, unit):
     """As whole numbers of 16 bits, or floats of a TIFF."""
-    ending, kind = (".tif", np.float32) if steps == 1 else (".png", np.uint16)
+    ending, kind = (".tif", np.float32) if steps < 1 else (".png", np.uint16)
     for frame in dataset.frames:
-        depth = frame.depth() if steps == 1 else np.round(frame.depth() * steps)
+        depth = frame.depth() * steps if steps < 1 else np.round(frame.depth() * steps)
         cv2.imwrite(str(frame.depth_path.with_suffix(ending)), depth.astype(kind))
     text = (dataset.root / "transforms.json").read_text()
     (dataset.root / "transforms.json").write_text(text.replace(".exr", ending))
