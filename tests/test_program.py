@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +16,7 @@ import mgs
 from mgs import InputError, ListCache, fisher, load_dataset, load_prior, read_ply, save_prior
 from mgs.cli import nbv as nbv_command
 from mgs.cli.app import COMMANDS, _hint, app
-from mgs.cli.options import keys_of, parse_settings
-from mgs.cli.renamed import OPTIONS, renewed
+from mgs.cli.options import keys_of
 from mgs.evaluation import psnr_measure
 from mgs.files import write_json
 from mgs.fit.settings import ALPHA_WEIGHT
@@ -72,32 +70,6 @@ def test_the_hint_knows_options_with_an_equals_sign(tmp_path):
     again = f"; continue with: mgs nbv --resume {tmp_path} --capture-command 'fly {{pose}}'"
     assert _hint(given) == again
     assert _hint(["fit", "data", "--out", str(tmp_path)]) == again.partition(" --capture")[0]
-
-
-@pytest.mark.parametrize("name", OPTIONS)
-def test_old_options_become_options_and_settings_that_the_command_has(name):
-    command = typer.main.get_command(app).commands[name]
-    options = {flag for parameter in command.params for flag in parameter.opts}
-    for old, new in OPTIONS[name].items():
-        assert old not in options
-        if new.startswith("--"):
-            assert new in options
-        else:
-            key, _, value = new.removesuffix(".").partition("=")
-            pair = f"{key}.colour=1" if new.endswith(".") else f"{key}={value or 1}"
-            assert parse_settings([pair], command)
-
-
-def test_old_words_print_the_new_ones():
-    with warnings.catch_warnings(record=True) as notices:
-        warnings.simplefilter("always")
-        words = renewed(["nbv", "d", "--seed-views=3", "--rate", "colour=1", "--no-antialiased"])
-        assert renewed(["refit", "RUN"]) == ["simplify", "--method", "refit", "RUN"]
-    sets = ["--set", "train.rates.colour=1", "--set", "train.antialiased=false"]
-    assert words == ["nbv", "d", "--seeds=3", *sets]
-    new = ["--seeds=3", " ".join(sets[:2]), " ".join(sets[2:]), "mgs simplify --method refit"]
-    shown = [str(notice.message) for notice in notices]
-    assert all(f" is now {words};" in line for words, line in zip(new, shown, strict=True)), shown
 
 
 def test_help_ends_with_the_settings_that_have_no_option(capsys):

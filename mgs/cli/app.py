@@ -18,7 +18,6 @@ from typer.core import TyperCommand, TyperGroup
 
 from mgs import __version__
 from mgs.cli.options import Row, describe
-from mgs.cli.renamed import renewed
 from mgs.errors import InputError, Notice, from_interrupt, missing, printable
 
 INTERRUPTED = 130  # exit code after Ctrl-C: by convention 128 plus the number of the signal, SIGINT
@@ -138,7 +137,6 @@ def main(arguments: list[str] | None = None) -> None:
         sys.stdout.reconfigure(errors="replace")
     warnings.simplefilter("always", Notice)
     warnings.showwarning = _print_warning  # type: ignore[assignment]
-    arguments = renewed(arguments)
     try:
         code = app(arguments, prog_name="mgs", standalone_mode=False)
         sys.stdout.flush()
