@@ -75,6 +75,7 @@ class State:
 
     @property
     def cameras(self) -> list[Camera]:
+        """Cameras of all V frames."""
         return [frame.camera for frame in self.frames]
 
     @property

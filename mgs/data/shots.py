@@ -21,7 +21,7 @@ from mgs.images import exif_orientation, image_size
 LEVELLED = 10.0  # angle from +Z, degrees, up to which cameras' common up vector counts as +Z
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 # NeRF-synthetic names images without a suffix.
-SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
+SUFFIXES = ("", ".jpg", ".jpeg", ".JPG", ".JPEG", ".png", ".PNG", ".tif", ".tiff", ".webp")
 FAR = 1000.0  # distance from the origin over the cameras' extent, beyond which the origin is moved
 HELD = {  # EXIF orientation -> axes of the camera of the turned picture, in those of the stored one
     3: [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],

@@ -129,9 +129,12 @@ def thin_run(
             data = fitted(len(rest))[1]
         _check_reachable(f"{run.folder} as {kind}", psnr, quality())
         after, least = quality(), 0
+        header = len(written(rest[:1])) if size is not None else 0  # with one Gaussian
         while size is not None and len(data) > size:
-            if not (count := len(rest) * size // len(data)):
-                raise InputError(f"{run.folder}: its header takes more bytes; ask for more bytes")
+            if (room := size - header) < 0 or len(rest) == 1:
+                few = f"one Gaussian takes {header:,} bytes"
+                raise InputError(f"{run.folder} as {kind}: {few}; ask for more bytes")
+            count = 1 + (len(rest) - 1) * room // (len(data) - header)
             (rest, data), after = fitted(count), quality()
         while psnr is not None and len(rest) - least > max(1, len(rest) // CLOSE):
             some, smaller = fitted((least + len(rest)) // 2)

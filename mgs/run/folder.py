@@ -136,6 +136,7 @@ class Run:
 
     @cached_property
     def dataset(self) -> Dataset:
+        """The dataset of the settings, in the upright world of the prior."""
         dataset = load_dataset(self.settings.dataset, up=up_of_prior(self.settings.prior))
         self.check_frames(dataset)
         return dataset
@@ -148,6 +149,7 @@ class Run:
 
     @cached_property
     def prior(self) -> Prior:
+        """The prior of the settings."""
         path = self.settings.prior
         if not path.is_dir():
             where = f"{self.folder / 'config.json'}: prior {path}"
