@@ -1,9 +1,10 @@
 """Bytes against quality: the format mgs beside SPZ, compressed PLY, SOG, and the pictures as JPEG.
 
-Each rock is fitted with several numbers of Gaussians. Each model is written by every coder, whole
-and pruned as by `mgs simplify` (mgs with positions: pruned; SOG: whole). A coder is judged by the
-best of its files at each size. What files do not say, as the space of colours, is added when they
-are read back, so only the coding differs.
+Each rock is fitted with several numbers of Gaussians. Every coder writes each model: whole, pruned
+as by `mgs simplify`, and with 1/2 to 1/16 of its Gaussians, fitted once more as by `mgs export
+--bytes`. With the mesh mgs writes the whole one alone, without it all but that. A coder is judged
+by the best of its files at each size. What files do not say, as the space of colours, is added when
+they are read back, so only the coding differs.
 """
 
 import io
@@ -14,7 +15,6 @@ from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +31,9 @@ from mgs.run.folder import Run
 from mgs.run.nbv import start_fit
 from mgs.splat_files import FORMATS, load_gaussians, write_gaussians
 from studies.frame.case import FRESH, ROCKS, Case, Rock, Size, judge, rocks_of, test_views_of
-from studies.frame.output import Content, Panel, draw_panels, table, write_table
+from studies.frame.output import Panel, draw_panels, table, write_table
 from studies.frame.program import Study, Work, study_of
-from studies.frame.statistics import Row, pareto_front
+from studies.frame.statistics import Row, interval, pareto_front
 from studies.frame.sweep import Cell
 
 WITH, ALONE, JPEG, SOG = "mgs, mesh at the receiver", "mgs", "JPEG, fitted at home", "SOG"
@@ -99,33 +99,31 @@ def fitted(root: Path, out: Path, dataset: str, prior: str) -> Run:
 
 def code(root: Path, out: Path, dataset: str, prior: str, tool: str) -> dict[str, Any]:
     """Task: fit a model; write it by every coder. Returns the rows of its files."""
-    run, data, rows = fitted(root, out, dataset, prior), mgs.load_dataset(root / dataset), []
-    rows.append(_row("whole model", 0, run.gaussians, data))
-    models = [run.gaussians]
+    run, data = fitted(root, out, dataset, prior), mgs.load_dataset(root / dataset)
+    g, rows = run.gaussians, [_row("whole model", 0, run.gaussians, data)]
+    models = [g]
     for name, shared in ((WITH, True), (ALONE, False)):
-        for encoder in islice(encoders(run, shared), 1):  # the usual pruning alone
-            models += [encoder.g] if not shared else []
+        for encoder in encoders(run, shared):
+            models += [] if shared else [encoder.g]
             for scale in SCALES:
                 file = encoder.file(scale)
                 rows.append(_row(name, len(file), file.model, data) | {"scale": scale})
     # Not every format says in which space colours are blended, or that splats are antialiased.
-    g = run.gaussians
     marks = partial(replace, linear=g.linear, antialiased=g.antialiased)
     for model in models:
-        for name, kind in OTHERS.items():
-            path = out / f"model{FORMATS[kind]}"
-            write_gaussians(path, model, kind, np.eye(3))
-            read = marks(load_gaussians(path))
-            rows.append(_row(name, path.stat().st_size, read, data))
-        if tool and model is models[0]:
+        paths = {coder: out / f"model{FORMATS[kind]}" for coder, kind in OTHERS.items()}
+        for coder, path in paths.items():
+            write_gaussians(path, model, OTHERS[coder], np.eye(3))
+        files = {coder: (path, path) for coder, path in paths.items()}
+        if tool:
             mgs.write_ply(out / "model.ply", model)
             for pair in (("model.ply", "model.sog"), ("model.sog", "back.ply")):
-                subprocess.run(
-                    [*tool.split(), "-w", *pair], cwd=out, check=True, capture_output=True
-                )
-            size = (out / "model.sog").stat().st_size
-            read = marks(load_gaussians(out / "back.ply"))
-            rows.append(_row(SOG, size, read, data))
+                words = [*tool.split(), "-w", *pair]
+                subprocess.run(words, cwd=out, check=True, capture_output=True)
+            files[SOG] = out / "model.sog", out / "back.ply"
+        for coder, (path, back) in files.items():
+            read = marks(load_gaussians(back))
+            rows.append(_row(coder, path.stat().st_size, read, data))
     return {"rows": rows}
 
 
@@ -217,40 +215,44 @@ def share(rows: Sequence[Row], run: str, one: str, other: str) -> float:
     return float(np.exp(np.mean(logs[0] - logs[1])))
 
 
-COLUMNS: dict[str, Content] = {
-    "rock": "run",
-    "mgs with mesh / SPZ": "with_mesh:.3f",
-    "mgs / SPZ": "alone:.3f",
-    "compressed PLY / SPZ": "compressed:.2f",
-    "SOG / SPZ": "sog:.2f",
-    "mgs with mesh / JPEG": "jpeg:.2f",
+PAIRS = {
+    "mgs with mesh / SPZ": (WITH, "SPZ"),
+    "mgs / SPZ": (ALONE, "SPZ"),
+    "compressed PLY / SPZ": ("compressed PLY", "SPZ"),
+    "SOG / SPZ": (SOG, "SPZ"),
+    "mgs / SOG": (ALONE, SOG),
+    "mgs with mesh / JPEG": (WITH, JPEG),
 }
+"""Coders compared, by the heading of their column."""
+
+
+def tables(rows: Sequence[Row]) -> str:
+    """Table of `share` of PAIRS on each rock, and of the means with 95 % intervals."""
+    runs = list(dict.fromkeys(row["run"] for row in rows))
+    values = {name: [share(rows, run, *pair) for run in runs] for name, pair in PAIRS.items()}
+    lines: list[Row] = []
+    for k, run in enumerate(runs):
+        found = {name: of[k] for name, of in values.items()}
+        lines.append({"rock": run} | {n: f"{v:.3f}" for n, v in found.items() if not np.isnan(v)})
+    mean: Row = {"rock": "mean"}
+    for name, of in values.items():
+        if (ends := interval(of)) and not np.isnan(of).any():
+            mean[name] = f"{np.mean(of):.3f} [{ends[0]:.3f}, {ends[1]:.3f}]"
+    return table({name: name for name in ("rock", *PAIRS)}, [*lines, mean])
 
 
 def write(work: Work) -> list[Path]:
     """Write rate.csv, .json, .md and .png, and sent.png."""
     rows = list(rows_of(work))
-    pairs = {
-        "with_mesh": (WITH, "SPZ"),
-        "alone": (ALONE, "SPZ"),
-        "compressed": ("compressed PLY", "SPZ"),
-        "sog": (SOG, "SPZ"),
-        "jpeg": (WITH, JPEG),
-    }
-    shares: list[Row] = []
-    for run in dict.fromkeys(row["run"] for row in rows):
-        found = {key: share(rows, run, *pair) for key, pair in pairs.items()}
-        shares.append({"run": run} | {k: None if np.isnan(v) else v for k, v in found.items()})
-    text = table(COLUMNS, shares)
     labels = "kB", "psnr", "kB", "PSNR, test views (dB)", "coder", True
     panels = [
-        Panel(*labels, only=(("run", row["run"]), ("front", True)), title=row["run"])
-        for row in shares
+        Panel(*labels, only=(("run", rock.name), ("front", True)), title=rock.name)
+        for rock in work.size.rocks
     ]
     drawn = [row for row in rows if row["kB"]]
     draw_panels(work.out / "rate.png", panels, drawn, "Best files of each coder")
     shutil.copyfile(work.out / "cells/picture/sent.png", work.out / "sent.png")
-    paths = write_table(work, "rate", rows, text, shares=shares)
+    paths = write_table(work, "rate", rows, tables(rows))
     return [*paths, work.out / "rate.png", work.out / "sent.png"]
 
 

@@ -27,7 +27,8 @@ HALVINGS = 9  # halvings of that range, in its logarithm: steps are found to 1.4
 VIEWS = 16  # most views, evenly spread over those taken, in which errors are weighed
 STEP = 1e-4  # linear RGB, by which the slope of sRGB is measured
 CLOSE = 50  # searches for a PSNR end at numbers of Gaussians that differ by 1/CLOSE
-NOISES = (PRUNE_NOISE, 4 * PRUNE_NOISE)  # by pruning, if positions are sent: the better
+THINNINGS = 4  # times that half of the Gaussians are removed, if positions are sent
+AGAIN = 0.3  # learning rates of a further fit over those of a first one, which leave its optimum
 
 
 @dataclass(frozen=True)
@@ -53,19 +54,22 @@ def compact_run(
     stage starts. Raises InputError if neither can be reached, for a shared prior whose Gaussians
     were moved or changed by the fit, and as `Run.state`."""
     measured = _measure(run)
-    before, results = measured(run.gaussians), list[tuple[Compact, float]]()
+    before, best = measured(run.gaussians), list[tuple[float, Compact]]()
     _check_reachable(str(run.folder), psnr, before)
     for encoder in encoders(run, shared, say):
         say("choosing steps")
         file = _fitted(encoder, size, None if psnr is None else lambda m: measured(m) >= psnr)
-        if file is not None:
-            results.append((file, measured(file.model)))
-    if not results:
+        if file is None:
+            continue
+        value = measured(file.model) if size else -len(file)
+        if best and value <= best[-1][0]:
+            break  # fewer Gaussians would be worse still
+        best.append((value, file))
+    if not best:
         least = "it takes more bytes to place its Gaussians" if size else "no steps are fine enough"
         raise InputError(f"{run.folder}: {least}; ask for more bytes or a lower psnr")
-    rank = (lambda pair: pair[1]) if size else (lambda pair: -len(pair[0]))
-    file, after = max(results, key=rank)
-    return Compacted(bytes(file), len(file.model), (before, after))
+    file = best[-1][1]
+    return Compacted(bytes(file), len(file.model), (before, measured(file.model)))
 
 
 def _measure(run: Run) -> Callable[[Gaussians], float]:
@@ -84,6 +88,19 @@ def _check_reachable(model: str, psnr: float | None, most: float) -> None:
         raise InputError(f"psnr {psnr:g}: {own}; ask for less")
 
 
+def refitting(run: Run) -> Callable[[Gaussians], Gaussians]:
+    """A function that fits Gaussians to the views taken once more, with themselves as the prior."""
+    from mgs.fit.fitting import fit_gaussians
+
+    scene, frames = Scene(run.dataset, run.prior, run.settings), run.taken
+    gains = scene.measured_exposure(frames) if run.settings.exposure else None
+    targets, lam = scene.targets(frames, gains), run.settings.lam_by_kind(scene.groups)
+    rates = {kind: AGAIN * rate for kind, rate in run.settings.train.rates.items()}
+    train = run.settings.train.model_copy(update={"density": "fixed", "rates": rates})
+    given = [frame.camera for frame in frames], targets, train
+    return lambda g: fit_gaussians(g, *given, cache=scene.cache, lam=lam).gaussians
+
+
 def thin_run(
     run: Run,
     kind: str,
@@ -94,25 +111,19 @@ def thin_run(
     """Make a file of another format (`mgs.splat_files.FORMATS`) with as many Gaussians as fit into
     `size` bytes, or as few as have `psnr` dB in the views taken.
 
-    All Gaussians of such a file take the same bytes, so those go that change the views taken least.
-    The rest is fitted to these once more, with itself as the prior. say: as in `compact_run`.
+    All Gaussians of such a file take the same bytes, so those go that change the views taken least,
+    at most half at a time. The rest is fitted to these once more. say: as in `compact_run`.
     Raises InputError if neither can be reached, and as `Run.state`."""
-    from mgs.fit.fitting import fit_gaussians
     from mgs.fit.pruning import fewest
 
-    scene, frames, world = Scene(run.dataset, run.prior, run.settings), run.taken, run.dataset.world
-    cameras = [frame.camera for frame in frames]
-    gains = scene.measured_exposure(frames) if run.settings.exposure else None
-    targets, lam = scene.targets(frames, gains), run.settings.lam_by_kind(scene.groups)
-    train = run.settings.train.model_copy(update={"density": "fixed"})
-    measured = _measure(run)
+    world, cameras = run.dataset.world, [frame.camera for frame in run.taken]
+    measured, again = _measure(run), refitting(run)
 
     def fitted(count: int) -> tuple[Gaussians, bytes]:
-        """The Gaussians that are left, before their fit, and the file of them after it."""
+        """The Gaussians that are left, and the file of them."""
         say(f"fitting {count:,} Gaussians")
-        some = rest[fewest(rest, cameras, count)]
-        fit = fit_gaussians(some, cameras, targets, train, cache=scene.cache, lam=lam)
-        return some, written(fit.gaussians)
+        some = again(rest[fewest(rest, cameras, count)])
+        return some, written(some)
 
     def written(model: Gaussians) -> bytes:
         write_gaussians(path, as_imported(run, model), kind, to_y_up(world.up))
@@ -126,7 +137,7 @@ def thin_run(
         path, rest = Path(folder) / f"x{FORMATS[kind]}", in_srgb(run.gaussians[run.shown])
         data, before = written(rest), measured(run.gaussians)
         if run.gaussians.linear:  # its colours change as they are blended in another space
-            data = fitted(len(rest))[1]
+            rest, data = fitted(len(rest))
         _check_reachable(f"{run.folder} as {kind}", psnr, quality())
         after, least = quality(), 0
         header = len(written(rest[:1])) if size is not None else 0  # with one Gaussian
@@ -135,7 +146,7 @@ def thin_run(
                 few = f"one Gaussian takes {header:,} bytes"
                 raise InputError(f"{run.folder} as {kind}: {few}; ask for more bytes")
             count = 1 + (len(rest) - 1) * room // (len(data) - header)
-            (rest, data), after = fitted(count), quality()
+            (rest, data), after = fitted(max(count, len(rest) // 2)), quality()
         while psnr is not None and len(rest) - least > max(1, len(rest) // CLOSE):
             some, smaller = fitted((least + len(rest)) // 2)
             if (value := quality()) >= psnr:
@@ -148,8 +159,9 @@ def thin_run(
 def encoders(
     run: Run, shared: bool, say: Callable[[str], None] = lambda stage: None
 ) -> Iterator[Encoder]:
-    """Encoders of the run's model, pruned by each of NOISES where positions are sent."""
-    from mgs.fit.pruning import prune
+    """Encoders of the run's model; where positions are sent, pruned, then with a half to
+    a sixteenth of its Gaussians, fitted once more."""
+    from mgs.fit.pruning import fewest, prune
 
     g, place = run.state.gaussians, (run.dataset.world.up, run.dataset.world.origin)
     start, gradients = None, partial(_gradients, run)
@@ -162,12 +174,17 @@ def encoders(
         say("weighing errors")
         yield Encoder(g, gradients, start, None, *place)
         return
-    cameras = [frame.camera for frame in run.taken]
-    for noise in NOISES:
-        say("removing Gaussians")
-        indices = prune(g, cameras, noise).kept
-        say("weighing errors")
-        yield Encoder(g[indices], gradients, None, start.layer[indices] if start else None, *place)
+    cameras, again = [frame.camera for frame in run.taken], refitting(run)
+    layer = start.layer if start else np.zeros(len(g), np.int64)
+    say("removing Gaussians")
+    rest = prune(g, cameras, PRUNE_NOISE).kept
+    yield Encoder(g[rest], gradients, None, layer[rest], *place)
+    for _ in range(THINNINGS):
+        count = max(1, len(g) // 2)
+        say(f"fitting {count:,} Gaussians")
+        rest = fewest(g, cameras, count)
+        g, layer = again(g[rest]), layer[rest]
+        yield Encoder(g, gradients, None, layer, *place)
 
 
 def _start(run: Run, g: Gaussians) -> Start | None:
