@@ -21,6 +21,7 @@ import mgs
 from mgs.colour import srgb_from_linear
 from mgs.data.importers import import_source
 from mgs.data.sources import read_source
+from mgs.fit.settings import TrainSettings
 from mgs.learning import fit_views
 from mgs.metrics import psnr
 from mgs.policy.poses import spread
@@ -87,15 +88,16 @@ class BlenderSize:
     """Sizes of images and models, and numbers of runs.
 
     downscale: of the 800x800 images. gaussians: of every model. views: numbers of views at the
-    start and at the end. passes: of the fit that is judged, twice the default. draws: seeds of the
-    random start. scenes: folders with transforms_train.json and transforms_test.json, set by the
-    options.
+    start and at the end. passes: of the fit that is judged, twice the default. loss: of all fits.
+    draws: seeds of the random start. scenes: folders with transforms_train.json and
+    transforms_test.json, set by the options.
     """
 
     downscale: int = 4
     gaussians: int = 10_000
     views: tuple[tuple[int, int], ...] = ((2, 10),)
     passes: int = 20
+    loss: str = TrainSettings().loss
     draws: int = 3
     policies: tuple[str, ...] = (*OURS, *COMPARED)
     scenes: tuple[Path, ...] = ()
@@ -121,7 +123,7 @@ def sized(size: BlenderSize, options: Namespace) -> BlenderSize:
         if policy not in size.policies:
             known = "; ".join(size.policies)
             raise mgs.InputError(f"--policy {policy}: is not compared; choose of {known}")
-    changes = {key: getattr(options, key) for key in ("downscale", "gaussians", "draws")}
+    changes = {key: getattr(options, key) for key in ("downscale", "gaussians", "draws", "loss")}
     changes |= {"policies": tuple(options.policy or ())}
     given = {key: value for key, value in changes.items() if value}
     return replace(size, scenes=tuple(sorted(scenes)), **given)
@@ -143,7 +145,7 @@ def cells_of(size: BlenderSize) -> list[Cell]:
             if draw > 0 and policy in ONCE:
                 continue
             how = {"first": first, "last": last, "policy": policy, "seed": draw}
-            how |= {key: getattr(size, key) for key in ("gaussians", "passes")}
+            how |= {key: getattr(size, key) for key in ("gaussians", "passes", "loss")}
             made = data[scene]
             label = policy.replace(", ", "-").replace(" ", "-")
             where = f"{scene.name}-{size.downscale}/{size.gaussians}/{first}-{last}"
@@ -178,6 +180,7 @@ def choose_and_judge(
     seed: int,
     gaussians: int,
     passes: int,
+    loss: str,
 ) -> dict[str, Any]:
     """Task: choose views until there are `last`, fit all of them from the start, and judge.
 
@@ -190,7 +193,7 @@ def choose_and_judge(
     def start_from(views: Sequence[int]) -> mgs.Scene:
         shown = [data.frames[i] for i in views]
         prior = mgs.build_prior(data, gaussians=gaussians, seed=seed, source="random", shown=shown)
-        train = {"means": "free", "alpha_weight": ALPHA_WEIGHT}
+        train = {"means": "free", "alpha_weight": ALPHA_WEIGHT, "loss": loss}
         about = {"dataset": data.root, "prior": data.root, "seed": seed, "train": train}
         settings = validated(NbvSettings, about).with_spacing(prior.spacing, LOOSE["random"])
         return mgs.Scene(data, prior, settings)
@@ -321,6 +324,7 @@ STUDY = Study(
         "--downscale": {"type": at_least(1), "help": "Divisor of 800x800. Default: 4, or full 1."},
         "--gaussians": {"type": at_least(2), "help": "Default: 10,000, or full 100,000."},
         "--draws": {"type": at_least(1), "help": "Random starts. Default: 3, or full 10."},
+        "--loss": {"help": "Loss of all fits. Default: that of mgs nbv."},
         "--policy": {"action": "append", "help": "A policy to run; repeatable. Default: all."},
     },
     sized,
