@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from refusals import fails
 from scipy.optimize import minimize
 
-from mgs.policy import certificate, criteria, directional, relaxation
+from mgs.policy import certificate, criteria, relaxation
 from mgs.policy.certificate import added_bound, best_set, least_bound, upper_bound
 from mgs.policy.directional import Views
 
@@ -36,7 +36,8 @@ def case(kind, seed=0, order=None):
             total, so_far = 0.0, taken
             for v in some:
                 one = Views(views.positions[[v]], views.seen[[v]])
-                total += directional.gains(points, LAM, *model, so_far, one, around)[0]
+                given = points, LAM, *model, so_far, one, around
+                total += relaxation.directional(*given).added(())[0]
                 so_far = Views(*(np.concatenate(pair) for pair in zip(so_far, one, strict=True)))
             return total
 

@@ -13,8 +13,8 @@ from program import steps
 
 from mgs import choose, learn
 from mgs.colour import SH_C0
-from mgs.policy import criteria, directional, pool_gains, visibility
-from mgs.policy.directional import Views, gains
+from mgs.policy import criteria, directional, pool_gains, relaxation, visibility
+from mgs.policy.directional import Views
 from mgs.policy.pool_gains import PoolGains
 from mgs.policy.visibility import Visibility, planned_path, planned_views
 from mgs.run import flight
@@ -23,6 +23,13 @@ from mgs.run.policies import POLICIES
 from mgs.splat import reference
 
 LAM = (0.02 / 1.0) ** 2
+
+
+def gains(*given):
+    """Gain of each candidate after the views taken [C], from scratch."""
+    return relaxation.directional(*given).added(())
+
+
 POSES = 7
 
 

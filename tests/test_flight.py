@@ -12,8 +12,9 @@ from program import command, said, steps, stop_at
 from tiny import run
 
 from mgs.policy import tour
-from mgs.policy.directional import Views, gains
+from mgs.policy.directional import Views
 from mgs.policy.pool_gains import PoolGains
+from mgs.policy.relaxation import directional
 from mgs.run import folder as run_folder
 from mgs.run.settings import FlightLimits
 
@@ -64,7 +65,7 @@ def total(points, pool, views):
         return Views(pool.positions[frames], pool.seen[frames])
 
     pairs = ((some(views[:k]), some(views[k : k + 1])) for k in range(len(views)))
-    return sum(gains(points, 1e-3, 1, 0.3, *pair)[0] for pair in pairs)
+    return sum(directional(points, 1e-3, 1, 0.3, *pair).added(())[0] for pair in pairs)
 
 
 @settings(max_examples=15, deadline=None)

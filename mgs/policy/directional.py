@@ -1,4 +1,5 @@
-"""Directional optimality (docs/nbv.md) in plain NumPy; `mgs.policy.pool_gains` is its fast twin.
+"""Directional optimality (docs/nbv.md): what views see, and sums over them. Gains are computed by
+`mgs.policy.relaxation.directional`, and by its fast twin, `mgs.policy.pool_gains`.
 
 The prior's Gaussian j has the colour sum_k c_k y_k(d) along d, with K = (L + 1)^2 spherical
 harmonics y. W_vj: its squared blending weights in view v, y_vj: y of the direction from v to j.
@@ -61,18 +62,17 @@ def dome_cameras(like: Camera, positions: Array, centre: Array) -> list[Camera]:
     return [Camera(like.K, like.width, like.height, pose) for pose in poses]
 
 
-def basis(points: Array, views: Views, degree: int) -> NDArray[np.float64]:
-    """Spherical harmonics of the directions from cameras to points [N,V,K].
+def vectors(points: Array, views: Views, degree: int) -> NDArray[np.float64]:
+    """sqrt(W) y of each view and point [N,V,K]. points: [N,3], metres.
 
-    points: [N,3], metres. Zero where the view does not see the point: most pairs, and computing
-    them would take most of the time."""
+    Only pairs that see each other are computed: most do not."""
     from mgs.splat.reference import sh_basis  # imported here because mgs.splat loads Dr.Jit
 
     point, view = np.nonzero(views.seen.T)
     offset = np.asarray(points, np.float64)[point] - np.asarray(views.positions, np.float64)[view]
-    y = np.zeros((len(points), len(views.positions), (degree + 1) ** 2))
-    y[point, view] = sh_basis(offset / np.linalg.norm(offset, axis=1, keepdims=True), degree)
-    return y
+    z = np.zeros((len(points), len(views.positions), (degree + 1) ** 2))
+    z[point, view] = sh_basis(offset / np.linalg.norm(offset, axis=1, keepdims=True), degree)
+    return z * np.sqrt(views.seen.T.astype(np.float64))[..., None]
 
 
 def precision(degree: int, tau: float, lam: float) -> NDArray[np.float64]:
@@ -83,31 +83,12 @@ def precision(degree: int, tau: float, lam: float) -> NDArray[np.float64]:
 
 def information(points: Array, views: Views, degree: int) -> NDArray[np.float64]:
     """Sum over the views of W y y^T [N,K,K]. points: [N,3], metres."""
-    y = basis(points, views, degree) * np.sqrt(views.seen.T.astype(np.float64))[..., None]
-    return np.asarray(y.transpose(0, 2, 1) @ y)
-
-
-def gains(
-    points: Array,
-    lam: float,
-    degree: int,
-    tau: float,
-    taken: Views,
-    candidates: Views,
-    dome: Views | None = None,
-) -> NDArray[np.float64]:
-    """Gain of each candidate over the views taken [C]: the D gain, or with a dome the I gain.
-
-    points: means of the Gaussians on the surface [N,3], metres. lam, degree, tau: see `precision`.
-    """
-    prior = np.diag(precision(degree, tau, lam))
 
     def part(some: slice) -> NDArray[np.float64]:
-        before, after = of_points(taken, some), of_points(candidates, some)
-        around = None if dome is None else of_points(dome, some)
-        return _gains(points[some], prior, degree, before, after, around)
+        z = vectors(points[some], of_points(views, some), degree)
+        return np.asarray(z.transpose(0, 2, 1) @ z)
 
-    return np.asarray(sum(in_parts(len(points), part), np.zeros(len(candidates.positions))))
+    return np.concatenate(in_parts(len(points), part))
 
 
 def of_points(views: Views, some: slice) -> Views:
@@ -119,16 +100,3 @@ def in_parts(count: int, part: Callable[[slice], Result]) -> list[Result]:
     chunks = [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         return list(pool.map(part, chunks))
-
-
-def _gains(
-    points: Array, prior: Array, degree: int, taken: Views, candidates: Views, dome: Views | None
-) -> NDArray[np.float64]:
-    S = np.linalg.inv(prior + information(points, taken, degree))
-    y, W = basis(points, candidates, degree), candidates.seen.T.astype(np.float64)
-    Sy = y @ S
-    leverages = W * (Sy * y).sum(2)
-    if dome is None:
-        return np.asarray(1.5 * np.log1p(leverages).sum(0))
-    M = information(points, dome, degree)
-    return np.asarray((W * ((Sy @ M) * Sy).sum(2) / (1 + leverages)).sum(0))

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mgs.memory import IMAGE_BYTES, padded
 from mgs.policy.criteria import Array
-from mgs.policy.directional import Views, in_parts, information, of_points, precision
+from mgs.policy.directional import Views, information, precision
 from mgs.splat.recording import one_at_a_time
 
 BYTES_OF_ENTRY, BYTES_OF_PAIR = 16, 40  # of both matrices; of a pair of pose and Gaussian
@@ -37,7 +37,7 @@ def fits(points: Array, pool: Views, degree: int) -> bool:
 
 class PoolGains:
     """Gains of the poses of a pool after the views `taken`. Arguments as in
-    `mgs.policy.directional.gains`.
+    `mgs.policy.relaxation.directional`.
 
     S, M: matrices, one array [N] for each entry of `_upper`.
     g, q: one number for each pair of a pose and a Gaussian that it sees.
@@ -68,11 +68,7 @@ class PoolGains:
         Sy = [float(v) * value for v, value in zip(variance, y, strict=True)]
         self.g, self.M, self.q = _dot(Sy, y), None, None
         if dome is not None:
-
-            def part(some: slice) -> NDArray[np.float64]:
-                return information(points[some], of_points(dome, some), degree)
-
-            M = np.concatenate(in_parts(len(points), part))
+            M = information(points, dome, degree)
             self.M = [mi.Float64(padded(M[:, a, b], np.float64)) for a, b in upper]
             self.q = _dot(_times([_at(entry, self.of) for entry in self.M], Sy), Sy)
         dr.eval(self.S, self.M, self.g, self.q)

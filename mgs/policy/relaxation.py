@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from scipy.optimize import linprog
 from mgs.errors import InputError
 from mgs.memory import VIEW_BYTES
 from mgs.policy.criteria import Array, coverage_greedy, observed
-from mgs.policy.directional import Views, in_parts, information, of_points, precision
+from mgs.policy.directional import Views, in_parts, information, of_points, precision, vectors
 
 Floats = NDArray[np.float64]
 
@@ -45,8 +45,39 @@ class Bound(NamedTuple):
     stopped: str = "steps"
 
 
+class Bounded:
+    """A concave criterion: `steps(x, box)` yields its value at weights in the box of 0 and 1 whose
+    size is sum x, and a bound by tangents there. coarse: the same for fewer Gaussians, or itself.
+    pairs: of a candidate and a Gaussian, by which the time of a bound grows."""
+
+    def bound(
+        self: Any,
+        x: Floats,
+        box: tuple[Floats, Floats],
+        tolerance: float,
+        until: float,
+        enough: float = -np.inf,
+    ) -> Bound:
+        """Least upper bound of the `steps`, first for the coarse criterion, then from there. Stops
+        at a gap of `tolerance`, at the time `until`, or once it is at most `enough`."""
+        if self.pairs > 2 * self.coarse.pairs:
+            x = self.coarse.bound(x, box, tolerance, until).weights
+        best, lower, reason = None, -np.inf, "steps"
+        for gain, bound in self.steps(x, box):
+            lower = max(lower, gain)
+            best = bound if best is None or bound.value < best.value else best
+            if best.value - lower <= tolerance * best.value or best.value <= enough:
+                reason = "gap"
+                break
+            if time.monotonic() > until:
+                reason = "time"
+                break
+        assert best is not None
+        return best._replace(gap=(best.value - lower) / max(best.value, 1e-300), stopped=reason)
+
+
 @dataclass(frozen=True)
-class Relaxation:
+class Relaxation(Bounded):
     """A criterion as a concave function of the weights x [C] of the candidates. phi is scale log
     det A, or -scale trace(A^-1 M) where `over` is given. vectors(some): z [n,C,K] of a slice of the
     N Gaussians. base: A(0) [N,K,K]. over: M [N,K,K]."""
@@ -64,7 +95,6 @@ class Relaxation:
 
     @property
     def pairs(self) -> int:
-        """Pairs of a candidate and a Gaussian, by which the time of a bound grows."""
         return self.candidates * len(self.base)
 
     @cached_property
@@ -122,7 +152,8 @@ class Relaxation:
         return np.asarray(sum(in_parts(len(self.base), part)))
 
     def added(self, views: Iterable[int]) -> Floats:
-        """Gain of each candidate after these views [C] (`mgs.policy.directional`); 0 for them."""
+        """Gain of each candidate after these views [C], 0 for them, by the Sherman-Morrison formula
+        (`mgs.policy.directional`)."""
         x = self._taken(views)
 
         def part(some: slice) -> Floats:
@@ -135,23 +166,8 @@ class Relaxation:
 
         return np.where(x > 0, 0.0, sum(in_parts(len(self.base), part)))
 
-    def bound(
-        self,
-        x: Floats,
-        box: tuple[Floats, Floats],
-        tolerance: float,
-        until: float,
-        enough: float = -np.inf,
-    ) -> Bound:
-        """Least upper bound from tangents, for sets in the box of 0 and 1 whose size is sum x.
-
-        First for the coarse relaxation, then from there: Newton steps with the coarse curvature.
-        Stops at a gap of `tolerance`, at the time `until`, or once it is at most `enough`."""
-        if len(self.base) > 2 * len(self.coarse.base):
-            x = self.coarse.bound(x, box, tolerance, until).weights
-        return _least(self._ascent(x, box), tolerance, until, enough)
-
-    def _ascent(self, x: Floats, box: tuple[Floats, Floats]) -> Iterator[tuple[float, Bound]]:
+    def steps(self, x: Floats, box: tuple[Floats, Floats]) -> Iterator[tuple[float, Bound]]:
+        """Newton steps with the coarse curvature."""
         k, (value, slope) = round(float(x.sum())), self.tangent(x)
         for _ in range(STEPS):
             above = value + float(slope @ (_largest(slope, *box, k) - x))
@@ -171,6 +187,8 @@ class Relaxation:
 
     def _at(self, x: Floats, some: slice) -> tuple[Floats, Floats]:
         z = self.vectors(some)
+        if not x.any():
+            return z, self.base[some]
         return z, self.base[some] + (z * x[:, None]).transpose(0, 2, 1) @ z
 
     def _phi(self, A: Floats, some: slice) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
@@ -188,24 +206,6 @@ class Relaxation:
         if self.over is None:
             return np.asarray(self.scale * np.linalg.slogdet(A)[1])
         return np.asarray(-self.scale * np.einsum("nkl,nkl->n", S, self.over[some]))
-
-
-def _least(
-    steps: Iterable[tuple[float, Bound]], tolerance: float, until: float, enough: float
-) -> Bound:
-    """Least of the bounds that come with the gain of their weights; stops as `Relaxation.bound`."""
-    best, lower, reason = None, -np.inf, "steps"
-    for gain, bound in steps:
-        lower = max(lower, gain)
-        best = bound if best is None or bound.value < best.value else best
-        if best.value - lower <= tolerance * best.value or best.value <= enough:
-            reason = "gap"
-            break
-        if time.monotonic() > until:
-            reason = "time"
-            break
-    assert best is not None
-    return best._replace(gap=(best.value - lower) / max(best.value, 1e-300), stopped=reason)
 
 
 def _largest(prices: Floats, lo: Floats, hi: Floats, k: int) -> Floats:
@@ -245,33 +245,22 @@ def directional(
     candidates: Views,
     dome: Views | None = None,
 ) -> Relaxation:
-    """Directional D-optimality of candidates, or I-optimality with a dome. Arguments as
-    `mgs.policy.directional.gains`. Raises InputError as `checked`."""
-    from mgs.splat.reference import sh_basis  # imported here because mgs.splat loads Dr.Jit
+    """Directional D-optimality of candidates, or I-optimality with a dome.
 
-    checked(candidates.seen)
-    means, centres = (np.asarray(a, np.float64) for a in (points, candidates.positions))
+    points: means of the Gaussians on the surface [N,3], metres. lam, degree, tau: see `precision`.
+    """
+    means = np.asarray(points, np.float64)
 
-    def vectors(some: slice) -> Floats:
-        offset = means[some, None] - centres
-        offset /= np.sqrt(np.einsum("nvk,nvk->nv", offset, offset))[..., None]
-        y = sh_basis(offset.reshape(-1, 3), degree).reshape(*offset.shape[:2], -1)
-        y *= np.sqrt(candidates.seen[:, some].T.astype(np.float64))[..., None]
-        return np.asarray(y)
+    def seen(some: slice) -> Floats:
+        return vectors(means[some], of_points(candidates, some), degree)
 
-    def summed(views: Views) -> Floats:
-        def part(some: slice) -> Floats:
-            return information(means[some], of_points(views, some), degree)
-
-        return np.concatenate(in_parts(len(means), part))
-
-    base = np.diag(precision(degree, tau, lam)) + summed(taken)
-    relaxation = Relaxation(len(centres), vectors, base, scale=1.5)
+    base = np.diag(precision(degree, tau, lam)) + information(means, taken, degree)
+    relaxation = Relaxation(len(candidates.positions), seen, base, scale=1.5)
     if dome is not None:
-        relaxation = Relaxation(len(centres), vectors, base, summed(dome))
+        relaxation = replace(relaxation, over=information(means, dome, degree), scale=1.0)
     if 8 * base.shape[1] * candidates.seen.size > VIEW_BYTES:
         return relaxation
-    z = np.concatenate(in_parts(len(means), vectors))
+    z = np.concatenate(in_parts(len(means), seen))
     return replace(relaxation, vectors=lambda some: z[some])
 
 
@@ -301,7 +290,7 @@ def check_finite(per_view: Array) -> None:
 
 
 @dataclass(frozen=True)
-class Coverage:
+class Coverage(Bounded):
     """Number of Gaussians that candidates newly observe (`mgs.policy.criteria.coverage_greedy`).
 
     A set observes a Gaussian only if its views' shares s of the information that is missing add up
@@ -350,21 +339,9 @@ class Coverage:
         gains[taken] = 0
         return gains
 
-    def bound(
-        self,
-        x: Floats,
-        box: tuple[Floats, Floats],
-        tolerance: float,
-        until: float,
-        enough: float = -np.inf,
-    ) -> Bound:
-        """Upper bound by the linear programme. Arguments: `Relaxation.bound`.
-
-        Cutting planes: every x tried gives a tangent, and HiGHS finds the next x, where the least
-        tangent is largest. Any mean of tangents is a bound; the prices are its slope."""
-        return _least(self._cuts(x, box), tolerance, until, enough)
-
-    def _cuts(self, x: Floats, box: tuple[Floats, Floats]) -> Iterator[tuple[float, Bound]]:
+    def steps(self, x: Floats, box: tuple[Floats, Floats]) -> Iterator[tuple[float, Bound]]:
+        """Cutting planes: every x tried gives a tangent, and HiGHS finds the next x, where the
+        least tangent is largest. Any mean of tangents is a bound; the prices are its slope."""
         rows, counts = self.shares
         size = round(float(x.sum()))
         most = np.sort(rows * box[1], axis=1)[:, -size:].sum(axis=1)

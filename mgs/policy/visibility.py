@@ -8,9 +8,10 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.memory import IMAGE_BYTES, kept_within
 from mgs.policy.criteria import Array
-from mgs.policy.directional import Views, dome_cameras, gains, of_points, squared_weights
+from mgs.policy.directional import Views, dome_cameras, of_points, squared_weights
 from mgs.policy.pool_gains import PoolGains
 from mgs.policy.poses import nearest_poses
+from mgs.policy.relaxation import Relaxation, directional
 from mgs.progress import Stage, report
 
 Model = tuple[int, float, bool]
@@ -75,13 +76,21 @@ class Visibility:
         state = self.states.get(model)
         if state is None or state.taken != list(taken[: len(state.taken)]):
             state = self.plan_gains(model)
+            if state is None and not self.pool.seen.any():
+                return np.zeros(len(candidates))
             if state is None:
-                before, after = self.pool.of(taken), self.pool.of(candidates)
-                dome = self.dome if over_dome else None
-                return gains(self.points, self.lam, degree, tau, before, after, dome)
+                return self.relaxation(taken, candidates, model).added(())
             self.states[model] = state
         state.take(taken[len(state.taken) :])
         return state.of_poses(candidates)
+
+    def relaxation(
+        self, taken: Sequence[int], candidates: Sequence[int], model: Model
+    ) -> Relaxation:
+        """Criterion of the candidates after the views taken."""
+        degree, tau, over_dome = model
+        views = self.pool.of(taken), self.pool.of(candidates), self.dome if over_dome else None
+        return directional(self.points, self.lam, degree, tau, *views)
 
     def _planned(
         self, taken: tuple[int, ...], candidates: tuple[int, ...], count: int, model: Model

@@ -258,10 +258,8 @@ class Directional:
 
     def relaxation(self, scene: Scene, state: State, views: Sequence[int]) -> Relaxation:
         surface = scene.surface(state)
-        taken, others = surface.pool.of(state.taken), surface.pool.of(views)
-        dome = surface.dome if self.over_dome else None
-        lam, degree, tau = surface.lam, self.degree, self.tau
-        return relaxed.directional(surface.points, lam, degree, tau, taken, others, dome)
+        relaxed.checked(surface.pool.of(views).seen)
+        return surface.relaxation(state.taken, views, self.model)
 
 
 DIRECTIONAL_D = Directional(degree=1, tau=0.3, over_dome=False)
