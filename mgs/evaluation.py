@@ -22,6 +22,7 @@ from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import PNG_LEVEL
 from mgs.memory import IMAGE_BYTES, kept_within
 from mgs.metrics import METRICS, SURFACE_METRICS, compare, compare_psnr, compare_surface
+from mgs.progress import report
 from mgs.rotation import rotmat_from_quat
 
 if TYPE_CHECKING:
@@ -30,16 +31,9 @@ if TYPE_CHECKING:
 Renderer = Callable[[Gaussians, Camera], tuple[np.ndarray, np.ndarray, np.ndarray]]
 """(gaussians, camera) -> linear RGB [H,W,3], alpha [H,W], expected z-depth [H,W] in metres."""
 
-Progress = Callable[[int, int], None]
-"""Called as progress(views done, all)."""
-
 MEASURED_AT_ONCE = 4  # most views that are measured at the same time, each in a thread
 PIXELS_AT_ONCE = 4_000_000  # of all of these; a larger view is measured alone
 DIFFERENCE_GAIN = 4  # factor by which differences are brightened in the pictures
-
-
-def no_progress(done: int, total: int) -> None:
-    """Default callback: does nothing."""
 
 
 def render_view(
@@ -157,7 +151,6 @@ def evaluate_model(
     test_frames: Sequence[Frame] = (),
     renderer: Renderer = render_view,
     pictures: Path | None = None,
-    progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Compare a model with every frame of a dataset, and with its test views if it has some.
 
@@ -181,11 +174,10 @@ def evaluate_model(
     at_once = max(1, min(MEASURED_AT_ONCE, PIXELS_AT_ONCE // largest))
     renders = ((view, renderer(gaussians, view[0].camera)) for view in work)
     views: list[dict[str, Any]] = []
-    progress(0, len(work))
     for (frame, _), metrics in zip(work, _compared(renders, _measured, at_once), strict=True):
         in_training = len(views) < len(frames) and frame.name in trained
         views.append({"name": frame.name, "trained": in_training} | metrics)
-        progress(len(views), len(work))
+        report("rendering and comparing", len(views), len(work))
     views, tests = views[: len(frames)], views[len(frames) :]
     result: dict[str, Any] = {"images": len(trained)}
     if tests:

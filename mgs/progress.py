@@ -28,8 +28,8 @@ def no_progress(stage: str, done: int, total: int) -> None:
 _listener: ContextVar[Progress] = ContextVar("progress", default=no_progress)
 
 
-def report(stage: str, done: int, total: int) -> None:
-    """Tell the listener how far a stage is."""
+def report(stage: str, done: int = 0, total: int = 0) -> None:
+    """Tell the listener how far a stage is. total: 0 if unknown."""
     _listener.get()(stage, done, total)
 
 

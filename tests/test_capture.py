@@ -14,6 +14,7 @@ from refusals import fails, listing, refused
 from mgs import PriorSettings, build_prior, prior_from_mesh, save_prior
 from mgs.data.check import check_dataset
 from mgs.data.dataset import FILES, load_dataset
+from mgs.progress import listening
 from mgs.reports.tables import table_columns
 from mgs.run.inputs import prior_digest
 from mgs.synth import arena, rendering
@@ -121,8 +122,8 @@ def test_only_test_views_are_rendered_in_advance(full, poses):
 
 def test_an_interrupted_dataset_goes_on_only_as_on_demand(poses, tmp_path):
     given, out = (SCENE, TINY), tmp_path / "again"
-    with pytest.raises(KeyboardInterrupt):
-        synth_orbit(out, *given, seed=3, test_views=2, on_demand=True, progress=stop_at())
+    with pytest.raises(KeyboardInterrupt), listening(stop_at()):
+        synth_orbit(out, *given, seed=3, test_views=2, on_demand=True)
     fails("unfinished dataset of other settings", synth_orbit, out, *given, seed=3, test_views=2)
     synth_orbit(out, *given, seed=3, test_views=2, on_demand=True)
     assert listing(out) == listing(poses.root)

@@ -21,6 +21,7 @@ from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.evaluation import evaluate_model, write_comparison
 from mgs.images import write_exr, write_png
 from mgs.metrics import METRICS, OPAQUE, PSNR_LIMIT, SURFACE_METRICS, compare_surface, psnr, ssim
+from mgs.progress import listening
 from mgs.reports import evaluation as measuring
 from mgs.run.folder import read_checkpoint
 
@@ -116,8 +117,8 @@ def test_evaluate(tmp_path):
     dataset, calls = write_dataset(tmp_path / "data", orbit_cameras(4)), []
     tests = write_dataset(tmp_path / "test", orbit_cameras(3, 40, 30)).frames
     options = {"test_frames": tests, "renderer": flat, "pictures": tmp_path / "renders"}
-    options["progress"] = lambda done, total: calls.append((done, total))
-    result = evaluate_model(grey(), dataset.frames, {"kf_0001"}, **options)
+    with listening(lambda _stage, *how: calls.append(how)):
+        result = evaluate_model(grey(), dataset.frames, {"kf_0001"}, **options)
     assert [view["name"] for view in result["views"]] == [f"kf_000{i}" for i in range(4)]
     assert [view["trained"] for view in result["views"]] == [False, True, False, False]
     assert [view["trained"] for view in result["test_views"]] == [False] * 3
@@ -140,7 +141,7 @@ def test_evaluate(tmp_path):
         values = [view[name] for view in result["views"]]
         assert result["all"][name] == pytest.approx(np.mean(values))
         assert result["held_out"][name] == pytest.approx(np.mean([values[i] for i in (0, 2, 3)]))
-    assert calls == [(i, 7) for i in range(8)]
+    assert calls == [(i, 7) for i in range(1, 8)]
     assert json.loads(json.dumps(result, allow_nan=False)) == result
     pictures = {path.relative_to(tmp_path).as_posix() for path in tmp_path.glob("renders/**/*.png")}
     names = *(f"kf_000{i}" for i in range(4)), *(f"test/kf_000{i}" for i in range(3))

@@ -14,6 +14,7 @@ from mgs.data.check import check_dataset
 from mgs.data.meshes import distances_to_mesh, read_mesh
 from mgs.errors import InputError
 from mgs.files import locked, read_json
+from mgs.progress import listening
 from mgs.resources import resource_folder
 from mgs.seeds import generator
 from mgs.synth.orbit import evaluation_cameras, rock_cameras
@@ -67,8 +68,8 @@ def test_same_seed_same_bytes_and_resume_and_pose_noise_and_test_views(dataset, 
     out, made = tmp_path / "again", {"scene": SCENE, "preset": TINY, "seed": 3, "test_views": 4}
     made |= {"pose_noise": PoseNoise(0.01, 0.1)}
     for call, unwritten in ((3, "transforms.json"), (8, "test/transforms.json")):
-        with pytest.raises(KeyboardInterrupt):
-            synth_orbit(out, **made, progress=stop_at(call))
+        with pytest.raises(KeyboardInterrupt), listening(stop_at(call)):
+            synth_orbit(out, **made)
         assert not (out / unwritten).exists()
     written = {path: path.stat().st_mtime_ns for path in out.rglob("*_0*.*")}
     assert len(written) == 4 * 7
@@ -119,8 +120,8 @@ def test_another_mesh_of_the_same_name_is_not_gone_on_with(tmp_path):
     path = tmp_path / "rock.ply"
     made = {"scene": SCENE, "preset": ONE, "mesh": path}
     trimesh.creation.icosphere(subdivisions=2).export(path)
-    with pytest.raises(KeyboardInterrupt):
-        synth_orbit(tmp_path / "out", **made, progress=stop_at(2))
+    with pytest.raises(KeyboardInterrupt), listening(stop_at(2)):
+        synth_orbit(tmp_path / "out", **made)
     trimesh.creation.icosphere(subdivisions=3).export(path)
     fails("other settings", synth_orbit, tmp_path / "out", **made)
     trimesh.creation.icosphere(subdivisions=2).export(path)

@@ -1,6 +1,5 @@
 """`mgs dataset`: check a dataset, or make masks for one that has none."""
 
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -36,8 +35,8 @@ def _make_masks(path: Path, prior: Path) -> None:
 
     data, mesh_prior = load_dataset(path), load_prior(prior)
     console = Terminal()
-    with working_in(path), progress_bar("masks", console) as progress:
-        masks = make_masks(data, mesh_prior.mesh, partial(progress, "masks"))
+    with working_in(path), progress_bar("masks", console):
+        masks = make_masks(data, mesh_prior.mesh)
     sheet = path / SHEET
     console.print(f"{path}: {len(masks)} masks of {prior}; look at {sheet} before you use them")
 
@@ -48,8 +47,8 @@ def _check(path: Path) -> None:
 
     data = load_dataset(path)
     console = Terminal()
-    with progress_bar("reading", console) as progress:
-        check = check_dataset(data, partial(progress, "reading"))
+    with progress_bar("reading", console):
+        check = check_dataset(data)
     camera, (low, high) = data.frames[0].camera, check.depth_range
     absent = len(data) - len(taken_frames(data))
     waiting = f" ({absent} of them on demand, not taken yet)" if absent else ""

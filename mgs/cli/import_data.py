@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +14,6 @@ from mgs.cli.options import parse_up
 from mgs.cli.terminal import Terminal, progress_bar
 from mgs.errors import InputError
 from mgs.files import Ours, clear_folder, scratch_folder
-from mgs.progress import listening
 
 if TYPE_CHECKING:
     from mgs.data.clouds import SparseCloud
@@ -96,8 +94,7 @@ def import_data(
     unpacked = out.with_name(f"{out.name}.unpacked")
     with (
         scratch_folder(unpacked, resumable=not is_bag(source)) as scratch,
-        progress_bar("reading", console) as progress,
-        listening(progress),
+        progress_bar("reading", console),
     ):
         shots = read_source(
             source,
@@ -124,7 +121,6 @@ def import_data(
             downscale=downscale,
             up=upward,
             tests=tests,
-            on_frame=partial(progress, "importing"),
         )
         poses, cloud = shots.fit, shots.sparse
         if shots.kind != PHOTOGRAPHS:

@@ -1,6 +1,5 @@
 """`mgs eval`, `diagnose`, `report`, `simplify`: measure models, or make smaller ones."""
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -52,15 +51,14 @@ def evaluate(
 
     runtime.start()
     rows, lines = list[dict[str, Any]](), list[str]()
-    with progress_bar() as bar:
-        progress = partial(bar, "rendering and comparing")
+    with progress_bar():
         for subject in subjects:
             files = [subject]
             if subject.is_dir():
                 if dataset is not None:
                     raise InputError(f"--dataset: is for a file, not for {subject}; leave it out")
                 run = open_run(subject)
-                evaluate_run(run, pictures=pictures, progress=progress, say=lines.append)
+                evaluate_run(run, pictures=pictures, say=lines.append)
                 folder = f" ({subject.resolve().name})" if len(subjects) > 1 else ""
                 rows += comparison_rows({f"{run.label}{folder}": run})
                 smaller = [subject / name for name in (REFITTED, PRUNED)]
@@ -69,7 +67,7 @@ def evaluate(
                 name, of = path.name, prior
                 if path != subject:
                     name, of = f"  {path.stem.partition('_')[2]}", None
-                metrics = measured(path, dataset, prior=of, progress=progress)
+                metrics = measured(path, dataset, prior=of)
                 rows.append(metrics_row(name, metrics))
                 lines.append(f"wrote {path.with_suffix('.metrics.json')}")
     print_quality(Terminal(), rows)
@@ -98,8 +96,8 @@ def diagnose(runs: list[Path], views: str | None = None, force: bool = False) ->
         check_new_file(folder / "information.ply", force)
     runtime.start()
     for run, folder in zip(runs, folders, strict=True):
-        with folder_locked(folder), progress_bar() as bar:
-            paths = mapped(run, names, partial(bar, "mapping"))
+        with folder_locked(folder), progress_bar():
+            paths = mapped(run, names)
         for path in paths:
             echo(f"wrote {path}")
 
@@ -140,11 +138,11 @@ def simplify(
         check_new_file(open_run(run).folder / name, force)
     runtime.start()
     for run in runs:
-        with working_in(run), progress_bar() as bar:
+        with working_in(run), progress_bar():
             if method == "prune":
-                lines = _pruned(prune_run(run, say=bar, **of_prune), noise or PRUNE_NOISE)
+                lines = _pruned(prune_run(run, **of_prune), noise or PRUNE_NOISE)
             else:
-                lines = _refitted(refit_run(run, say=bar, **of_refit))
+                lines = _refitted(refit_run(run, **of_refit))
         echo("\n".join([*lines, f"wrote {run / name}"]))
 
 
@@ -211,8 +209,8 @@ def report(
     if html is not None:
         from mgs.reports.page import write_page
 
-        with progress_bar() as bar:
-            size = write_page(html, runs, progress=partial(bar, "drawing"))
+        with progress_bar():
+            size = write_page(html, runs)
         echo(f"wrote {html} ({size / 1e6:.1f} MB)")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -190,8 +189,7 @@ def resume_and_print(
                 progress.print(f"pass {done} of {most}: {psnr:.2f} dB, {path}")
 
         state = resume_nbv(run, on_step, progress, policy, live, on_pass, like).state
-        watched = partial(progress, "evaluating")
-        metrics = evaluate_run(run.folder, pictures=False, progress=watched)
+        metrics = evaluate_run(run.folder, pictures=False)
     print_run(run.folder, state, metrics, console)
 
 

@@ -1,7 +1,6 @@
 """`mgs prior`: from depth images, points, masks or a mesh to a rock mesh and samples of it."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -143,7 +142,7 @@ def prior(
             chosen = choose_source(data, source, points)
             console.print(f"prior from {chosen}" + ("" if source or points else WHY[chosen]))
             options = {"source": chosen, "points": points}
-            result, segmented = _built(data, settings, folder, progress, **options)
+            result, segmented = _built(data, settings, folder, **options)
         if result.kind != "random":
             progress("colours of the surface")
             agreement = math.nan if data.on_demand else colour_agreement(result, data.frames)
@@ -177,7 +176,6 @@ def _built(
     dataset: "Dataset",
     settings: "PriorSettings",
     folder: Path,
-    on_stage: Callable[[str], None],
     **options: Any,
 ) -> "tuple[Prior, SegmentedCloud | None]":
     """`prior_and_cloud`. A refused cloud is drawn beside `folder`; the error names the picture."""
@@ -186,7 +184,7 @@ def _built(
     from mgs.prior.segmentation import NoSurface
 
     try:
-        return prior_and_cloud(dataset, settings, on_stage, **options)
+        return prior_and_cloud(dataset, settings, **options)
     except NoSurface as refused:
         picture = folder.with_name(f"{folder.name}-refused.png")
         draw_refused(picture, refused.points, refused.kept)

@@ -79,11 +79,10 @@ def render(
     if antialiased is not None:
         gaussians = replace(gaussians, antialiased=antialiased)
     runtime.start()
-    with folder_locked(out), progress_bar() as bar:
+    with folder_locked(out), progress_bar():
         if not force:
             check_new_folder(out)
-        progress = partial(bar, "rendering")
-        draw_views(out, gaussians, views, background, exr, progress)
+        draw_views(out, gaussians, views, background, exr)
     colours = "linear RGB" if gaussians.linear else "sRGB"
     what = f"{len(gaussians):,} Gaussians (SH degree {gaussians.sh_degree}, colours in {colours})"
     echo(f"wrote {len(views)} views of {what} to {out}")
@@ -222,11 +221,11 @@ def _export_compact(
     targets = _targets(runs, [run / f"export{ending}" for run in runs], out, force)
     runtime.start()
     for run, path in targets:
-        with progress_bar() as bar:
+        with progress_bar():
             if to == "mgs":
-                result = compact_run(open_run(run), size, psnr, shared, bar)
+                result = compact_run(open_run(run), size, psnr, shared)
             else:
-                result = thin_run(open_run(run), to, size, psnr, bar)
+                result = thin_run(open_run(run), to, size, psnr)
         data, count, (before, after) = result.data, result.count, result.psnr
         with atomic_path(path) as temporary:
             temporary.write_bytes(data)
@@ -267,8 +266,8 @@ def _in_srgb(model: Path, linear: "Gaussians") -> "Gaussians":
         echo(f"{cost} darker; the export of a run folder fits them again")
         return in_srgb(linear)
     run = open_run(model)
-    with progress_bar() as bar:
-        fitted = refit_in_srgb(run, partial(bar, "fitting colours, blended in sRGB"))
+    with progress_bar():
+        fitted = refit_in_srgb(run)
     name, values = compare_models([run.gaussians, fitted], run)
     if values is not None:
         linear_rgb = f"{values[0]:.2f} dB blended in linear RGB, as in the run"
@@ -322,7 +321,7 @@ def video(
         opened = open_run(run)
         with progress_bar("drawing") as bar:
             if story:
-                frames, count = story_frames(opened, bar), len(opened.state.taken)
+                frames, count = story_frames(opened), len(opened.state.taken)
                 each = (seconds or count) / count
             else:
                 count, each = max(1, round((seconds or 8) * fps)), 1 / fps

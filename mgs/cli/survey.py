@@ -52,7 +52,7 @@ def survey(
     # The folder is checked and locked before the work.
     ours = Ours(FILES, [dataset]) if force else None
     with atomic_folder(folder, ours) as unfinished, progress_bar("survey", console) as progress:
-        flown = fly(frames, settings, progress)
+        flown = fly(frames, settings)
         progress("writing")
         numbers = save_survey(unfinished, frames, flown, settings)
     console.print(_table(numbers))

@@ -1,7 +1,6 @@
 """`mgs synth-orbit`: render a dataset, an orbit around a rock."""
 
 import re
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -79,7 +78,7 @@ def synth_orbit(
     console = Terminal()
     if force:
         clear_folder(out, Ours(FILES, [path for path in (mesh, Path(scene)) if path]))
-    with progress_bar("rendering", console) as progress:
+    with progress_bar("rendering", console):
         dataset = rendered(
             out,
             settings,
@@ -87,7 +86,6 @@ def synth_orbit(
             seed,
             mesh,
             noise,
-            progress=partial(progress, "rendering"),
             say=console.print,
             mesh_up=mesh_up,
             test_views=test_views,

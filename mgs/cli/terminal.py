@@ -18,6 +18,7 @@ from rich.progress import (
 from rich.text import Text
 
 from mgs.errors import printable_lines
+from mgs.progress import listening
 
 
 class Terminal(Console):
@@ -74,12 +75,14 @@ class ProgressBar:
 def progress_bar(stage: str = "reading", console: Terminal | None = None) -> Iterator[ProgressBar]:
     """Show progress while the context is open, on a terminal or in a notebook; nothing of it stays.
 
-    The object it yields is called as progress(stage, done, total). For a function that reports
-    (done, total) alone, pass `functools.partial(progress, "rendering")`.
+    It listens to `mgs.progress.report`, and what it yields may be called as progress(stage, done,
+    total).
     """
     name = TextColumn("{task.description}", markup=False)
     columns = name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     console = console or Terminal()
     off = not (console.is_terminal or console.is_jupyter)  # it would leave an empty line
     with Progress(*columns, console=console, transient=True, disable=off) as bar:
-        yield ProgressBar(bar, stage)
+        progress = ProgressBar(bar, stage)
+        with listening(progress):
+            yield progress

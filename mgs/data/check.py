@@ -1,6 +1,6 @@
 """Consistency checks of a dataset: files, colour, depth, masks and poses."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame
 from mgs.data.visibility import has_masks, in_image
 from mgs.errors import InputError
+from mgs.progress import report
 
 TOLERANCE = 0.02  # relative excess of depth beyond which a frame sees through a point of the rock
 # Measured on rendered rocks: 0 in sound datasets, 0.07 to 0.3 with all depths 10 % too large.
@@ -35,9 +36,7 @@ def taken_frames(dataset: Dataset) -> list[Frame]:
     ]
 
 
-def check_dataset(
-    dataset: Dataset, progress: Callable[[int, int], None] = lambda done, total: None
-) -> Check:
+def check_dataset(dataset: Dataset) -> Check:
     """Read every pixel of the `taken_frames` and list all problems."""
     problems: list[str] = []
     shares, ranges, through = [], [], []
@@ -75,7 +74,7 @@ def check_dataset(
                     before = frame, depth, mask
         except InputError as error:
             problems.append(str(error))
-        progress(index + 1, len(frames))
+        report("reading", index + 1, len(frames))
     common = [share for share in through if np.isfinite(share)]
     median = float(np.median(common)) if common else float("nan")
     if through and not median <= MAX_SEEN_THROUGH:

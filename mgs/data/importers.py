@@ -22,6 +22,7 @@ from mgs.data.world import PLUS_Z, Vector, World
 from mgs.errors import InputError, Notice
 from mgs.files import copy_file, fingerprint, folder_locked, remove_file, write_json
 from mgs.images import PNG_BIT_DEPTH, read_depth, read_mask, read_rgba, write_exr, write_png
+from mgs.progress import report
 
 CHECKED = 4  # about the number of pictures that are checked before an import
 RECORD = "import.json"  # record of what is imported; an interrupted import of the same continues
@@ -36,7 +37,6 @@ def import_source(
     downscale: int = 1,
     up: Vector = PLUS_Z,
     tests: Source | None = None,
-    on_frame: Callable[[int, int], None] | None = None,
 ) -> Dataset:
     """Write a source as a dataset into `out`: new, empty, or left by an interrupted import of it.
 
@@ -46,7 +46,7 @@ def import_source(
     from an alpha with intermediate values that gives the mask; with `masks` or `mesh` there are
     none. Images, depth and masks are undistorted to a pinhole camera in which every pixel is valid,
     then reduced by blocks of `downscale` x `downscale`. up: as `World`. tests: shots of the same
-    world, which become the test views. on_frame: called (done, total) before each frame.
+    world, which become the test views.
 
     When an interrupted import continues, a finished frame is made again only if one of its files
     is newer; the result is the same bit for bit. A finished import is loaded as it is. Raises
@@ -82,14 +82,13 @@ def import_source(
         _warn_of_bits(shots)
         frames = []
         for k, shot in enumerate(shots):
-            if on_frame:
-                on_frame(k, len(shots))
+            report("importing", k, len(shots))
             frames.append(import_shot(shot, out, silhouette, downscale, begin))
         if source.sparse is not None:
             write_cloud(out / "sparse.ply", source.sparse)
         if tests is not None and not (out / TEST_FOLDER / "transforms.json").is_file():
             how: Any = {"masks": masks, "mesh": mesh, "downscale": downscale, "up": up}
-            import_source(tests, out / TEST_FOLDER, **how, on_frame=on_frame)
+            import_source(tests, out / TEST_FOLDER, **how)
         world = World(up, source.unit or "unit", source.origin)
         upright = [replace(frame, camera=world.enter(frame.camera)) for frame in frames]
         place = {"place": source.place} if source.place and up == PLUS_Z else {}

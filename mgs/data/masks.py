@@ -1,6 +1,5 @@
 """Masks for photographs that have none: a mesh of the object is projected into them."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,19 +12,17 @@ from mgs.data.meshes import Mesh
 from mgs.data.visibility import has_masks
 from mgs.errors import InputError
 from mgs.images import write_png
+from mgs.progress import report
 
 SHEET = "masks.png"  # contact sheet, in the folder of the dataset
 THUMBNAIL = 240  # width of a photograph in the contact sheet, pixels
 ACROSS = 6  # photographs in a row of the contact sheet
 
 
-def make_masks(
-    dataset: Dataset, mesh: Mesh, progress: Callable[[int, int], None] = lambda done, total: None
-) -> Dataset:
+def make_masks(dataset: Dataset, mesh: Mesh) -> Dataset:
     """Write a mask of a mesh for each frame of a dataset, a contact sheet, and transforms.json; the
-    same first for its test views, if they have no masks. progress: called (done, total) before each
-    frame. Raises InputError if a frame has a mask already, if the mesh is in no image, or if a file
-    cannot be read or written."""
+    same first for its test views, if they have no masks. Raises InputError if a frame has a mask
+    already, if the mesh is in no image, or if a file cannot be read or written."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     for frame in dataset.frames:
@@ -34,11 +31,11 @@ def make_masks(
             raise InputError(f"frame {frame.name}: has a mask already; {cure}")
     tests = dataset.test_views()
     if tests is not None and not has_masks(tests.frames):
-        make_masks(tests, mesh, progress)
+        make_masks(tests, mesh)
     depth, frames, visible = mesh_depth(mesh), [], False
     thumbnails = []
     for k, frame in enumerate(dataset.frames):
-        progress(k, len(dataset))
+        report("masks", k, len(dataset))
         mask, rgb = depth(frame.camera) > 0, frame.rgb()
         visible |= bool(mask.any())
         path = dataset.root / "masks" / f"{frame.name}.png"

@@ -25,6 +25,7 @@ from mgs.fit.stopping import StopReason
 from mgs.gaussians import Gaussians
 from mgs.memory import Deferred
 from mgs.policy.criteria import LEARN_LOSS
+from mgs.progress import report
 from mgs.splat import ListCache, as_drjit, groups
 
 DIRECTIONAL = "directional"  # kind of the colour coefficients of degrees above 0
@@ -131,7 +132,6 @@ def lean_fit(
     learn: Literal["all", "auto"] = "auto",
     sh: Literal["0", "auto"] = "auto",
     loss: float = LEARN_LOSS,
-    say: Callable[[str], None] = lambda stage: None,
 ) -> LeanModel:
     """Fit a model that has no more parameters than the images need.
 
@@ -144,14 +144,14 @@ def lean_fit(
 
     Worth is always that in squared differences, also where the fits have another loss.
 
-    say(stage): called as a stage starts. Raises InputError as `fitted`.
+    Raises InputError as `fitted`.
     """
     cache, views = ListCache(), range(len(images))
     left_out = None
     if sh == "auto" and len(images) >= BLOCKS:
-        left_out = directional_gain(images, settings, cache, say)
+        left_out = directional_gain(images, settings, cache)
     degree = 1 if left_out and left_out.pays else 0
-    say("fitting all parameters")
+    report("fitting all parameters")
     whole = fitted(images, views, settings, degree, cache)
     worths = _worth(whole, images, settings, cache)
     columns = kinds(degree, settings.train.means)
@@ -165,23 +165,18 @@ def lean_fit(
     ]
     if decided:
         learns |= paying(worths, {kind: sizes[kind] for kind in decided}, loss)
-    say("fitting what the images pay for")
+    report("fitting what the images pay for")
     last = fitted(images, views, settings, degree, cache, learns)
     parameters = sum(int(mask.sum()) * sizes[kind] for kind, mask in learns.items())
     return LeanModel(last, whole, learns, parameters, left_out)
 
 
-def directional_gain(
-    images: Images,
-    settings: ModelSettings,
-    cache: ListCache,
-    say: Callable[[str], None] = lambda stage: None,
-) -> LeftOut:
+def directional_gain(images: Images, settings: ModelSettings, cache: ListCache) -> LeftOut:
     """Gain of colours of degree 1 over degree 0 on views left out: fits of both degrees without
     each of BLOCKS blocks of neighbours in `images.order` (Roberts et al. 2017)."""
     decibels = []
     for done, block in enumerate(np.array_split(np.asarray(images.order), BLOCKS)):
-        say(f"fitting without some views, {done + 1} of {BLOCKS}")
+        report("fitting without some views", done, BLOCKS)
         rest = [i for i in images.order if i not in block]
         models = [fitted(images, rest, settings, degree, cache) for degree in (0, 1)]
         for i in block:

@@ -37,6 +37,7 @@ from mgs.prior.segmentation import SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import Surface, poisson_mesh, sample_surface, spread_first
 from mgs.prior.truth import error_to_truth
+from mgs.progress import report
 from mgs.seeds import derive_seed
 
 
@@ -96,7 +97,6 @@ class Prior:
 def build_prior(
     dataset: str | Path | Dataset,
     settings: PriorSettings | None = None,
-    on_stage: Callable[[str], None] = lambda stage: None,
     *,
     source: str | None = None,
     points: Path | None = None,
@@ -106,7 +106,6 @@ def build_prior(
     """Build the prior of a dataset, as in `build_prior("demo/dataset", gaussians=2000)`.
 
     - settings, or keyword arguments: fields of `PriorSettings`.
-    - on_stage: called with the name of each stage.
     - source: "depth", "points", "hull" (of the masks) or "random"; by default the first that the
       dataset has. points: PLY file in place of the dataset's points.
     - shown: frames whose masks a "random" prior may read, by default all.
@@ -117,13 +116,12 @@ def build_prior(
     settings = replace(settings or PriorSettings(), **fields)
     if source == "random" and shown is not None:
         return _random_prior(dataset, settings, shown)
-    return prior_and_cloud(dataset, settings, on_stage, source=source, points=points)[0]
+    return prior_and_cloud(dataset, settings, source=source, points=points)[0]
 
 
 def prior_and_cloud(
     dataset: Dataset,
     settings: PriorSettings,
-    on_stage: Callable[[str], None] = lambda stage: None,
     *,
     source: str | None = None,
     points: Path | None = None,
@@ -139,11 +137,11 @@ def prior_and_cloud(
         check_photographs(dataset.frames, of_object=True)
         check_masks(dataset.frames)
     if kind == "depth":
-        surface = _depth_surface(dataset, settings, on_stage)
+        surface = _depth_surface(dataset, settings)
     else:
-        surface = surface_of(dataset, kind, settings, on_stage, points)
+        surface = surface_of(dataset, kind, settings, points)
     mesh, segmented, cell = surface.mesh, surface.segmented, surface.cell
-    on_stage("surface samples")
+    report("surface samples")
     residual, noise, plane = 0.0, 0.0, None
     if segmented is not None:
         distances = distances_to_mesh(segmented.rock_points, mesh.vertices, mesh.faces)
@@ -169,7 +167,7 @@ def prior_and_cloud(
     numbers |= _place(dataset) | {"settings": asdict(settings)}
     truth = dataset.root / "rock.glb"
     if truth.is_file() and kind == "depth" and segmented is not None:
-        on_stage("distance to the true rock")
+        report("distance to the true rock")
         numbers["truth"] = error_to_truth(
             samples, spacing, mesh, truth, dataset, segmented, settings.seed
         )
@@ -197,14 +195,12 @@ def _random_prior(dataset: Dataset, settings: PriorSettings, shown: Sequence[Fra
     return Prior(mesh, points, normals, spacing, tolerance, about | numbers).moved(_as_in_files)
 
 
-def _depth_surface(
-    dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]
-) -> Surface:
-    segmented = segment_dataset(dataset, settings, on_stage)
+def _depth_surface(dataset: Dataset, settings: PriorSettings) -> Surface:
+    segmented = segment_dataset(dataset, settings)
     check_masks(dataset.frames)
     cloud, plane = segmented.cloud, segmented.plane
     assert plane is not None
-    on_stage("Poisson mesh")
+    report("Poisson mesh")
     points, normals = segmented.rock_points, segmented.rock_normals
     mesh, depth = poisson_mesh(points, normals, cloud.voxel, plane, settings.poisson_depth)
     numbers = {

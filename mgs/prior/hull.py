@@ -2,7 +2,7 @@
 point's projections inside the masks' outlines, times the size of a pixel there, is 0."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ from mgs.data.meshes import Mesh
 from mgs.data.visibility import in_image, nearest_point
 from mgs.errors import InputError, Notice
 from mgs.prior.surface import Surface
+from mgs.progress import report
 
 COARSE, REFINEMENTS = 48, 2  # cells along an edge of the first grid; its refinements by two
 NEAR_SURFACE = 3.0  # nodes are evaluated anew if their interpolated value is under this many cells
@@ -29,9 +30,7 @@ ODD = 0.5  # least share of what few frames cut away, for a mask that cuts it aw
 FEW = 0.1  # share of the frames that see a point of the object and may carve it by mistake
 
 
-def visual_hull(
-    frames: Sequence[Frame], on_stage: Callable[[str], None] = lambda stage: None
-) -> Surface:
+def visual_hull(frames: Sequence[Frame]) -> Surface:
     """Visual hull of the masks of frames, smoothed by at most half a cell; its numbers have the
     mean and least share of a mask that it fills.
 
@@ -42,7 +41,7 @@ def visual_hull(
     others = list(frames)
     while True:
         try:
-            return _carved(others, on_stage)
+            return _carved(others)
         except _Contradiction as error:
             if error.share < ODD or len(frames) - len(others) >= FEW * len(frames):
                 raise InputError(f"{error}") from None
@@ -67,11 +66,11 @@ class _Contradiction(InputError):
         )
 
 
-def _carved(frames: Sequence[Frame], on_stage: Callable[[str], None]) -> Surface:
+def _carved(frames: Sequence[Frame]) -> Surface:
     """`visual_hull` of all frames. Raises _Contradiction where their masks do not fit."""
     from skimage.measure import marching_cubes
 
-    on_stage("visual hull")
+    report("visual hull")
     views = [_view(frame) for frame in frames]
     lo, edge = _bounds(frames)
     cells, side = COARSE, np.arange(COARSE + 1)

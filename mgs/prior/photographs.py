@@ -1,6 +1,6 @@
 """Surfaces from photographs without depth: of triangulated points, the visual hull, or both."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from mgs.prior.points import segment_points, spacing_of
 from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import Surface, closed_poisson, intersection, poisson_mesh
+from mgs.progress import report
 from mgs.survey.fusion import focus, voxel_means
 
 SOURCES = ("depth", "mesh", "points", "hull", "random")  # sources of a prior
@@ -91,7 +92,6 @@ def surface_of(
     dataset: Dataset,
     source: str,
     settings: PriorSettings,
-    on_stage: Callable[[str], None],
     points: Path | None = None,
 ) -> Surface:
     """Surface of the source "points" or "hull". points: file of the cloud, by default the dataset's
@@ -100,11 +100,11 @@ def surface_of(
     closed."""
     if source == "hull":
         settings.refuse_shaping("a hull is carved from masks")
-        return visual_hull(dataset.frames, on_stage)
+        return visual_hull(dataset.frames)
     cloud = read_cloud(points or dataset.root / CLOUD).upright(dataset.world)
-    segmented = segment_points(cloud, dataset, settings, on_stage)
-    hull = visual_hull(dataset.frames, on_stage) if has_masks(dataset.frames) else None
-    on_stage("Poisson mesh")
+    segmented = segment_points(cloud, dataset, settings)
+    hull = visual_hull(dataset.frames) if has_masks(dataset.frames) else None
+    report("Poisson mesh")
     spacing = spacing_of(segmented.rock_points)
     try:
         mesh, depth = _closed(segmented, hull, spacing, settings)

@@ -3,7 +3,7 @@ else by ground plane and density clusters (HDBSCAN), and last by their neighbour
 start of photographs whose object has no known surface: points that came with the cameras take the
 place of as many random ones."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -22,6 +22,7 @@ from mgs.errors import InputError
 from mgs.prior.resolution import MOST_GAUSSIANS
 from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud, estimate_normals, ground_plane
 from mgs.prior.settings import PriorSettings
+from mgs.progress import report
 from mgs.seeds import derive_seed, generator
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD
 from mgs.survey.fusion import REACH, Cloud, focus
@@ -102,12 +103,12 @@ def main_cluster(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, in
 
 
 def segment_points(
-    sparse: SparseCloud, dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]
+    sparse: SparseCloud, dataset: Dataset, settings: PriorSettings
 ) -> SegmentedCloud:
     """The object in a triangulated cloud: the points inside all masks; without masks, what stands
-    above the ground; without ground, the densest thing near what the cameras look at. on_stage:
-    called with the name of each stage. Raises NoSurface if too few points are left."""
-    on_stage("points")
+    above the ground; without ground, the densest thing near what the cameras look at. Raises
+    NoSurface if too few points are left."""
+    report("points")
     frames = dataset.frames
     good = reliable(sparse)
     points, views = sparse.points[good], views_of(sparse, [frame.camera for frame in frames])[good]
@@ -118,7 +119,7 @@ def segment_points(
         inside = (share >= MASK_SHARE) & (count >= LEAST_TRACK)
         where = "inside the masks; give masks and poses that fit, or take the source hull"
     else:
-        on_stage("ground plane and clusters")
+        report("ground plane and clusters")
         plane = _plane_or_none(cloud, frames, settings)
         if plane is not None:
             ground = np.abs(plane.height(points)) <= plane.tolerance

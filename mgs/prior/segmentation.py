@@ -11,6 +11,7 @@ from mgs.data.frames import Frame
 from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError
 from mgs.prior.settings import PriorSettings
+from mgs.progress import report
 from mgs.seeds import derive_seed
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD
 from mgs.survey.fusion import FILTERED_SHARE, Cloud, focus, fuse_frames, voxel_means
@@ -193,19 +194,16 @@ class SegmentedCloud:
     clusters: int
 
 
-def segment_dataset(
-    dataset: Dataset, settings: PriorSettings, on_stage: Callable[[str], None]
-) -> SegmentedCloud:
-    """Fuse the depth images of a dataset into a cloud, and find the ground and the rock. on_stage:
-    called with the name of each stage. Raises InputError as `fuse_frames`, `ground_plane` and
-    `rock_cluster`."""
-    on_stage("cloud")
+def segment_dataset(dataset: Dataset, settings: PriorSettings) -> SegmentedCloud:
+    """Fuse the depth images of a dataset into a cloud, and find the ground and the rock. Raises
+    InputError as `fuse_frames`, `ground_plane` and `rock_cluster`."""
+    report("cloud")
     cloud = fuse_frames(dataset.frames)
-    on_stage("ground plane")
+    report("ground plane")
     plane = ground_plane(cloud, dataset.frames, derive_seed(settings.seed, "prior/plane"))
     ground = np.abs(plane.height(cloud.points)) <= plane.tolerance
     above = plane.height(cloud.points) > plane.tolerance
-    on_stage("rock cluster")
+    report("rock cluster")
     target = focus(dataset.frames).point
 
     def weight(points: np.ndarray) -> np.ndarray:

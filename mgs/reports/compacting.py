@@ -15,6 +15,7 @@ from mgs.errors import InputError
 from mgs.evaluation import psnr_over
 from mgs.gaussians import Gaussians
 from mgs.policy.criteria import PRUNE_NOISE
+from mgs.progress import report
 from mgs.reports.exporting import as_imported, in_srgb, to_y_up
 from mgs.run.folder import Run
 from mgs.scene import Scene
@@ -46,18 +47,17 @@ def compact_run(
     size: int | None = None,
     psnr: float | None = None,
     shared: bool = False,
-    say: Callable[[str], None] = lambda stage: None,
 ) -> Compacted:
     """Make the best model of at most `size` bytes, or the smallest of `psnr` dB in the views taken.
 
-    shared: the receiver has the run's prior, so positions are not sent. say(stage): called as a
-    stage starts. Raises InputError if neither can be reached, for a shared prior whose Gaussians
-    were moved or changed by the fit, and as `Run.state`."""
+    shared: the receiver has the run's prior, so positions are not sent. Raises InputError if
+    neither can be reached, for a shared prior whose Gaussians were moved or changed by the fit, and
+    as `Run.state`."""
     measured = _measure(run)
     before, best = measured(run.gaussians), list[tuple[float, Compact]]()
     _check_reachable(str(run.folder), psnr, before)
-    for encoder in encoders(run, shared, say):
-        say("choosing steps")
+    for encoder in encoders(run, shared):
+        report("choosing steps")
         file = _fitted(encoder, size, None if psnr is None else lambda m: measured(m) >= psnr)
         if file is None:
             continue
@@ -106,14 +106,13 @@ def thin_run(
     kind: str,
     size: int | None = None,
     psnr: float | None = None,
-    say: Callable[[str], None] = lambda stage: None,
 ) -> Compacted:
     """Make a file of another format (`mgs.splat_files.FORMATS`) with as many Gaussians as fit into
     `size` bytes, or as few as have `psnr` dB in the views taken.
 
     All Gaussians of such a file take the same bytes, so those go that change the views taken least,
-    at most half at a time. The rest is fitted to these once more. say: as in `compact_run`.
-    Raises InputError if neither can be reached, and as `Run.state`."""
+    at most half at a time. The rest is fitted to these once more. Raises InputError if neither can
+    be reached, and as `Run.state`."""
     from mgs.fit.pruning import fewest
 
     world, cameras = run.dataset.world, [frame.camera for frame in run.taken]
@@ -121,7 +120,7 @@ def thin_run(
 
     def fitted(count: int) -> tuple[Gaussians, bytes]:
         """The Gaussians that are left, and the file of them."""
-        say(f"fitting {count:,} Gaussians")
+        report(f"fitting {count:,} Gaussians")
         some = again(rest[fewest(rest, cameras, count)])
         return some, written(some)
 
@@ -156,9 +155,7 @@ def thin_run(
     return Compacted(data, len(rest), (before, after))
 
 
-def encoders(
-    run: Run, shared: bool, say: Callable[[str], None] = lambda stage: None
-) -> Iterator[Encoder]:
+def encoders(run: Run, shared: bool) -> Iterator[Encoder]:
     """Encoders of the run's model; where positions are sent, pruned, then with a half to
     a sixteenth of its Gaussians, fitted once more."""
     from mgs.fit.pruning import fewest, prune
@@ -171,17 +168,17 @@ def encoders(
         if start is None:
             moved = "its fit moved the Gaussians of its prior or has others"
             raise InputError(f"{run.folder}: {moved}; leave out `shared_prior`")
-        say("weighing errors")
+        report("weighing errors")
         yield Encoder(g, gradients, start, None, *place)
         return
     cameras, again = [frame.camera for frame in run.taken], refitting(run)
     layer = start.layer if start else np.zeros(len(g), np.int64)
-    say("removing Gaussians")
+    report("removing Gaussians")
     rest = prune(g, cameras, PRUNE_NOISE).kept
     yield Encoder(g[rest], gradients, None, layer[rest], *place)
     for _ in range(THINNINGS):
         count = max(1, len(g) // 2)
-        say(f"fitting {count:,} Gaussians")
+        report(f"fitting {count:,} Gaussians")
         rest = fewest(g, cameras, count)
         g, layer = again(g[rest]), layer[rest]
         yield Encoder(g, gradients, None, layer, *place)

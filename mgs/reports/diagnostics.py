@@ -1,7 +1,7 @@
 """Maps of what the training views of a run say about its model (docs/evaluation.md), in views (EXR,
 PNG) and of Gaussians (PLY). A map of a scalar is its mean in each pixel by blending weights."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -18,6 +18,7 @@ from mgs.files import write_columns
 from mgs.gaussians import Gaussians, sh_from_rgb
 from mgs.images import write_exr
 from mgs.policy import criteria
+from mgs.progress import report
 from mgs.run.folder import Run, open_run
 
 VIEWS = 3  # number of views that are drawn if none are named
@@ -188,16 +189,10 @@ def choose_views(
     return [pool[i] for i in spread]
 
 
-def diagnose(
-    run: str | PathLike[str],
-    views: Sequence[str] | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Path]:
+def diagnose(run: str | PathLike[str], views: Sequence[str] | None = None) -> list[Path]:
     """Write RUN/diagnostics: information.ply, and NAME.exr and NAME.png of each view. Returns the
-    paths.
-
-    views: names of frames (`choose_views`). progress: called as progress(views done, all). Raises
-    InputError for an unknown view, and as `open_run`."""
+    paths. views: names of frames (`choose_views`). Raises InputError for an unknown view, and as
+    `open_run`."""
     opened = open_run(run)
     gaussians, trained = opened.state.gaussians, [frame.name for frame in opened.taken]
     frames = choose_views(opened.dataset.frames, trained, views)
@@ -205,7 +200,7 @@ def diagnose(
     write_information_ply(out / "information.ply", opened.model, scalars)
     paths = [out / "information.ply"]
     for done, frame in enumerate(frames):
-        progress(done, len(frames))
+        report("mapping", done, len(frames))
         maps = view_maps(gaussians, frame.camera, scalars)
         title = f"{frame.name}, {'' if frame.name in trained else 'never '}trained on"
         if opened.settings.estimator != "exact":  # its numbers are not in the units of the panels
@@ -215,5 +210,4 @@ def diagnose(
         write_exr(files[0], maps, world.leave(frame.camera), world.unit)
         write_preview(files[1], maps, title, world.unit)
         paths += files
-    progress(len(frames), len(frames))
     return paths

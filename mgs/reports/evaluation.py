@@ -11,10 +11,11 @@ import numpy as np
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset
 from mgs.data.frames import Frame
 from mgs.errors import InputError
-from mgs.evaluation import Progress, evaluate_model, no_progress
+from mgs.evaluation import evaluate_model
 from mgs.files import working_in, write_json
 from mgs.gaussians import ARRAYS, Gaussians
 from mgs.memory import KEPT_BYTES, release
+from mgs.progress import listening, no_progress
 from mgs.provenance import versions
 from mgs.run.folder import Run, holds_run, open_run, read_config
 from mgs.run.inputs import array_digest, camera_digest, frame_digests
@@ -26,7 +27,6 @@ def evaluate_run(
     run: str | Path | Run,
     *,
     pictures: bool = True,
-    progress: Progress = no_progress,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Any]:
     """Evaluate a run of `mgs nbv` on its dataset and its test views; write RUN/metrics.json and,
@@ -67,7 +67,6 @@ def evaluate_run(
             trained,
             test_frames=test_frames,
             pictures=folder if pictures else None,
-            progress=progress,
         )
         write_json(file, metrics)
         run.metrics = metrics
@@ -81,7 +80,8 @@ def drawn_test_view(run: Run, model: Gaussians) -> tuple[Path, float]:
     tests, folder = run.dataset.test_views(), run.folder / "renders"
     frame = tests.frames[0] if tests else run.dataset.frames[0]
     folder = folder / TEST_FOLDER if tests else folder
-    metrics = evaluate_model(model, [frame], [], pictures=folder)
+    with listening(no_progress):  # of the fit at work
+        metrics = evaluate_model(model, [frame], [], pictures=folder)
     return folder / f"{frame.name}.png", metrics["all"]["psnr"]
 
 
@@ -136,7 +136,6 @@ def evaluate(
     *,
     trained: Iterable[str] = (),
     prior: str | Path | None = None,
-    progress: Progress = no_progress,
     **options: Any,
 ) -> dict[str, Any]:
     """Measure PSNR and SSIM of a run or a model; return the contents of metrics.json.
@@ -155,7 +154,7 @@ def evaluate(
         if dataset is not None or trained:
             own = "is a run, with its own dataset; leave out dataset and trained"
             raise InputError(f"{subject}: {own}")
-        return evaluate_run(subject, progress=progress, **options)
+        return evaluate_run(subject, **options)
     path = None
     if not isinstance(subject, Gaussians):
         path = Path(subject)
@@ -177,7 +176,7 @@ def evaluate(
     if unknown := sorted(set(names) - {frame.name for frame in views.frames}):
         raise InputError(f"{views.root}: has no frame {unknown[0]}, which `trained` names")
     frames, test_frames = views.with_images(names), tests.frames if tests else ()
-    metrics = evaluate_model(subject, frames, names, test_frames=test_frames, progress=progress)
+    metrics = evaluate_model(subject, frames, names, test_frames=test_frames)
     if path is not None:
         write_json(path.with_suffix(".metrics.json"), metrics)
     return metrics

@@ -1,7 +1,7 @@
 """Models for viewers of other programs, and views of a run as datasets that other programs train on
 (nerfstudio, COLMAP): `mgs export`."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from mgs.gaussians import Gaussians
 from mgs.images import write_png
 from mgs.memory import Deferred
 from mgs.prior.exposure import exposure_of, without_gain
+from mgs.progress import report
 from mgs.run.folder import Run, open_run
 from mgs.splat.reference import sh_basis
 from mgs.splat_files import load_gaussians, upward
@@ -76,17 +77,17 @@ def in_srgb(g: Gaussians) -> Gaussians:
     return replace(g, sh=sh, linear=False)
 
 
-def refit_in_srgb(run: Run, progress: Callable[[int, int], None]) -> Gaussians:
+def refit_in_srgb(run: Run) -> Gaussians:
     """Fit the colours of a run's linear model, blended in sRGB, to the views taken; the rest is
-    unchanged. progress(done, all) is called after each pass. Raises InputError if a file of a frame
-    or, where exposures differ, of the prior cannot be read."""
+    unchanged. Raises InputError if a file of a frame or, where exposures differ, of the prior
+    cannot be read."""
     from mgs.fit.fitting import fit_gaussians
 
     frames = run.taken
     gains = exposure_of(run.prior)(frames) if run.settings.exposure else np.ones((len(frames), 3))
     targets = Deferred(range(len(frames)), lambda i: without_gain(target_of(frames[i]), gains[i]))
     cameras, model = [frame.camera for frame in frames], in_srgb(run.gaussians[run.shown])
-    on_pass = lambda done, most, _: progress(done, most)  # noqa: E731
+    on_pass = lambda *how: report("fitting colours, blended in sRGB", *how[:2])  # noqa: E731
     return fit_gaussians(model, cameras, targets, REFIT, on_pass).gaussians
 
 

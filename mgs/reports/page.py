@@ -19,6 +19,7 @@ from mgs.files import write_text
 from mgs.notebook import data_uri
 from mgs.plotting import crop, painted
 from mgs.policy.criteria import GAIN_UNIT, uncertainty
+from mgs.progress import report
 from mgs.reports.diagnostics import VISIBLE, view_maps
 from mgs.reports.page_plots import (
     METRIC_NAMES,
@@ -157,20 +158,15 @@ def colour_scale(name: str) -> list[str]:
 COMPARED = 6  # views of the dataset, and test views, on which truth and renders are compared
 
 
-def write_page(
-    path: str | Path,
-    folders: Sequence[str | PathLike[str]],
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> int:
+def write_page(path: str | Path, folders: Sequence[str | PathLike[str]]) -> int:
     """Write the page of these runs as one HTML file; return its size in bytes.
 
-    folders: run folders on one dataset, finished or not. progress: called as progress(pictures of
-    views drawn, all). Links to other files are relative to the page. The same files give the same
-    page, byte for byte. Raises InputError as `mgs.reports.tables.compare_runs`, and if a file is
-    damaged or the page cannot be written."""
+    folders: run folders on one dataset, finished or not. Links to other files are relative to the
+    page. The same files give the same page, byte for byte. Raises InputError as
+    `mgs.reports.tables.compare_runs`, and if a file is damaged or the page cannot be written."""
     path, runs = Path(path), compare_runs(folders)
     views = compared_frames(list(runs.values()))
-    album = draw_pictures(runs, views, progress)
+    album = draw_pictures(runs, views)
     limit = album.finish()
     dataset = next(iter(runs.values())).dataset
     text = _fill_in(
@@ -205,11 +201,7 @@ def write_page(
     return path.stat().st_size
 
 
-def draw_pictures(
-    runs: Mapping[str, Run],
-    views: Sequence[Frame],
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Album:
+def draw_pictures(runs: Mapping[str, Run], views: Sequence[Frame]) -> Album:
     """Draw the pictures of the page: of every run the views that it took, and of `views` the truth
     and the renders of all runs. Raises InputError if a file of a frame cannot be read."""
     frames = [*views, *(frame for run in runs.values() for frame in run.taken)]
@@ -221,9 +213,8 @@ def draw_pictures(
     def drawn() -> None:
         nonlocal done
         done += 1
-        progress(done, total)
+        report("drawing", done, total)
 
-    progress(0, total)
     for label, run in runs.items():
         draw_taken(album, label, run, drawn)
         for frame in views:

@@ -1,6 +1,5 @@
 """Smaller models of a run, compared with the whole one on other views: `mgs simplify`."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -8,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 from mgs.errors import InputError
 from mgs.files import check_writable
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
+from mgs.progress import report
 from mgs.reports.evaluation import compare_models
 from mgs.run import inputs
 from mgs.run.folder import open_run
@@ -38,23 +38,21 @@ class PrunedRun:
     psnr: list[float] | None
 
 
-def prune_run(
-    run: str | Path, noise: float = PRUNE_NOISE, say: Callable[[str], None] = lambda stage: None
-) -> PrunedRun:
+def prune_run(run: str | Path, noise: float = PRUNE_NOISE) -> PrunedRun:
     """Prune the model of a run by its training views (`mgs.fit.pruning.prune`), and write
     RUN/PRUNED.
 
     Both models are compared on the test views of the dataset, or without them on the held-out
-    views. say(stage): called as a stage starts. Raises InputError as `open_run` and `prune`."""
+    views. Raises InputError as `open_run` and `prune`."""
     from mgs.fit.pruning import prune
 
     opened = open_run(run)
     gaussians, names = opened.state.gaussians, [frame.name for frame in opened.taken]
-    say("pruning")
+    report("pruning")
     cameras = [frame.camera for frame in opened.dataset.frames if frame.name in names]
     pruned = prune(gaussians, cameras, noise)
     smaller = gaussians[pruned.kept]
-    say("comparing")
+    report("comparing")
     views, psnr = compare_models([gaussians, smaller], opened)
     write_ply(opened.folder / PRUNED, to_source(smaller, opened.dataset.world))
     return PrunedRun(len(gaussians), len(smaller), pruned.predicted, pruned.actual, views, psnr)
@@ -77,15 +75,14 @@ def refit_run(
     learn: Literal["all", "auto"] = "auto",
     sh: Literal["0", "auto"] = "auto",
     loss: float = LEARN_LOSS,
-    say: Callable[[str], None] = lambda stage: None,
 ) -> RefittedRun:
     """Fit the views of a run once more (`mgs.fit.evidence.lean_fit`), and write RUN/REFITTED.
 
     A vertex of the file has a byte for each kind of parameter, `learned_colour` and so on: 1 if it
     was learned; else the file holds the prior's value. The models are compared on the test views,
-    or without them on the held-out views. say(stage): called as a stage starts. Raises InputError
-    as `open_run` and `lean_fit`, for wrong arguments, for a run whose density is not fixed, and if
-    the prior or the images are not those of the run."""
+    or without them on the held-out views. Raises InputError as `open_run` and `lean_fit`, for wrong
+    arguments, for a run whose density is not fixed, and if the prior or the images are not those of
+    the run."""
     from mgs.fit.evidence import lean_fit
     from mgs.learning import images_of
     from mgs.scene import Scene
@@ -107,8 +104,8 @@ def refit_run(
     digest = inputs.prior_digest(prior)
     inputs.check_unchanged(opened.folder, opened.state.inputs, digest, settings, opened.dataset)
     images = images_of(Scene(opened.dataset, prior, settings), opened.taken)
-    lean = lean_fit(images, settings, learn, sh, loss, say=say)
-    say("comparing")
+    lean = lean_fit(images, settings, learn, sh, loss)
+    report("comparing")
     views, psnr = compare_models([own, lean.whole, lean.gaussians], opened)
     marks = {f"learned_{kind}": mask for kind, mask in lean.learned.items()}
     write_ply(path, to_source(lean.gaussians, opened.dataset.world), marks)

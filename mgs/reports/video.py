@@ -24,7 +24,7 @@ from mgs.metrics import psnr
 from mgs.plotting import NO_GRID, crop, new_figure, painted
 from mgs.policy import criteria
 from mgs.policy.tour import flying_order, legs
-from mgs.progress import Progress, listening
+from mgs.progress import report
 from mgs.reports.diagnostics import VISIBLE, picture, run_scalars, show_map, view_maps
 from mgs.reports.figures import NEWEST, draw_cameras
 from mgs.run.folder import Run
@@ -182,18 +182,17 @@ def models(run: Run, scene: Scene) -> Iterator[State]:
         yield before
 
 
-def story_frames(run: Run, progress: Progress) -> Film:
+def story_frames(run: Run) -> Film:
     """Frames of the story, one for each view taken: the cameras from above, the render of one view,
     and the share of the variance that is left in it. The view is the brightest of those that the
     first image leaves more unknown than most, among test views, views never taken, or all. Raises
     InputError as `models`, and if an image cannot be read."""
     scene, view = scene_of(run), None
-    with listening(progress):
-        for model in models(run, scene):
-            unknown = {"uncertainty": criteria.uncertainty(model.H, scene.lam)}
-            view = view or _shown_view(run, model, unknown)
-            maps = view_maps(model.gaussians, view.camera, unknown)
-            yield _drawn(run, model, maps, view)
+    for model in models(run, scene):
+        unknown = {"uncertainty": criteria.uncertainty(model.H, scene.lam)}
+        view = view or _shown_view(run, model, unknown)
+        maps = view_maps(model.gaussians, view.camera, unknown)
+        yield _drawn(run, model, maps, view)
 
 
 def _shown_view(run: Run, model: State, unknown: dict[str, np.ndarray]) -> Frame:
@@ -251,22 +250,20 @@ def draw_views(
     views: Sequence[tuple[str, Camera]],
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     exr: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Draw a model through every camera; write one PNG for each into the folder `out`.
 
     views: (path of the view's image, camera); a picture takes the name of the image (`file_names`).
     background: sRGB in [0,1]. exr: write an OpenEXR file too, with linear R G B over the
-    background, opacity A and expected z-depth Z in metres, 0 where nothing is drawn. progress:
-    called as progress(views done, all). Raises InputError as `mgs.splat.render`, and if a file
-    cannot be written."""
+    background, opacity A and expected z-depth Z in metres, 0 where nothing is drawn. Raises
+    InputError as `mgs.splat.render`, and if a file cannot be written."""
     from mgs.splat import as_drjit, render
 
     model, linear = as_drjit(gaussians), gaussians.linear
     behind = linear_from_srgb(background) if linear else np.asarray(background, np.float32)
     names = file_names([path for path, _ in views])
     for done, (name, (_, camera)) in enumerate(zip(names, views, strict=True)):
-        progress(done, len(views))
+        report("rendering", done, len(views))
         image = render(model, camera, behind.tolist())
         rgb = np.asarray(image.rgb)
         write_png(out / f"{name}.png", rgb, linear=linear)
@@ -275,7 +272,6 @@ def draw_views(
             alpha, depth = np.asarray(image.alpha), np.asarray(image.depth)
             channels = {"R": r, "G": g, "B": b, "A": alpha, "Z": depth}
             write_exr(out / f"{name}.exr", channels, camera)
-    progress(len(views), len(views))
 
 
 def file_names(paths: Sequence[str]) -> list[str]:

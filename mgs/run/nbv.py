@@ -176,13 +176,10 @@ def start_run(
     check_settings(mission, len(dataset))
     inputs = [path for path in (root, folder) if path]
     with atomic_folder(out, Ours(FILES, inputs) if holds_run(out) else None) as unfinished:
-        surface = given or build_prior(
-            dataset.survey(),
-            PriorSettings(gaussians=gaussians, seed=mission.seed, parts=parts),
-            source=source,
-            shown=_seed_frames(dataset, mission) if source == "random" else None,
-            on_stage=lambda stage: progress(f"prior: {stage}", 0, 1),
-        )
+        how = PriorSettings(gaussians=gaussians, seed=mission.seed, parts=parts)
+        shown = _seed_frames(dataset, mission) if source == "random" else None
+        with listening(progress):
+            surface = given or build_prior(dataset.survey(), how, source=source, shown=shown)
         if folder is None:
             save_prior(unfinished / "prior", surface)
         _check_surface(surface, dataset, mission, where)

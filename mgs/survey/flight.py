@@ -2,7 +2,6 @@
 whose first pose is known and whose others are registered; and the folder of a survey, itself
 a dataset, with estimated poses and measured depth. Poses are [4,4] camera-to-world, metres."""
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from mgs.errors import InputError
 from mgs.files import copy_file, write_json
 from mgs.images import write_exr
 from mgs.plotting import drawing
+from mgs.progress import report
 from mgs.seeds import generator
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD, noisy_depth
 from mgs.survey.fusion import Cloud, focus, fuse_frames
@@ -70,14 +70,9 @@ class Survey:
     loops: list[Edge]  # accepted loop closures
 
 
-def fly(
-    dataset: Dataset,
-    settings: SurveySettings,
-    on_stage: Callable[[str, int, int], None] = lambda stage, done, total: None,
-) -> Survey:
-    """Survey a dataset that has depth images. on_stage: called (name, done, total). Raises
-    InputError if there are fewer than three frames, or one has no depth image or too few returns to
-    be registered."""
+def fly(dataset: Dataset, settings: SurveySettings) -> Survey:
+    """Survey a dataset that has depth images. Raises InputError if there are fewer than three
+    frames, or one has no depth image or too few returns to be registered."""
     frames = dataset.frames
     if len(frames) < 3:
         raise InputError(
@@ -85,7 +80,7 @@ def fly(
         )
     depths = []
     for k, frame in enumerate(frames):
-        on_stage("depth", k, len(frames))
+        report("depth", k, len(frames))
         rng = generator(settings.seed, f"survey/{frame.name}")
         depths.append(noisy_depth(frame.depth(), frame.camera, rng, settings.sensor))
     truth = np.stack([frame.camera.camera_to_world for frame in frames])
@@ -99,7 +94,7 @@ def fly(
     ]
     edges = []
     for k in range(len(frames) - 1):
-        on_stage("registration", k, len(frames) - 1)
+        report("registration", k, len(frames) - 1)
         edge = register(clouds, k, k + 1, steps[k], grid, (1.0,))
         # A result far from odometry has slid along a smooth surface, or failed.
         trusted = agrees(edge.relative, steps[k], settings.drift, grid)
@@ -108,7 +103,7 @@ def fly(
     loops = []
     candidates = loop_candidates(registered)
     for k, (i, j) in enumerate(candidates):
-        on_stage("loop closure", k, len(candidates))
+        report("loop closure", k, len(candidates))
         guess = np.linalg.inv(registered[i]) @ registered[j]
         edge = register(clouds, i, j, guess, grid, (4.0, 2.0, 1.0))
         if edge.overlap >= CLOSURE_OVERLAP:

@@ -30,6 +30,7 @@ from mgs.errors import InputError, row_named
 from mgs.files import atomic_path, copy_file, fingerprint, folder_locked, reading, write_json
 from mgs.images import write_exr, write_png
 from mgs.memory import check_room
+from mgs.progress import report
 from mgs.provenance import versions
 from mgs.seeds import derive_seed, generator
 from mgs.synth.orbit import PoseNoise, evaluation_cameras, perturb, rock_cameras
@@ -67,7 +68,6 @@ def synth_orbit(
     seed: int = 0,
     mesh: str | Path | None = None,
     pose_noise: PoseNoise | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
     say: Callable[[str], None] = lambda message: None,
     mesh_up: str | None = None,
     test_views: int = 0,
@@ -88,7 +88,7 @@ def synth_orbit(
     - pose_noise: error of the poses in transforms.json; true_poses.json then holds the exact ones.
     - test_views: number of views on a dome to render into `out`/test, with exact poses.
     - on_demand: render only the survey and the test views; a run renders the frames it takes.
-    - progress: called as progress(views done, all views). say: called with lines for the user.
+    - say: called with lines for the user.
 
     An interrupted call is completed by a second one, with the same files as after one call. A
     finished dataset is loaded as it is. Raises InputError if the scene or preset is unknown, `out`
@@ -146,7 +146,7 @@ def synth_orbit(
             temporary.write_bytes(glb.result())
         photographer = Photographer(world, exposure, spp, seed, denoise)
         views = tests if on_demand else [*orbit, *tests]
-        _render_frames(photographer, views, progress)
+        _render_frames(photographer, views)
         if views:
             write_contact_sheet(out / "contact_sheet.png", tests if on_demand else orbit)
         record = {
@@ -264,20 +264,18 @@ def _write_survey(
     write_transforms(folder, frames)
 
 
-def _render_frames(
-    photographer: Photographer, frames: list[Frame], progress: Callable[[int, int], None]
-) -> None:
+def _render_frames(photographer: Photographer, frames: list[Frame]) -> None:
     """Render the frames that are not done, each while the one before is denoised and written."""
     with ThreadPoolExecutor(1) as developer:
         last = developer.submit(lambda: None)
         for index, frame in enumerate(frames):
             traced = None if is_done(frame) else photographer.expose(frame)
             last.result()
-            progress(index, len(frames))
+            report("rendering", index, len(frames))
             if traced:
                 last = developer.submit(photographer.develop, frame, traced)
         last.result()
-    progress(len(frames), len(frames))
+    report("rendering", len(frames), len(frames))
 
 
 def write_contact_sheet(path: str | Path, frames: list[Frame]) -> None:
