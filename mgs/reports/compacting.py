@@ -119,10 +119,12 @@ def thin_run(
     measured, again = _measure(run), refitting(run)
 
     def fitted(count: int) -> tuple[Gaussians, bytes]:
-        """The Gaussians that are left, and the file of them."""
+        """The Gaussians to go on from, fitted only if half are gone, as more fits than that match
+        the views taken alone; and the file of the fitted ones."""
         report(f"fitting {count:,} Gaussians")
-        some = again(rest[fewest(rest, cameras, count)])
-        return some, written(some)
+        some = rest[fewest(rest, cameras, count)]
+        fit = again(some)
+        return fit if 2 * count <= len(rest) else some, written(fit)
 
     def written(model: Gaussians) -> bytes:
         write_gaussians(path, as_imported(run, model), kind, to_y_up(world.up))
@@ -136,7 +138,7 @@ def thin_run(
         path, rest = Path(folder) / f"x{FORMATS[kind]}", in_srgb(run.gaussians[run.shown])
         data, before = written(rest), measured(run.gaussians)
         if run.gaussians.linear:  # its colours change as they are blended in another space
-            rest, data = fitted(len(rest))
+            data = fitted(len(rest))[1]
         _check_reachable(f"{run.folder} as {kind}", psnr, quality())
         after, least = quality(), 0
         header = len(written(rest[:1])) if size is not None else 0  # with one Gaussian
