@@ -82,6 +82,8 @@ def test_a_fit_shows_a_view_before_its_end(dataset, run, tmp_path, capsys, monke
     assert decibels[0] < decibels[1]
     assert (out / f"renders/{load_dataset(dataset).frames[0].name}.png").is_file()
     assert "fitting: 3 of 5" in lines
+    command("dataset", "check", dataset)
+    assert "reading: 3 of 10" in said(capsys)[1]
 
 
 def test_interrupted_in_the_middle_of_a_step_then_resumed(dataset, run, tmp_path):

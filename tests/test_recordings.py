@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from mgs import Camera, load_dataset
 from mgs.data import tracks
 from mgs.data.peers import is_peer
+from mgs.data.shots import find_image
 from mgs.data.sources import read_source
 
 MOUNT = tracks.rigid((0.1, -0.2, 0.3), (0.5, -0.5, 0.5, -0.5))
@@ -435,6 +436,13 @@ def test_an_object_named_as_another_programs_list_is_no_source_of_it(dataset, tm
     shutil.copy(dataset.root / "transforms.json", path)
     assert not is_peer("3D Gaussian Splatting", tmp_path)
     assert len(read_source(path).shots) == len(dataset)
+
+
+def test_a_name_without_an_ending_is_the_photograph(tmp_path):
+    """A cut-out as PNG may lie beside it."""
+    for name in ("a.png", "a.jpg"):
+        (tmp_path / name).touch()
+    assert find_image(tmp_path, "a").name == "a.jpg"
 
 
 def test_keyframes_by_distance(dataset, tmp_path):
