@@ -497,17 +497,21 @@ def test_photographs_without_masks_are_fitted_whole_from_their_points(
     assert "has no surface on which to compare" in refused(capsys, arguments, tmp_path / "run")
 
 
-def test_an_object_in_masks_starts_with_few_gaussians_that_are_split(tmp_path, coarse_priors):
+def test_an_object_in_masks_starts_with_few_gaussians_that_are_split(
+    tmp_path, coarse_priors, capsys
+):
     synthetic.write_dataset(tmp_path / "d", depth=False)
-    for kind, more in (("split", ()), ("fixed", ("--density", "fixed"))):
-        out = tmp_path / kind
-        fitted = ["fit", tmp_path / "d", "--gaussians", 500, "--passes", 8, "--out", out]
-        command(*fitted, *more)
+    fitted = ["fit", tmp_path / "d", "--passes", 8, "--gaussians"]
+    kinds = ("split", 500, 104), ("fixed", 500, 500), ("split", 10, 10)
+    for kind, asked, start in kinds:
+        out = tmp_path / f"{kind}{asked}"
+        command(*fitted, asked, "--density", kind, "--out", out)
         prior, model = load_prior(out / "prior"), load_gaussians(out / "gaussians.ply")
         assert read_json(out / "config.json")["settings"]["train"]["density"] == kind
-        start = 104 if kind == "split" else 500
         assert len(prior.points) + prior.backed == start
-        assert 450 < len(model) <= 500
+        assert 0.9 * asked < len(model) <= asked
+    line = refused(capsys, [*fitted, 10**12, "--out", tmp_path / "many"], tmp_path / "many")
+    assert "ask for fewer Gaussians" in line
 
 
 def test_a_fit_with_adaptive_density_is_a_run_as_3dgs(tmp_path, capsys, monkeypatch):

@@ -8,10 +8,12 @@ import synthetic
 from program import command, exit_code, said
 from splat.scenes import calm, make_camera, make_clamped, relative_error
 
+from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.fit import poses
 from mgs.fit.objective import objective
 from mgs.run.folder import open_run
+from mgs.run.nbv import write_refined
 from mgs.splat import as_drjit, reference, render
 
 EYES = [(2.0, 0.4, 1.1), (-0.5, 2.1, 0.9), (-1.8, -1.1, 1.0), (0.6, -2.0, 1.3)]
@@ -108,3 +110,10 @@ def test_a_refinement_with_free_means_is_bitwise_the_same_again(tmp_path, coarse
 def test_poses_are_refined_where_all_images_are_there(tmp_path):
     data = synthetic.orbit(tmp_path / "data", 8, 32, 24)
     assert exit_code("nbv", data.root, "--out", tmp_path / "run", "--set", "refine_poses=true") == 2
+
+
+def test_refined_poses_keep_the_points(tmp_path):
+    data = synthetic.orbit(tmp_path / "data", 8, 32, 24)
+    write_cloud(data.root / "sparse.ply", SparseCloud(np.eye(3)))
+    write_refined(tmp_path / "run", data, data.frames)
+    assert np.array_equal(read_cloud(tmp_path / "run/sparse.ply").points, np.eye(3))

@@ -23,6 +23,8 @@ PASSES, WARM_PASSES = 10, 5
 # constant (docs/fit.md, An opaque surface).
 ALPHA_WEIGHT = 0.1
 
+MOST_OF_FIT = 2**25  # Gaussians of a fit
+
 Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
 # A number that others are divided by, bounded so that the results neither overflow nor vanish.
 Scale = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
@@ -53,7 +55,7 @@ class TrainSettings(Frozen):
     density: str = "fixed"
     """Density control of free means: fixed, split (divide the Gaussians that images pull at most),
     or adaptive (add and remove as 3DGS)."""
-    most_gaussians: Annotated[int, Field(ge=1, le=2**25)] = 200_000
+    most_gaussians: Annotated[int, Field(ge=1, le=MOST_OF_FIT)] = 200_000
     """Number of Gaussians beyond which a density control adds none."""
     loss: str = "l1-dssim"
     """Loss: l1-dssim (0.8 L1 + 0.2 D-SSIM of sRGB values, as 3DGS), or squared (difference of the

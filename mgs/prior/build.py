@@ -40,6 +40,8 @@ from mgs.prior.truth import error_to_truth
 from mgs.progress import report
 from mgs.seeds import derive_seed
 
+LEAST_DIVIDED = 100  # Gaussians that a fit starts with, though it will split them, if as many
+
 
 @dataclass(frozen=True, repr=False)
 class Prior:
@@ -234,7 +236,7 @@ def _samples(
     total = gaussians if isinstance(gaussians, int) else None
     if resolved and resolved.samples * (1 + share) > MOST_GAUSSIANS:
         total = MOST_GAUSSIANS
-    total = total and max(2, round(total / settings.parts))
+    total = total and max(min(total, LEAST_DIVIDED), round(total / settings.parts))
     count = None if total is None else total - round(total * share / (1 + share))
     if resolved:
         spacing = resolved.spacing

@@ -20,6 +20,7 @@ from mgs.data.world import UPRIGHT, Thing, World
 from mgs.errors import InputError
 from mgs.files import read_csv
 from mgs.prior.build import Prior
+from mgs.progress import report
 from mgs.rotation import rotmat_from_quat
 from mgs.synth.orbit import orbit_positions
 from mgs.synth.scene_file import Orbit
@@ -221,7 +222,8 @@ def hidden(
     judges, behind = np.zeros((2, len(eyes)), int)
     if points is None:
         return judges > 0
-    for camera in taken:
+    for done, camera in enumerate(taken):
+        report("looking for walls", done, len(taken))
         (pixels, depth), (places, far) = camera.project(points), camera.project(eyes)
         seen, here = in_image(camera, pixels, depth), in_image(camera, places, far)
         if seen.sum() < AROUND or not here.any():

@@ -16,9 +16,9 @@ from mgs.data.frames import Frame, moves
 from mgs.data.structure import CLOUD
 from mgs.data.visibility import has_masks
 from mgs.errors import InputError
-from mgs.files import THERE, Ours, atomic_folder, reading, write_json
+from mgs.files import THERE, Ours, atomic_folder, copy_file, reading, write_json
 from mgs.fit.density import GROWTH, split_times
-from mgs.fit.settings import ModelSettings, as_3dgs
+from mgs.fit.settings import MOST_OF_FIT, ModelSettings, as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE, Gaussians
 from mgs.learning import information, refine_poses, surface_information
 from mgs.memory import VIEW_BYTES
@@ -251,7 +251,7 @@ def start_fit(
             passes = train.get("passes", FREE_PASSES)
             parts = (1 + GROWTH) ** len(split_times(passes)) if isinstance(passes, int) else 1.0
             if isinstance(gaussians, int):
-                train.setdefault("most_gaussians", gaussians)
+                train.setdefault("most_gaussians", min(gaussians, MOST_OF_FIT))
     if train["means"] == "free" and kind in LOOSE:
         loose = LOOSE[kind]
         train = FREE_TRAIN | train
@@ -263,7 +263,7 @@ def start_fit(
 
 def write_refined(folder: Path, given: Dataset, frames: Sequence[Frame]) -> None:
     """Write a dataset of frames with refined poses, of the same files as the given one, and
-    poses.json: how far each moved, degrees and length. Test views keep their poses."""
+    poses.json: how far each moved, degrees and length. Points and test views stay as given."""
 
     def elsewhere(frame: Frame) -> Frame:
         paths = {key: path.resolve() for key in PATHS if (path := getattr(frame, key))}
@@ -272,6 +272,8 @@ def write_refined(folder: Path, given: Dataset, frames: Sequence[Frame]) -> None
     tests = given.test_views()
     if tests is not None:
         write_transforms(folder / TEST_FOLDER, [*map(elsewhere, tests.frames)], given.world)
+    if (given.root / CLOUD).is_file():
+        copy_file(given.root / CLOUD, folder / CLOUD)
     moved = {"dataset": str(given.root.resolve()), "moved": moves(given.frames, frames)}
     write_json(folder / POSES, moved)
     write_transforms(folder, [*map(elsewhere, frames)], given.world)

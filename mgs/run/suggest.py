@@ -120,7 +120,8 @@ def suggest(
     points = read_cloud(cloud).upright(run.dataset.world).points if cloud.is_file() else None
     site = Site(run.prior, images[-1].camera, points=points)
     taken = [frame.camera for frame in images]
-    why = refusals(poses, taken, site, safe_distance, elevations)
+    with listening(progress):
+        why = refusals(poses, taken, site, safe_distance, elevations)
     flyable = [pose for pose, reason in zip(poses, why, strict=True) if not reason]
     dropped = {reason: why.count(reason) for reason in dict.fromkeys(why) if reason}
     most = len(flyable) if views == "auto" else views
