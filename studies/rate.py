@@ -216,12 +216,11 @@ def share(rows: Sequence[Row], run: str, one: str, other: str) -> float:
 
 
 PAIRS = {
-    "mgs with mesh / SPZ": (WITH, "SPZ"),
     "mgs / SPZ": (ALONE, "SPZ"),
+    "mgs with mesh / SPZ": (WITH, "SPZ"),
     "compressed PLY / SPZ": ("compressed PLY", "SPZ"),
     "SOG / SPZ": (SOG, "SPZ"),
-    "mgs / SOG": (ALONE, SOG),
-    "mgs with mesh / JPEG": (WITH, JPEG),
+    "mgs / JPEG": (ALONE, JPEG),
 }
 """Coders compared, by the heading of their column."""
 

@@ -290,7 +290,7 @@ def _draw_lines(axis: "Axes", panel: Panel, rows: Sequence[Row]) -> None:
         order = np.argsort(xs)
         x, (mean, low, high) = np.asarray(xs, float)[order], points[:, order]
         alone = {"marker": "*", "markersize": 13, "color": "black", "zorder": 3}
-        look = {"marker": ""} if crowded else alone if len(x) == 1 else {}
+        look = alone if len(x) == 1 else {"marker": ""} if crowded else {}
         axis.plot(x, mean, **(style | look))
         axis.fill_between(x, low, high, color=style["color"], alpha=0.15, linewidth=0)
     if panel.log:
