@@ -49,7 +49,8 @@ def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
     )
     assert capsys.readouterr() == ("", "")
     assert steps == [3, 4, 5]
-    assert {"fitting", "information of the training set"} <= stages
+    mgs.start_run(dataset, tmp_path / "built", progress=lambda stage, *_: stages.add(stage))
+    assert {"fitting", "information of the training set", "surface samples"} <= stages
     assert mgs.read_ply(tmp_path / "run/gaussians.ply") == run.gaussians
     again = mgs.resume_nbv(tmp_path / "run")
     assert again.gaussians == run.gaussians
