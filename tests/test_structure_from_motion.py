@@ -246,8 +246,10 @@ def test_photographs_alone_are_one_command_to_the_next_picture(
     root, site, found = tmp_path / "photos", tmp_path / "photos.site", []
     few = ("--dome", 12, "--gaussians", 500)
     root.mkdir()
-    for frame in frames[:8]:
+    for frame in frames[:7]:
         shutil.copy(frame.image_path, root)
+    assert "7 photographs" in refused(capsys, ["suggest", root, *few], site)
+    shutil.copy(frames[7].image_path, root)
     extract = pycolmap.extract_features
 
     def watched(*files, image_names, **options):

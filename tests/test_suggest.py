@@ -160,6 +160,17 @@ def test_the_far_side_of_an_object_alone_is_not_behind_a_wall(site):
     assert "behind what the images show" not in refusals(ring, taken, replace(site, points=ball))
 
 
+def test_nothing_is_taken_from_behind_a_facade(site):
+    facade = replace(site.prior, normals=np.tile([0.6, 0.0, 0.8], (len(site.prior.points), 1)))
+    ring = place_poses("ring", 12, 2.6, (25, 35), site)
+    taken = [site.like]
+    why = refusals(ring, taken, replace(site, prior=facade))
+    eyes = np.stack([camera.position for _, camera in ring]) - site.centre
+    assert [bool(reason) for reason in why] == list(eyes @ [0.6, 0, 0.8] < 0)
+    assert 0 < sum(map(bool, why)) < 6
+    assert not any(refusals(ring, taken, site))
+
+
 def test_gains_of_a_model_without_a_surface_are_no_guide(run, monkeypatch, capsys):
     monkeypatch.setattr(Prior, "kind", "random")
     assert "nothing tells seen from unseen" in output(capsys, "suggest", run, "--dome", 5)

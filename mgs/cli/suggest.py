@@ -160,7 +160,10 @@ def suggest(
 
 def _placed(photographs: Path, site: Path, console: Terminal) -> Path:
     from mgs.data.on_site import dataset_at
+    from mgs.data.photographs import photographs_in
+    from mgs.prior.photographs import check_enough
 
+    check_enough(len(photographs_in(photographs)))  # more than can be placed: minutes earlier
     with progress_bar("reading", console) as progress, listening(progress):
         dataset, notes = dataset_at(photographs, site)
     for note in notes:

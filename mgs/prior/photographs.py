@@ -62,14 +62,19 @@ def choose_source(dataset: Dataset, source: str | None = None, points: Path | No
     raise InputError(f"{dataset.root}: has {lack}; {', or '.join(cures)}")
 
 
-def check_photographs(frames: Sequence[Frame], of_object: bool) -> None:
-    """Raise InputError for under LEAST_PHOTOGRAPHS. of_object: also for cameras that do not look at
-    one thing. Whole scenes, such as rooms and surveys from the air, have none."""
-    if len(frames) < LEAST_PHOTOGRAPHS:
+def check_enough(photographs: int) -> None:
+    """Raise InputError for under LEAST_PHOTOGRAPHS."""
+    if photographs < LEAST_PHOTOGRAPHS:
         raise InputError(
-            f"prior: {len(frames)} photographs without depth are too few; "
+            f"prior: {photographs} photographs without depth are too few; "
             f"take at least {LEAST_PHOTOGRAPHS}, from all sides"
         )
+
+
+def check_photographs(frames: Sequence[Frame], of_object: bool) -> None:
+    """Raise InputError as `check_enough`. of_object: also for cameras that do not look at one
+    thing. Whole scenes, such as rooms and surveys from the air, have none."""
+    check_enough(len(frames))
     if not of_object:
         return
     point = focus(frames).point[None]
@@ -78,7 +83,7 @@ def check_photographs(frames: Sequence[Frame], of_object: bool) -> None:
         raise InputError(
             f"prior: the photographs are not of one object: of {len(frames)} cameras only "
             f"{sum(inside)} have in their image what all look at; walk around the object, or check "
-            "the poses"
+            "the poses; a whole scene is fitted without a prior (`mgs fit`)"
         )
 
 

@@ -36,6 +36,7 @@ SAME_PLACE, SAME_VIEW = 1e-3, 1.0  # share of the distance, and degrees: counts 
 # on all sides. Images in which a place is judged by them. Chosen constants.
 AROUND, REACH, WITNESSES = 32, 0.2, 2
 OWN = 1.3  # times the radius of the object, within which points are its own. Chosen
+ONE_SIDED = 0.75  # least mean normal of a surface that has a back, as a facade; half a ball: 0.5
 FELT = 0.05  # least move that is named, over the distance from the object; as an angle, radians
 
 Named = tuple[str, Camera]
@@ -264,11 +265,13 @@ def refusals(
     if walls is not None:  # an object alone hides no place: its far side is what to suggest
         own = OWN * np.linalg.norm(site.prior.points - centre, axis=1).max()
         walls = walls[np.linalg.norm(walls - centre, axis=1) > own]
+    facing = site.prior.normals.mean(axis=0)
+    back = (offset @ facing < 0) & (np.linalg.norm(facing) > ONE_SIDED)
     within, keys = inside(mesh, eyes), [camera.world_to_camera.tobytes() for _, camera in poses]
     reasons = {
         "inside the object": within,
         f"nearer to it than {safe_distance:.3g}": near,
-        "behind what the images show": hidden(eyes, taken, walls),
+        "behind what the images show": back | hidden(eyes, taken, walls),
         f"not between {low:g} and {high:g} degrees": beyond,
         "taken already": _are_taken(poses, taken, far),
         "the same as one before": [keys.index(key) < k for k, key in enumerate(keys)],
