@@ -160,6 +160,18 @@ def test_the_far_side_of_an_object_alone_is_not_behind_a_wall(site):
     assert "behind what the images show" not in refusals(ring, taken, replace(site, points=ball))
 
 
+def test_a_wall_near_a_long_object_hides_what_is_behind(site):
+    across = np.stack(np.meshgrid(*[np.linspace(-4, 4, 60)] * 2), -1).reshape(-1, 2)
+    wall = site.centre + np.insert(across, 1, 2.0, axis=1)
+    long = site.centre + (site.prior.points - site.centre) * [5, 1, 1]
+    behind = replace(site, prior=replace(site.prior, points=long), points=wall)
+    eyes = site.centre + np.array([[x, -4, 0] for x in (-1, 0, 1)])
+    taken = [synthetic.pinhole(50, 64, 48, eye, site.centre) for eye in eyes]
+    places = site.centre + np.array([[0, 4, 0], [0, -3, 0]])
+    poses = [(name, behind.camera(place)) for name, place in zip("ab", places, strict=True)]
+    assert refusals(poses, taken, behind) == ["behind what the images show", ""]
+
+
 def test_nothing_is_taken_from_behind_a_facade(site):
     facade = replace(site.prior, normals=np.tile([0.6, 0.0, 0.8], (len(site.prior.points), 1)))
     ring = place_poses("ring", 12, 2.6, (25, 35), site)

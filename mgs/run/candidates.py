@@ -35,7 +35,7 @@ SAME_PLACE, SAME_VIEW = 1e-3, 1.0  # share of the distance, and degrees: counts 
 # Points of an image that say how deep it sees at a pixel: at most so far away, over its width, and
 # on all sides. Images in which a place is judged by them. Chosen constants.
 AROUND, REACH, WITNESSES = 32, 0.2, 2
-OWN = 1.3  # times the radius of the object, within which points are its own. Chosen
+OWN = 0.3  # distance from the surface, over the radius, within which points are its own. Chosen
 ONE_SIDED = 0.75  # least mean normal of a surface that has a back, as a facade; half a ball: 0.5
 FELT = 0.05  # least move that is named, over the distance from the object; as an angle, radians
 
@@ -264,7 +264,7 @@ def refusals(
     walls = site.points
     if walls is not None:  # an object alone hides no place: its far side is what to suggest
         own = OWN * np.linalg.norm(site.prior.points - centre, axis=1).max()
-        walls = walls[np.linalg.norm(walls - centre, axis=1) > own]
+        walls = walls[cKDTree(site.prior.points).query(walls)[0] > own]
     facing = site.prior.normals.mean(axis=0)
     back = (offset @ facing < 0) & (np.linalg.norm(facing) > ONE_SIDED)
     within, keys = inside(mesh, eyes), [camera.world_to_camera.tobytes() for _, camera in poses]
