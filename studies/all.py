@@ -26,7 +26,7 @@ STAGES = {
     "setups": ("setups", "--rocks", "8"),
     "paper": ("paper", "--rocks", "8"),
     "table1": ("table1",),
-    "flights": ("flights", "--rocks", "12"),
+    "flights": ("flights", "--rocks", "8"),
     "survey": ("survey", "--rocks", "8"),
     "parsimony": ("parsimony", "--rocks", "8"),
     "chart": ("chart",),
