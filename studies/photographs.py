@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import mgs
+from mgs.data.visibility import has_masks
 from mgs.files import read_csv
 from mgs.run.nbv import start_fit
 from studies.chart import check_dataset
@@ -26,19 +27,24 @@ from studies.frame.sweep import Cell
 
 NAME = "photographs"
 
-NUMBERS = ("cpu_seconds", "psnr", "seconds", "ssim")
+NUMBERS = ("cpu_seconds", "psnr", "seconds", "ssim", "gaussians")
 """Columns that are read from the CSV of another program."""
 
 COLUMNS: dict[str, Content] = {
     "dataset": "dataset",
     "program": "program",
     "passes": "passes",
-    "seconds": "seconds:.0f",
+    "Gaussians": "gaussians:,.0f",
     "CPU seconds": "cpu_seconds:.0f",
     "PSNR (dB)": "psnr:.2f",
-    "SSIM": "ssim:.4f",
-    "PSNR, masks (dB)": "psnr_mask:.2f",
+    "SSIM": "ssim:.3f",
 }
+
+
+def tables(rows: Sequence[Row]) -> str:
+    """Markdown table of the longest fit of each program to each dataset."""
+    longest = {(row["dataset"], row["program"]): row for row in rows}
+    return table(COLUMNS, [longest[key] for key in sorted(longest)])
 
 
 def measure(root: Path, out: Path, dataset: str, gaussians: Any, passes: int) -> dict[str, Any]:
@@ -88,8 +94,8 @@ def read_peer(file: Path, datasets: Sequence[str]) -> list[Row]:
 
 @dataclass(frozen=True)
 class Fits:
-    """Fits of every number of passes, to every dataset, with every number of Gaussians. peers: rows
-    of other programs."""
+    """Fits of every number of passes, to every dataset, with every number of Gaussians; photographs
+    without masks start from their points. peers: rows of other programs."""
 
     passes: tuple[int, ...]
     datasets: tuple[Path, ...] = ()
@@ -98,10 +104,12 @@ class Fits:
 
     def each(self) -> Iterator[tuple[Path, int | str, int, Cell]]:
         """Dataset, Gaussians, passes and cell of each fit."""
-        for dataset, count, passes in product(self.datasets, self.gaussians, self.passes):
-            name = f"{NAME}/{dataset.absolute().name}/{count}-{passes}"
-            how = {"dataset": str(dataset.resolve()), "gaussians": count, "passes": passes}
-            yield dataset, count, passes, Cell(name, f"{__name__}:measure", how, alone=True)
+        for dataset in self.datasets:
+            counts = self.gaussians if has_masks(mgs.load_dataset(dataset).frames) else ("auto",)
+            for count, passes in product(counts, self.passes):
+                name = f"{NAME}/{dataset.absolute().name}/{count}-{passes}"
+                how = {"dataset": str(dataset.resolve()), "gaussians": count, "passes": passes}
+                yield dataset, count, passes, Cell(name, f"{__name__}:measure", how, alone=True)
 
     def peer_rows(self) -> list[Row]:
         """Rows of other programs (`read_peer`)."""
@@ -109,7 +117,7 @@ class Fits:
         return [row for file in self.peers for row in read_peer(file, names)]
 
 
-SIZES = {"quick": Fits((5, 15, 30)), "full": Fits((5, 15, 30, 60))}
+SIZES = {"quick": Fits((5, 15)), "full": Fits((5, 15, 30, 60))}
 
 
 def sized(size: Fits, options: Namespace) -> Fits:
@@ -135,7 +143,7 @@ def write(work: Work) -> list[Path]:
     for dataset, count, passes, cell in work.size.each():
         result = work.results[cell.name]
         words = ["mgs", "fit", str(dataset), "--gaussians", str(count), "--passes", str(passes)]
-        program = f"mgs, {result['gaussians']:,} Gaussians"
+        program = "mgs" if len(work.size.gaussians) == 1 else f"mgs, {count} Gaussians"
         about = {"dataset": dataset.absolute().name, "program": program, "passes": passes}
         rows.append(about | result | {"command": shlex.join([*words, "--out", "RUN"])})
     rows += work.size.peer_rows()
@@ -145,7 +153,7 @@ def write(work: Work) -> list[Path]:
         for name in dict.fromkeys(row["dataset"] for row in rows)
     ]
     draw_panels(work.out / f"{NAME}.png", panels, rows)
-    return [*write_table(work, NAME, rows, table(COLUMNS, rows)), work.out / f"{NAME}.png"]
+    return [*write_table(work, NAME, rows, tables(rows)), work.out / f"{NAME}.png"]
 
 
 STUDY = Study(
@@ -165,7 +173,7 @@ STUDY = Study(
             "action": "append",
             "type": count_of,
             "metavar": "N|auto",
-            "help": "Number of Gaussians; repeat for more.",
+            "help": "Number of Gaussians of objects with masks; repeat for more.",
         },
         "--peer": {
             "action": "append",
