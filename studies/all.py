@@ -26,6 +26,7 @@ STAGES = {
     "setups": ("setups", "--rocks", "8"),
     "paper": ("paper", "--rocks", "8"),
     "table1": ("table1",),
+    "couplings": ("couplings", "--rocks", "4"),
     "flights": ("flights", "--rocks", "8"),
     "survey": ("survey", "--rocks", "8"),
     "parsimony": ("parsimony", "--rocks", "8"),

@@ -160,6 +160,24 @@ def test_policies_use_their_own_estimator():
     assert POLICIES["paper"](scene, state, [1, 2, 3]) == pytest.approx(paper)
 
 
+def test_full_d_is_the_gain_of_the_whole_matrix(monkeypatch):
+    """Against dense float64 Jacobians; by the blocks it is 6 and 8 % larger."""
+    monkeypatch.setattr(studied, "PROBES", 16)
+    model = make_gaussians(12, 3, log_scales=(-1.5, -0.8))
+    eyes = [(2.0, 0.4, 1.1), (1.9, 0.9, 0.8), (-1.9, 0.3, 1.0)]
+    cameras = [make_camera((24, 18), 30.0, eye) for eye in eyes]
+    state = mgs.State((), (0,), 1, model, np.zeros((12, 11)), np.zeros(0))
+    state = replace(state, frames=tuple(SimpleNamespace(camera=camera) for camera in cameras))
+    settings = SimpleNamespace(train=SimpleNamespace(means="frozen"))
+    scene = SimpleNamespace(settings=settings, cache=mgs.ListCache(), lam=LAM)
+    J = [reference.jacobian(model, camera).reshape(-1, 132) for camera in cameras]
+    each = [jacobian.T @ jacobian for jacobian in J]
+    prior = np.diag(np.tile(LAM, 12))
+    before = np.linalg.slogdet(each[0] + prior)[1]
+    gains = [np.linalg.slogdet(each[0] + F + prior)[1] - before for F in each[1:]]
+    assert studied.full_d(scene, state, [1, 2]) == pytest.approx(np.array(gains) / 132, rel=0.03)
+
+
 def test_fisherrf_code_squares_the_gradient_of_each_pixel():
     """Channels are summed first, and activations enter once (its CUDA kernel and PyTorch)."""
     model = make_gaussians(5, 3, colour=0.4)

@@ -8,6 +8,7 @@ from mgs.data.dataset import load_dataset
 from mgs.prior.build import load_prior
 from mgs.run.detectors import DETECTORS
 from studies import faults, stress
+from studies.couplings import halved
 
 FOLDERS = {"dataset": "dataset", "prior": "dataset/prior"}
 
@@ -42,6 +43,15 @@ def root(tmp_path_factory):
     cameras = synthetic.orbit_cameras(3, 48, 36, altitude=2.0)
     synthetic.write_dataset(folder / "dataset/test", cameras)
     return folder
+
+
+def test_a_halved_frame_has_means_of_four_pixels_and_points_at_half_the_place(root):
+    whole, point = load_dataset(root / "dataset").frames[0], np.array([[0.1, 0.2, 0.3]])
+    small = halved(whole)
+    assert small.rgb()[3, 5] == pytest.approx(whole.rgb()[6:8, 10:12].mean((0, 1)), abs=1e-6)
+    assert small.rgb().shape == (18, 24, 3)
+    pixel, half = (frame.camera.project(point)[0] for frame in (whole, small))
+    assert half == pytest.approx(pixel / 2)
 
 
 @pytest.mark.parametrize("name", faults.IMAGE_FAULTS)
