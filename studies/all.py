@@ -24,6 +24,7 @@ STAGES = {
     "fits": ("fits", "--rocks", "8"),
     "certificate": ("certificate", "--rocks", "12"),
     "setups": ("setups", "--rocks", "8"),
+    "oracle": ("oracle", "--rocks", "1"),
     "paper": ("paper", "--rocks", "8"),
     "table1": ("table1",),
     "couplings": ("couplings", "--rocks", "4"),
