@@ -347,7 +347,7 @@ def test_images_are_set_apart_as_test_views(dataset, tmp_path, capsys):
 
 def test_masks_by_projecting_a_mesh_or_from_files(dataset, tmp_path, capsys):
     _with_alpha(dataset, "8 bit")  # which is not looked at
-    for k, path in enumerate(list((dataset.root / "masks").iterdir())):
+    for k, path in enumerate(sorted((dataset.root / "masks").iterdir())):
         name = (path.name, f"{path.stem}_mask.png", f"{path.name}.png")[k % 3]
         path.rename(path.with_name(name))
     rock = synthetic.CENTRE, synthetic.AXES
@@ -355,6 +355,8 @@ def test_masks_by_projecting_a_mesh_or_from_files(dataset, tmp_path, capsys):
     mesh = ["--mesh", dataset.root / "rock.glb"]
     command("import", dataset.root, "--out", tmp_path / "mesh", *mesh)
     assert "turned from +Y up" in said(capsys)[0]
+    for frame in dataset.frames[::3]:  # a photograph beside a mask of its name
+        shutil.copy(frame.image_path, dataset.root / f"masks/{frame.name}.jpg")
     masks = ["--masks", dataset.root / "masks"]
     command("import", dataset.root, "--out", tmp_path / "files", *masks)
     projected, given = (load_dataset(tmp_path / name).frames for name in ("mesh", "files"))

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from mgs import Camera, load_dataset
 from mgs.data import tracks
 from mgs.data.peers import is_peer
-from mgs.data.shots import find_image
 from mgs.data.sources import read_source
 
 MOUNT = tracks.rigid((0.1, -0.2, 0.3), (0.5, -0.5, 0.5, -0.5))
@@ -438,11 +437,22 @@ def test_an_object_named_as_another_programs_list_is_no_source_of_it(dataset, tm
     assert len(read_source(path).shots) == len(dataset)
 
 
-def test_a_name_without_an_ending_is_the_photograph(tmp_path):
-    """A cut-out as PNG may lie beside it."""
-    for name in ("a.png", "a.jpg"):
-        (tmp_path / name).touch()
-    assert find_image(tmp_path, "a").name == "a.jpg"
+def test_a_name_without_an_ending_is_a_photograph_in_metashape_and_a_png_elsewhere(
+    dataset, tmp_path
+):
+    """A cut-out as PNG may lie beside a photograph, and a preview as JPEG beside a PNG."""
+    metashape = write_metashape(tmp_path / "metashape", dataset)
+
+    def bare(data):
+        for record in data["frames"]:
+            record["file_path"] = record["file_path"].removesuffix(".png")
+
+    copy = shutil.copytree(dataset.root, tmp_path / "copy")
+    synthetic.edit(copy, bare)
+    for source, ending in ((metashape, ".jpg"), (copy / "transforms.json", ".png")):
+        for path in list((source.parent / "images").glob("*.png")):
+            shutil.copy(path, path.with_suffix(".jpg"))
+        assert {shot.image.suffix for shot in read_source(source).shots} == {ending}
 
 
 def test_keyframes_by_distance(dataset, tmp_path):

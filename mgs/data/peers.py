@@ -18,7 +18,7 @@ from mgs.data.clouds import SparseCloud
 from mgs.data.colmap import models_in
 from mgs.data.dataset import FRAME_INTERVAL
 from mgs.data.lens import Lens
-from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, find_image, frame_name
+from mgs.data.shots import PHOTOGRAPH, PICTURE_SUFFIXES, Shot, Source, find_image, frame_name
 from mgs.data.tracks import ROUNDED, orthonormal
 from mgs.data.world import PLUS_Z
 from mgs.errors import InputError
@@ -298,7 +298,7 @@ def _image(name: str, folders: list[Path]) -> tuple[Path, str] | None:
     """Image of a name, which may be a path of another machine, and its name in its folder."""
     for end in (name, PureWindowsPath(name).name):
         for folder in folders:
-            if image := find_image(folder, end):
+            if image := find_image(folder, end, PHOTOGRAPH):
                 return image, end
     return None
 

@@ -20,8 +20,9 @@ from mgs.images import exif_orientation, image_size
 
 LEVELLED = 10.0  # angle from +Z, degrees, up to which cameras' common up vector counts as +Z
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
-# NeRF-synthetic names images without a suffix.
-SUFFIXES = ("", ".jpg", ".jpeg", ".JPG", ".JPEG", ".png", ".PNG", ".tif", ".tiff", ".webp")
+# Of a name without a suffix, as in NeRF-synthetic data: PNG first, which has alpha and is a mask.
+SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
+PHOTOGRAPH = ("", ".jpg", ".jpeg", ".JPG", ".JPEG", *SUFFIXES)  # a cut-out as PNG may lie beside it
 FAR = 1000.0  # distance from the origin over the cameras' extent, beyond which the origin is moved
 HELD = {  # EXIF orientation -> axes of the camera of the turned picture, in those of the stored one
     3: [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
@@ -175,9 +176,9 @@ def frame_name(path: str) -> str:
     return "_".join(part for part in parts if part not in (".", "..", "/", "images"))
 
 
-def find_image(folder: Path, name: str) -> Path | None:
-    """The file of this name in a folder, with one of SUFFIXES, or None."""
-    paths = (folder / f"{name}{suffix}" for suffix in SUFFIXES)
+def find_image(folder: Path, name: str, suffixes: Sequence[str] = SUFFIXES) -> Path | None:
+    """The file of this name in a folder, with the first suffix that exists, or None."""
+    paths = (folder / f"{name}{suffix}" for suffix in suffixes)
     return next((path for path in paths if path.is_file()), None)
 
 
