@@ -357,6 +357,9 @@ def test_the_command_writes_what_fits_and_programs_read_it(dataset, prior, tmp_p
         assert message in refused(capsys, ["export", run, *options, "--force"])
     command("export", run, "--psnr", "12", "--shared-prior", "--force")
     assert alone.stat().st_size < 1200
+    prior.rename(tmp_path / "gone")
+    command("export", run, "--bytes", "2k", "--force")
+    assert 1200 < alone.stat().st_size <= 2000
 
 
 def test_the_start_hides_the_last_bits(prior):

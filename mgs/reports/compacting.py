@@ -159,12 +159,13 @@ def thin_run(
 
 def encoders(run: Run, shared: bool) -> Iterator[Encoder]:
     """Encoders of the run's model; where positions are sent, pruned, then with a half to
-    a sixteenth of its Gaussians, fitted once more."""
+    a sixteenth of its Gaussians, fitted once more if the prior's folder exists."""
     from mgs.fit.pruning import fewest, prune
 
     g, place = run.state.gaussians, (run.dataset.world.up, run.dataset.world.origin)
     start, gradients = None, partial(_gradients, run)
-    if shared or run.settings.prior.is_dir():
+    fits = run.settings.prior.is_dir()
+    if shared or fits:
         start = _start(run, g)
     if shared:
         if start is None:
@@ -173,16 +174,19 @@ def encoders(run: Run, shared: bool) -> Iterator[Encoder]:
         report("weighing errors")
         yield Encoder(g, gradients, start, None, *place)
         return
-    cameras, again = [frame.camera for frame in run.taken], refitting(run)
+    cameras = [frame.camera for frame in run.taken]
     layer = start.layer if start else np.zeros(len(g), np.int64)
     report("removing Gaussians")
     rest = prune(g, cameras, PRUNE_NOISE).kept
     yield Encoder(g[rest], gradients, None, layer[rest], *place)
+    again = refitting(run) if fits else None
     for _ in range(THINNINGS):
         count = max(1, len(g) // 2)
-        report(f"fitting {count:,} Gaussians")
         rest = fewest(g, cameras, count)
-        g, layer = again(g[rest]), layer[rest]
+        g, layer = g[rest], layer[rest]
+        if again is not None:
+            report(f"fitting {count:,} Gaussians")
+            g = again(g)
         yield Encoder(g, gradients, None, layer, *place)
 
 
