@@ -154,6 +154,18 @@ def test_the_hull_keeps_each_piece_inside_the_masks(tmp_path, monkeypatch):
     assert sorted(round(piece.centroid[2], 1) for piece in pieces) == [0.2, 0.9]
 
 
+def test_the_hull_keeps_thin_parts_that_are_most_of_the_object(tmp_path, monkeypatch):
+    """Three rods through a small stone, as a tripod: smoothing alone takes them away."""
+    monkeypatch.setattr(hull, "COARSE", 24)
+    middle, thin = np.array([0, 0, 0.5]), 0.035
+    axes = np.full((3, 3), thin) + (0.5 - thin) * np.eye(3)
+    rods = [(middle, axis) for axis in [*axes, np.full(3, 0.06)]]
+    dataset = synthetic.write_dataset(tmp_path, synthetic.orbit_cameras(16, 128, 96), rods)
+    found = visual_hull(dataset.frames)
+    assert found.numbers["hull_fills_masks"] > 0.8
+    assert np.ptp(found.mesh.vertices, axis=0) == pytest.approx(1, abs=0.1)
+
+
 def test_masks_that_do_not_fit_are_one_line_that_names_a_frame(tmp_path):
     dataset = floating(tmp_path / "d", lattice(12))
     others = visual_hull([*dataset.frames[:7], *dataset.frames[8:]])

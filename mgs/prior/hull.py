@@ -31,8 +31,8 @@ FEW = 0.1  # share of the frames that see a point of the object and may carve it
 
 
 def visual_hull(frames: Sequence[Frame]) -> Surface:
-    """Visual hull of the masks of frames, smoothed by at most half a cell; its numbers have the
-    mean and least share of a mask that it fills.
+    """Visual hull of the masks of frames, smoothed by at most half a cell, unless that takes away
+    a thin object; its numbers have the mean and least share of a mask that it fills.
 
     A few masks that cut away what no others do are left out, with a warning. Raises InputError if
     all masks are empty or full, if they share no point of space, or if the hull fills too little of
@@ -68,8 +68,6 @@ class _Contradiction(InputError):
 
 def _carved(frames: Sequence[Frame]) -> Surface:
     """`visual_hull` of all frames. Raises _Contradiction where their masks do not fit."""
-    from skimage.measure import marching_cubes
-
     report("visual hull")
     views = [_view(frame) for frame in frames]
     lo, edge = _bounds(frames)
@@ -86,13 +84,17 @@ def _carved(frames: Sequence[Frame]) -> Surface:
         field[tuple(near.T)] = _inside(views, lo + edge / cells * near, NEAR_SURFACE * edge / cells)
     cell = edge / cells
     smooth = np.clip(gaussian_filter(field, 1.0), field - cell / 2, field + cell / 2)
-    solid = np.pad(_without_specks(smooth), 1, constant_values=-cell)
-    vertices, faces, _, _ = marching_cubes(solid, 0.0, gradient_direction="ascent")
-    vertices = lo + cell * (vertices.astype(np.float64) - 1)
-    mesh = Mesh(vertices, faces.astype(np.int64), np.ones(len(faces), bool))
-    filled = _checked_agreement(frames, views, mesh, points)
-    share = {"hull_fills_masks": np.nanmean(filled), "hull_fills_least": np.nanmin(filled)}
-    return Surface(mesh, cell, {"hull_cell": cell} | {key: float(share[key]) for key in share})
+    for values in (smooth, field):  # smoothing takes away what is as thin as two cells
+        mesh = _meshed(values, lo, cell)
+        filled = _filled(views, mesh)
+        if np.nanmedian(filled) >= AGREEMENT:
+            break
+    if not np.nanmedian(filled) >= AGREEMENT:
+        share = f"{np.nanmedian(filled):.0%} of the median mask"
+        what = f"the masks carve away most of the object (the hull fills {share})"
+        raise _Contradiction(what, frames, _odd_one(views, points))
+    fills = {"hull_fills_masks": np.nanmean(filled), "hull_fills_least": np.nanmin(filled)}
+    return Surface(mesh, cell, {"hull_cell": cell} | {key: float(fills[key]) for key in fills})
 
 
 @dataclass(frozen=True)
@@ -201,21 +203,20 @@ def _without_specks(field: np.ndarray) -> np.ndarray:
     return np.where(specks[pieces], -np.abs(field), field)
 
 
-def _checked_agreement(
-    frames: Sequence[Frame], views: Sequence[_View], mesh: Mesh, points: np.ndarray
-) -> np.ndarray:
-    """Share of each mask that the mesh fills. Raises InputError if too small. points: [N,3], of the
-    coarse grid; they tell which frame is wrong."""
+def _meshed(field: np.ndarray, lo: np.ndarray, cell: float) -> Mesh:
+    """Surface where a field on a grid from lo [3] is 0, without specks."""
+    from skimage.measure import marching_cubes
+
+    solid = np.pad(_without_specks(field), 1, constant_values=-cell)
+    vertices, faces, _, _ = marching_cubes(solid, 0.0, gradient_direction="ascent")
+    vertices = lo + cell * (vertices.astype(np.float64) - 1)
+    return Mesh(vertices, faces.astype(np.int64), np.ones(len(faces), bool))
+
+
+def _filled(views: Sequence[_View], mesh: Mesh) -> np.ndarray:
+    """Share of the mask of each view that the mesh fills; NaN for an empty mask."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
-    depth = mesh_depth(mesh)
-    filled = []
-    for view in views:
-        mask = view.distance > 0
-        filled.append((depth(view.camera)[mask] > 0).mean() if mask.any() else np.nan)
-    agreement = np.array(filled)
-    if not np.nanmedian(agreement) >= AGREEMENT:
-        filled_share = f"{np.nanmedian(agreement):.0%} of the median mask"
-        what = f"the masks carve away most of the object (the hull fills {filled_share})"
-        raise _Contradiction(what, frames, _odd_one(views, points))
-    return agreement
+    depth, masks = mesh_depth(mesh), [view.distance > 0 for view in views]
+    pairs = zip(views, masks, strict=True)
+    return np.array([(depth(v.camera)[m] > 0).mean() if m.any() else np.nan for v, m in pairs])
