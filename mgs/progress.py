@@ -34,10 +34,10 @@ def report(stage: str, done: int = 0, total: int = 0) -> None:
 
 
 @contextmanager
-def listening(progress: Progress) -> Iterator[None]:
-    """Context manager in which `report` calls `progress`."""
-    token = _listener.set(progress)
+def listening(progress: Progress | None) -> Iterator[Progress]:
+    """Context manager in which `report` calls `progress`, or as before for None; gives which."""
+    token = _listener.set(progress or _listener.get())
     try:
-        yield
+        yield _listener.get()
     finally:
         _listener.reset(token)

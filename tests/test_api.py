@@ -9,6 +9,7 @@ from refusals import fails, refused
 from synthetic import pinhole
 
 import mgs
+from mgs.progress import listening
 
 
 def test_public_names_are_present_and_documented():
@@ -49,7 +50,10 @@ def test_the_whole_way_from_python(dataset, prior, tmp_path, capsys):
     )
     assert capsys.readouterr() == ("", "")
     assert steps == [3, 4, 5]
-    mgs.start_run(dataset, tmp_path / "built", progress=lambda stage, *_: stages.add(stage))
+    assert {"fitting", "information of the training set"} <= stages
+    stages.clear()
+    with listening(lambda stage, *_: stages.add(stage)):
+        mgs.run_nbv(dataset, tmp_path / "built", seeds=3, budget=0, train={"passes": 1})
     assert {"fitting", "information of the training set", "surface samples"} <= stages
     assert mgs.read_ply(tmp_path / "run/gaussians.ply") == run.gaussians
     again = mgs.resume_nbv(tmp_path / "run")

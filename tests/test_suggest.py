@@ -20,6 +20,7 @@ from mgs.data import flight_plan
 from mgs.data.clouds import SparseCloud, write_cloud
 from mgs.data.meshes import distances_to_mesh
 from mgs.data.world import World, unit_up
+from mgs.progress import listening
 from mgs.reports.suggestion import write_suggestion
 from mgs.run.candidates import Site, hidden, inside, place_poses, read_poses, refusals
 from mgs.run.nbv import start_fit
@@ -67,8 +68,12 @@ def test_views_are_planned_together_and_flown_in_a_short_order(run, site):
     assert short.metres <= 0.8 * found.metres
 
 
-def test_refined_poses_gain_within_the_limits(run, site):
-    """Every limit binds for some view: band, distance from the mesh, length of the flight."""
+def test_refined_poses_gain_within_the_limits(run, site, tmp_path, monkeypatch):
+    """Every limit binds for some view: band, distance from the mesh, length of the flight. Walls
+    are looked for again at each pose that is tried, and progress does not say so."""
+    stages, cloud = [], tmp_path / "sparse.ply"
+    write_cloud(cloud, SparseCloud(np.random.default_rng(0).normal((0, 0, -40), size=(60, 3))))
+    monkeypatch.setattr("mgs.run.suggest.CLOUD", cloud)
     opened, ring = open_run(run), place_poses("ring", 12, 2.6, (25, 35), site)
     before, mesh = suggest(opened, ring, 3), opened.prior.mesh
 
@@ -78,7 +83,11 @@ def test_refined_poses_gain_within_the_limits(run, site):
 
     safe, most = apart(before.plan) - 0.02, 1.001 * before.metres
     limits = {"safe_distance": safe, "elevations": (29.0, 31.0), "flight": {"length": most}}
-    found = suggest(opened, ring, 3, refine=True, **limits)
+    with listening(lambda stage, *_: stages.append(stage)):
+        found = suggest(opened, ring, 3, refine=True, **limits)
+    walls = [k for k, stage in enumerate(stages) if stage == "looking for walls"]
+    assert len(walls) == 8
+    assert walls[-1] < stages.index("moving the poses")
     assert found.refined[1] > found.refined[0]
     assert apart(found.plan) >= safe
     assert found.metres <= most

@@ -19,7 +19,6 @@ from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
 from mgs.fit.settings import Frozen
 from mgs.policy.criteria import GAIN_UNIT
-from mgs.progress import listening
 from mgs.run.settings import FlightLimits, Positive, SearchLimits, validated
 
 if TYPE_CHECKING:
@@ -133,15 +132,15 @@ def suggest(
     if out is not None:
         check_new_folder(out, ours)
     runtime.start()
-    with TemporaryDirectory() as scratch, progress_bar("reading", console) as progress:
-        run = _run(source, Path(scratch) / "run", fit, progress)
+    with TemporaryDirectory() as scratch, progress_bar("reading", console):
+        run = _run(source, Path(scratch) / "run", fit)
         if plan and run.dataset.unit != "m":
             raise InputError(f"{source}: a flight plan needs metres; import the data with `unit`")
         candidates, safe, band = _candidates(run, poses, dome, asked)
         from mgs.run.suggest import suggest as suggested
 
         changes |= {"safe_distance": safe, "elevations": band, "refine": asked.refine}
-        result = suggested(run, candidates, count, progress=progress, **changes)
+        result = suggested(run, candidates, count, **changes)
         crossed = _crossed(run, result)
         if crossed and plan:
             cure = "so no flight plan is written; give flight.no_fly"
@@ -164,7 +163,7 @@ def _placed(photographs: Path, site: Path, console: Terminal) -> Path:
     from mgs.prior.photographs import check_enough
 
     check_enough(len(photographs_in(photographs)))  # more than can be placed: minutes earlier
-    with progress_bar("reading", console) as progress, listening(progress):
+    with progress_bar("reading", console):
         dataset, notes = dataset_at(photographs, site)
     for note in notes:
         console.print(note, soft_wrap=True)
@@ -180,7 +179,7 @@ def _place(source: Path) -> Any:
     return parse_origin(text) if isinstance(text, str) else None
 
 
-def _run(source: Path, scratch: Path, settings: dict[str, Any], progress: Any) -> Run:
+def _run(source: Path, scratch: Path, settings: dict[str, Any]) -> Run:
     """The run itself, or a new one in `scratch`, fitted to all images of a dataset."""
     from mgs.run.folder import holds_run, open_run
     from mgs.run.nbv import resume_nbv, start_run
@@ -191,10 +190,8 @@ def _run(source: Path, scratch: Path, settings: dict[str, Any], progress: Any) -
                 raise InputError(f"suggest: {source} is a run with its model; leave out `{name}`")
         return open_run(source)
     count = len(load_dataset(source))
-    run = start_run(
-        source, scratch, seeds=count, budget=0, progress=progress, **not_none(**settings)
-    )
-    return resume_nbv(run, progress=progress)
+    run = start_run(source, scratch, seeds=count, budget=0, **not_none(**settings))
+    return resume_nbv(run)
 
 
 def _candidates(

@@ -26,7 +26,7 @@ from mgs.policy.poses import seed_views
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.photographs import choose_source
 from mgs.prior.settings import PriorSettings
-from mgs.progress import Progress, listening, no_progress
+from mgs.progress import Progress, listening
 from mgs.run import recording
 from mgs.run.flight import check_seeds
 from mgs.run.folder import (
@@ -77,7 +77,7 @@ def run_nbv(
     out: str | Path,
     *,
     on_step: Callable[[Checkpoint], None] = lambda state: None,
-    progress: Progress = no_progress,
+    progress: Progress | None = None,
     **settings: Any,
 ) -> Run:
     """Choose views one by one, as the paper does; return the finished run. Does the same as `mgs
@@ -93,7 +93,7 @@ def nbv(
     *,
     out: str | Path,
     on_step: Callable[[Checkpoint], None] = lambda state: None,
-    progress: Progress = no_progress,
+    progress: Progress | None = None,
     **mission: Any,
 ) -> Run:
     """Choose views of a scene one by one, in a run folder `out`; return the finished run.
@@ -117,7 +117,7 @@ def start_run(
     loose: float = 1.0,
     parts: float = 1.0,
     force: bool = False,
-    progress: Progress = no_progress,
+    progress: Progress | None = None,
     **settings: Any,
 ) -> Run:
     """Check all inputs, find or build the prior, and write config.json of a new run folder `out`.
@@ -175,11 +175,11 @@ def start_run(
     rule = policy_of(policy)  # a user's policy fails here, before there is a folder
     check_settings(mission, len(dataset))
     inputs = [path for path in (root, folder) if path]
-    with atomic_folder(out, Ours(FILES, inputs) if holds_run(out) else None) as unfinished:
+    ours = Ours(FILES, inputs) if holds_run(out) else None
+    with atomic_folder(out, ours) as unfinished, listening(progress):
         how = PriorSettings(gaussians=gaussians, seed=mission.seed, parts=parts)
         shown = _seed_frames(dataset, mission) if source == "random" else None
-        with listening(progress):
-            surface = given or build_prior(dataset.survey(), how, source=source, shown=shown)
+        surface = given or build_prior(dataset.survey(), how, source=source, shown=shown)
         if folder is None:
             save_prior(unfinished / "prior", surface)
         _check_surface(surface, dataset, mission, where)
@@ -187,12 +187,11 @@ def start_run(
         if mission.flies or mission.flight.no_fly or mission.flight.clearance is not None:
             check_seeds(Scene(dataset, surface, mission), mission)
         if automatic:
-            mission = _automatic(Scene(dataset, surface, mission), mission, rule, progress)
+            mission = _automatic(Scene(dataset, surface, mission), mission, rule)
         if live is not None:
             begin(unfinished / DATASET, dataset, surface)
         if refine:
-            with listening(progress):
-                frames = refine_poses(Scene(dataset, surface, mission), mission.pose_noise)
+            frames = refine_poses(Scene(dataset, surface, mission), mission.pose_noise)
             write_refined(unfinished / DATASET, dataset, frames)
         start(unfinished, mission, dataset)
         if not isinstance(policy, str):
@@ -217,7 +216,7 @@ def start_fit(
     *,
     prior: str | Path | None = None,
     gaussians: int | Literal["auto"] | None = None,
-    progress: Progress = no_progress,
+    progress: Progress | None = None,
     **settings: Any,
 ) -> Run:
     """`start_run` of a run that takes all images at once and chooses none.
@@ -295,19 +294,16 @@ def _settings(dataset: Dataset, policy: Any, values: dict[str, Any]) -> NbvSetti
     return settings.model_copy(update=resolved)
 
 
-def _automatic(
-    scene: Scene, settings: NbvSettings, policy: Policy, progress: Progress
-) -> NbvSettings:
+def _automatic(scene: Scene, settings: NbvSettings, policy: Policy) -> NbvSettings:
     """The settings with the budget of `enough_views`, by the Gaussians before training."""
-    with listening(progress):
-        seeds, frames = first_views(scene, settings)
-        shown = tuple(frames[i] for i in seeds)
-        model = scene.start(shown)
-        H = information(scene, model, shown)
-        state = State(frames, tuple(seeds), len(seeds), model, H, H)
-        state = replace(state, surface=surface_information(scene, state, seeds))
-        budget = enough_views(scene, state, policy, settings)
-        return settings.model_copy(update={"budget": budget, "enough": settings.enough or ENOUGH})
+    seeds, frames = first_views(scene, settings)
+    shown = tuple(frames[i] for i in seeds)
+    model = scene.start(shown)
+    H = information(scene, model, shown)
+    state = State(frames, tuple(seeds), len(seeds), model, H, H)
+    state = replace(state, surface=surface_information(scene, state, seeds))
+    budget = enough_views(scene, state, policy, settings)
+    return settings.model_copy(update={"budget": budget, "enough": settings.enough or ENOUGH})
 
 
 def _check_surface(prior: Prior, dataset: Dataset, settings: NbvSettings, where: Path) -> None:
@@ -329,7 +325,7 @@ def _check_surface(prior: Prior, dataset: Dataset, settings: NbvSettings, where:
 def resume_nbv(
     run: str | Path | Run,
     on_step: Callable[[Checkpoint], None] = lambda state: None,
-    progress: Progress = no_progress,
+    progress: Progress | None = None,
     policy: str | Callable[..., Any] | None = None,
     live: Live | Transport | None = None,
     on_pass: OnPass = lambda done, most, model: None,
@@ -338,7 +334,8 @@ def resume_nbv(
     """Continue a run from its last finished step to its end; return it, with its state.
 
     - on_step: called as on_step(state) after every finished step, or batch of steps, on disk.
-    - progress: called as progress(stage, done, total) during a step.
+    - progress: called as progress(stage, done, total) during a step; by default what listens
+      already, as `mgs.progress_bar` does.
     - policy: FILE.py:FUNCTION, or the Python function, if the policy is your own. Code is never
       taken from the folder. A Run that was started in this process knows its policy.
     - live: as in `start_run`; give it again if pictures are still to be captured. If no pose was

@@ -17,7 +17,7 @@ from mgs.fit.stopping import DivergedError
 from mgs.gaussians import Gaussians
 from mgs.learning import captured
 from mgs.policy import criteria
-from mgs.progress import Progress, Stage, listening, no_progress, report
+from mgs.progress import Progress, Stage, listening, report
 from mgs.run import inputs
 from mgs.run.checks import Checks
 from mgs.run.ending import RunEnd, diverged, run_end
@@ -43,7 +43,7 @@ def run(
     policy: Policy | None = None,
     *,
     on_step: Callable[[Checkpoint], None] = lambda state: None,
-    progress: Progress = no_progress,
+    progress: Progress | None = None,
     retry: bool = False,
     measure: Measure | None = None,
     checked: bool = True,
@@ -61,7 +61,7 @@ def run(
     pose or a file of a frame taken has changed; where a frame it takes cannot be read or has an
     empty mask; and where a fit diverged. The steps before are kept."""
     check_settings(settings, len(scene.dataset))
-    with working_in(out), listening(stopwatch := Stopwatch(progress)):
+    with working_in(out), listening(progress) as outer, listening(stopwatch := Stopwatch(outer)):
         checkpoint = read_checkpoint(out)
         if checkpoint is not None:
             digest = inputs.prior_digest(scene.prior)

@@ -100,7 +100,7 @@ def suggest(
     safe_distance: float = 0.0,
     elevations: tuple[float, float] | None = None,
     refine: bool = False,
-    progress: Progress = no_progress,
+    progress: Progress | None = None,
     **settings: Any,
 ) -> Suggestion:
     """Rank poses by what a picture from each would add to the model of a run, and plan `views`.
@@ -153,7 +153,11 @@ def suggest(
         worth, gains = certificate(scene, state, rule, mission, way[1:-1], order), None
         if refine:
             limits = taken, site, safe_distance, elevations
-            flies = lambda camera: refusals([("", camera)], *limits) == [""]  # noqa: E731
+
+            def flies(camera: Camera) -> bool:
+                with listening(no_progress):  # of the walls, for each pose that is tried
+                    return refusals([("", camera)], *limits) == [""]
+
             report("moving the poses", 0, 1)
             state, gains = refined(scene, state, mission, way, scene.derivatives, flies)
             weights, planned = _weights(scene, state, len(taken)), state
