@@ -197,9 +197,9 @@ def rows_of(work: Work) -> Iterator[Row]:
                 yield {"run": rock.name, **row, "front": bool(best)}
 
 
-def share(rows: Sequence[Row], run: str, one: str, other: str) -> float:
+def share(rows: Sequence[Row], run: str, one: str, other: str, below: float | None = None) -> float:
     """Bytes of a coder over those of another at equal PSNR: geometric mean over the values that
-    both reach; NaN if there is none."""
+    both reach, or at this many dB below the best of them; NaN if there is none."""
     fronts = [
         [r for r in rows if r["run"] == run and r["coder"] == coder and r["front"]]
         for coder in (one, other)
@@ -210,7 +210,9 @@ def share(rows: Sequence[Row], run: str, one: str, other: str) -> float:
     low, high = max(a for a, _ in ends), min(b for _, b in ends)
     if low > high:
         return float("nan")
-    at = np.linspace(low, high, COMMON)
+    at = np.linspace(low, high, COMMON) if below is None else np.array([high - below])
+    if at[0] < low:
+        return float("nan")
     logs = [np.interp(at, [r["psnr"] for r in f], np.log([r["kB"] for r in f])) for f in fronts]
     return float(np.exp(np.mean(logs[0] - logs[1])))
 
@@ -225,19 +227,25 @@ PAIRS = {
 """Coders compared, by the heading of their column."""
 
 
+LEVELS = {None: "mean", 0: "at the best PSNR", 2: "2 dB below it"}
+
+
 def tables(rows: Sequence[Row]) -> str:
-    """Table of `share` of PAIRS on each rock, and of the means with 95 % intervals."""
+    """Table of `share` of PAIRS on each rock, and of the means of LEVELS with 95 % intervals."""
     runs = list(dict.fromkeys(row["run"] for row in rows))
     values = {name: [share(rows, run, *pair) for run in runs] for name, pair in PAIRS.items()}
     lines: list[Row] = []
     for k, run in enumerate(runs):
         found = {name: of[k] for name, of in values.items()}
         lines.append({"rock": run} | {n: f"{v:.3f}" for n, v in found.items() if not np.isnan(v)})
-    mean: Row = {"rock": "mean"}
-    for name, of in values.items():
-        if (ends := interval(of)) and not np.isnan(of).any():
-            mean[name] = f"{np.mean(of):.3f} [{ends[0]:.3f}, {ends[1]:.3f}]"
-    return table({name: name for name in ("rock", *PAIRS)}, [*lines, mean])
+    for below, label in LEVELS.items():
+        mean: Row = {"rock": label}
+        for name, pair in PAIRS.items():
+            of = [share(rows, run, *pair, below) for run in runs]
+            if (ends := interval(of)) and not np.isnan(of).any():
+                mean[name] = f"{np.mean(of):.3f} [{ends[0]:.3f}, {ends[1]:.3f}]"
+        lines.append(mean)
+    return table({name: name for name in ("rock", *PAIRS)}, lines)
 
 
 def write(work: Work) -> list[Path]:
