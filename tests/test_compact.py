@@ -25,6 +25,7 @@ from mgs.data.frames import Frame
 from mgs.data.world import PLUS_Z
 from mgs.errors import InputError, Notice
 from mgs.evaluation import render_view
+from mgs.reports import compacting
 from mgs.rotation import rotmat_from_quat
 from mgs.splat_files import load_gaussians, upward
 from mgs.splat_places import from_source
@@ -305,8 +306,7 @@ def test_damaged_files_are_refused_or_read(tmp_path):
 
 def test_the_command_writes_what_fits_and_programs_read_it(dataset, prior, tmp_path, capsys):
     run = tmp_path / "run"
-    settings = {"prior": prior, "seeds": 4, "budget": 0, "train": {"passes": 5}}
-    mgs.run_nbv(dataset, run, **settings)
+    small_run(dataset, prior, run)
     capsys.readouterr()
     printed = output(capsys, "export", run, "--bytes", "2k")
     alone = run / "export.mgs"
@@ -360,6 +360,55 @@ def test_the_command_writes_what_fits_and_programs_read_it(dataset, prior, tmp_p
     prior.rename(tmp_path / "gone")
     command("export", run, "--bytes", "2k", "--force")
     assert 1200 < alone.stat().st_size <= 2000
+
+
+def small_run(dataset, prior, out, **train):
+    settings = {"prior": prior, "seeds": 4, "budget": 0, "train": {"passes": 5, **train}}
+    return mgs.run_nbv(dataset, out, **settings)
+
+
+def test_a_small_file_is_better_with_fewer_gaussians_fitted_once_more(dataset, prior, tmp_path):
+    run = small_run(dataset, prior, tmp_path / "run")
+    made = compacting.compact_run(run, 600)
+    pruned = compacting._fitted(next(compacting.encoders(run, shared=False)), 600, None)
+    prior.rename(tmp_path / "gone")
+    unfitted = compacting.compact_run(open_run(run.folder), 600)
+    assert max(len(made.data), len(pruned), len(unfitted.data)) <= 600
+    assert made.count < len(pruned.model)
+    assert made.psnr[1] > compacting._measure(run)(pruned.model) + 1
+    assert made.psnr[1] > unfitted.psnr[1] + 0.2
+
+
+def test_thinning_goes_on_from_fitted_gaussians_only_if_half_are_gone(
+    dataset, prior, tmp_path, monkeypatch
+):
+    """A fit is replaced by a doubling of quaternions, which shows how many came before."""
+    fits = list[tuple[int, int]]()
+
+    def again(g):
+        norm = np.linalg.norm(g.quats, axis=1)
+        fits.append((len(g), round(float(np.median(np.log2(norm))))))
+        return replace(g, quats=2 * g.quats)
+
+    run = small_run(dataset, prior, tmp_path / "run")
+    monkeypatch.setattr(compacting, "refitting", lambda run: again)
+    best = compacting._measure(run)(run.gaussians)
+    compacting.thin_run(run, "compressed-ply", psnr=best - 1)
+    assert len(fits) > 3
+    assert {before for _, before in fits} == {0}
+    fits.clear()
+    compacting.thin_run(run, "compressed-ply", psnr=best - 15)
+    assert [before for _, before in fits[:3]] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("space", ["srgb", "linear"])
+def test_a_size_below_one_gaussian_is_refused_before_any_fit(
+    dataset, prior, tmp_path, monkeypatch, space
+):
+    run = small_run(dataset, prior, tmp_path / "run", space=space)
+    fitted = lambda *_, **__: pytest.fail("fitted")  # noqa: E731
+    monkeypatch.setattr("mgs.fit.fitting.fit_gaussians", fitted)
+    fails("one Gaussian takes .* ask for more", compacting.thin_run, run, "spz", size=20)
 
 
 def test_the_start_hides_the_last_bits(prior):

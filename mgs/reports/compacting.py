@@ -136,17 +136,19 @@ def thin_run(
 
     with TemporaryDirectory() as folder:
         path, rest = Path(folder) / f"x{FORMATS[kind]}", in_srgb(run.gaussians[run.shown])
+        header = len(written(rest[:1]))  # with one Gaussian
+        few = f"one Gaussian takes {header:,} bytes; ask for more bytes"
+        if size is not None and size < header:
+            raise InputError(f"{run.folder} as {kind}: {few}")
         data, before = written(rest), measured(run.gaussians)
         if run.gaussians.linear:  # its colours change as they are blended in another space
             data = fitted(len(rest))[1]
         _check_reachable(f"{run.folder} as {kind}", psnr, quality())
         after, least = quality(), 0
-        header = len(written(rest[:1])) if size is not None else 0  # with one Gaussian
         while size is not None and len(data) > size:
-            if (room := size - header) < 0 or len(rest) == 1:
-                few = f"one Gaussian takes {header:,} bytes"
-                raise InputError(f"{run.folder} as {kind}: {few}; ask for more bytes")
-            count = 1 + (len(rest) - 1) * room // (len(data) - header)
+            if len(rest) == 1:
+                raise InputError(f"{run.folder} as {kind}: {few}")
+            count = 1 + (len(rest) - 1) * (size - header) // (len(data) - header)
             (rest, data), after = fitted(max(count, len(rest) // 2)), quality()
         while psnr is not None and len(rest) - least > max(1, len(rest) // CLOSE):
             some, smaller = fitted((least + len(rest)) // 2)
