@@ -1,6 +1,6 @@
 """The exception for bad input: what the user can cause and can correct."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TypeVar
 
 Row = TypeVar("Row")
@@ -51,12 +51,6 @@ def from_interrupt(error: BaseException | None) -> bool:
 
 class Notice(UserWarning):
     """Something that a user should know and that ends nothing. Commands print it as one line."""
-
-
-def listed(names: Sequence[str], most: int = 3) -> str:
-    """Text of the first names and the number of the others."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
 
 
 def row_named(table: Mapping[str, Row], name: str, what: str) -> Row:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import synthetic
 import tiny
-from scipy.ndimage import binary_dilation, gaussian_filter
+from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from mgs import as_drjit, run_nbv
@@ -48,7 +48,6 @@ BAD = {
     "exposure": ({"views": (GOOD, GOOD, GOOD, DIM)}, "by 50 % of"),
     "pose": ({"views": one_bad(offset=0.3)}, "10.0 times farther apart"),
     "outlier": ({"views": (GOOD, GOOD, GOOD, replace(GOOD, srgb_error=0.1))}, "10.0 times"),
-    "blur": ({"views": one_bad(blur=3.5)}, "up to 3.5 pixels wide (limit 3)"),
     "means": ({"drift": 5.0}, "5.0 standard deviations"),
     "coverage": ({"coverage": 0.2}, "only 20 %"),
     "saturated": ({"gains": (0.5, 0.3, 0.01)}, "gained 2 %"),
@@ -120,22 +119,6 @@ def test_views_of_few_pixels_may_fit_worse_and_one_wrong_view_among_them_is_foun
         found = indicators([*views[:k], wrong, *views[k + 1 :]])
         assert found["outlier"] == pytest.approx(3)
         assert found["exposure"] == pytest.approx(1)
-
-
-@pytest.mark.parametrize(("radius", "inner"), [(25, 0.7), (25, 0.25), (2, 0.7), (0, 0)])
-def test_an_outline_is_as_wide_as_the_blur_of_the_picture(radius, inner):
-    """A disc before a ground; none, a small one or one as bright as the ground tell nothing."""
-    y, x = np.mgrid[:80, :90] - 42.3
-    far = np.hypot(x, y)
-    mask, dim = far < radius, 0.25 + 0 * far
-    sharp = np.where(mask, inner, dim)[..., None] * np.ones(3)
-    width = {s: detectors.edge_width(gaussian_filter(sharp, (s, s, 0)), mask) for s in (0, 1.5, 3)}
-    if radius < 25 or inner == 0.25:
-        assert set(width.values()) == {0}
-    else:
-        assert 1 <= width[0] < 2
-        assert width[1.5] == pytest.approx(2.5 * 1.5, rel=0.1)
-        assert width[3] > width[1.5] * 1.3
 
 
 def test_a_prior_need_not_be_better_than_a_pixel_of_the_farthest_views():
@@ -284,13 +267,7 @@ def wide_masks(frames):
         write_png(frame.mask_path, binary_dilation(frame.mask(), iterations=6))
 
 
-def blurred_picture(frames):
-    """Blur one image by 1.5 pixels."""
-    write_png(frames[2].image_path, gaussian_filter(frames[2].rgb(), (1.5, 1.5, 0)))
-
-
 SPOILED = {
-    blurred_picture: "blurred: kf_0002; ",
     wrong_pose: "prior and mask are",
     drifting_exposure: "exposure drifts",
     wide_masks: "the prior's outline and the masks disagree",

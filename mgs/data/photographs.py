@@ -17,7 +17,7 @@ from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, frame_name, natural
 from mgs.data.structure import Matcher
 from mgs.data.tracks import Spacing
 from mgs.data.world import PLUS_Z
-from mgs.errors import InputError, listed
+from mgs.errors import InputError
 from mgs.files import read_json, write_json
 from mgs.images import exif_orientation, read_rgba, write_png
 from mgs.progress import report
@@ -188,7 +188,8 @@ def _by_reason(why: dict[str, str]) -> list[str]:
     lines = []
     for reason in dict.fromkeys(why.values()):
         names = [name for name, own in why.items() if own == reason]
-        lines.append(f"{listed(names, NAMED)}, {reason}")
+        more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+        lines.append(f"{', '.join(names[:NAMED])}{more}, {reason}")
     return lines
 
 

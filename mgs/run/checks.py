@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -117,9 +117,7 @@ class Checks:
         if state.choices:  # few passes, whose loss falls with the rates: good runs by up to 25 %
             indicators.pop("unconverged", None)
         before = [step["indicators"] for step in steps[:-1] if "indicators" in step]
-        most, pairs = detectors.DETECTORS["blur"].limit, zip(state.taken, views, strict=True)
-        blurred = [state.frames[i].name for i, view in pairs if view.before.blur > most]
-        alarms = detectors.alarms(indicators, before[-1] if before else None, blurred)
+        alarms = detectors.alarms(indicators, before[-1] if before else None)
         return {"indicators": indicators} | ({"warnings": alarms} if alarms else {})
 
     def _before_fit(self, state: State, frame: Frame) -> tuple[np.ndarray, detectors.Before]:
@@ -127,8 +125,7 @@ class Checks:
         start = self.scene.untrained(state)
         mask, margin = frame.mask(), detectors.outline_margin(start, frame.camera)
         alpha = self.scene.render(start, frame.camera)[1]
-        blur = 0.0 if mask.all() else detectors.edge_width(frame.rgb(), mask)
-        return np.packbits(mask), replace(detectors.before_fit(mask, alpha, margin), blur=blur)
+        return np.packbits(mask), detectors.before_fit(mask, alpha, margin)
 
 
 def predicted_psnr(entries: Sequence[Mapping[str, float]]) -> float | None:

@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter, map_coordinates
+from scipy.ndimage import binary_dilation, binary_erosion
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
-from mgs.errors import listed
 from mgs.gaussians import Gaussians
 
 DARK = 1e-3  # linear RGB, added to brightnesses before their ratio is taken
@@ -19,9 +18,6 @@ LEAST_SPREAD = 0.1  # added to their range: a fit without residual has no exposu
 NEIGHBOURS = 3  # number of nearest views with which a view's error is compared
 CLOSER = 2.0  # ratio of pixels from which on views count as taken from different distances
 OFFSET = 0.03  # largest of a view that is right, unless the farthest views have larger pixels
-REACH = 5  # pixels on both sides of an outline that tell how sharp it is; chosen
-CONTRAST = 0.1  # least difference of sRGB values between its sides; chosen
-EDGES = 20  # fewest pixels of an outline with such a contrast; chosen
 COVERING_VIEWS = 4  # fewest views of which a good coverage can be expected
 MANY_VIEWS = 8  # views that a good run must fit even if more are to come; chosen
 
@@ -32,11 +28,10 @@ class Before:
 
     outline: share of the pixels covered by mask or Gaussians where the two disagree, without the
     rim (`outline_margin`). offset: distance of the centres of the two areas, over the square root
-    of the mask's area. blur: `edge_width` of the image."""
+    of the mask's area."""
 
     outline: float
     offset: float
-    blur: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -66,28 +61,6 @@ def before_fit(mask: np.ndarray, alpha: np.ndarray, margin: int) -> Before:
     inside = binary_erosion(mask, iterations=margin, border_value=1)
     wrong = int(((body & outside) | (inside & ~body)).sum())
     return Before(wrong / max(either, 1), _distance(mask, body))
-
-
-def edge_width(rgb: np.ndarray, mask: np.ndarray) -> float:
-    """Width of the object's outline in an image, pixels; 0 where too little of it has a contrast.
-
-    It is the contrast between both sides over the steepest step of a pixel, median over the
-    outline: 1 to 2.4 where the image is sharp, 2.5 s with a blur of standard deviation s from 1 on.
-    rgb: [H,W,3] linear. mask: bool [H,W], right to 2 pixels."""
-    rim = np.argwhere(mask & ~binary_erosion(mask, border_value=1))
-    # Profiles across the outline [E,2 REACH+1]: normals point inwards, and the rim is inside.
-    slopes = (gaussian_filter(mask.astype(float), 2, order=axis) for axis in ((1, 0), (0, 1)))
-    normals = np.stack([slope[tuple(rim.T)] for slope in slopes], 1)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
-    points = rim[..., None] + normals[..., None] * (np.arange(-REACH, REACH + 1) - 0.5)
-    inside = (points >= 0) & (points <= np.array(mask.shape)[:, None] - 1)
-    points = points[inside.all(axis=(1, 2))]
-    grey = srgb_from_linear(np.clip(rgb, 0, 1)).mean(axis=2)
-    profiles = map_coordinates(grey, points.transpose(1, 0, 2), order=1)
-    contrast = np.abs(profiles[:, -3:].mean(axis=1) - profiles[:, :3].mean(axis=1))
-    steps = np.abs(np.diff(profiles[:, 2:-2], axis=1)).max(axis=1).clip(1e-3)
-    clear = contrast > CONTRAST
-    return float(np.median(contrast[clear] / steps[clear])) if clear.sum() > EDGES else 0.0
 
 
 def _distance(one: np.ndarray, other: np.ndarray) -> float:
@@ -195,7 +168,6 @@ def step_indicators(
             if len(views) >= COVERING_VIEWS:
                 indicators["coverage"] = 1 - coverage
         indicators["prior"] = float(np.median([view.before.outline for view in views]))
-        indicators["blur"] = max(view.before.blur for view in views)
         # The second fewest pixels, because the fewest may be those of a wrong mask.
         pixel = float(np.sort(pixels)[:2][-1]) ** -0.5
         indicators["pose"] = max(view.before.offset for view in views) / max(OFFSET, pixel)
@@ -221,13 +193,12 @@ class Detector:
     limit: float
     words: str
 
-    def said(self, value: float, pictures: Sequence[str] = ()) -> str:
+    def said(self, value: float) -> str:
         """The warning for a value; share, rest: it and the rest to 1 in per cent; most, least: the
-        same of the limit. pictures: names that the warning gives."""
+        same of the limit."""
         percent = {"share": value, "rest": 1 - value, "most": self.limit, "least": 1 - self.limit}
         numbers = {name: 100 * number for name, number in percent.items()}
-        names = listed(pictures)
-        return self.words.format(value=value, limit=self.limit, pictures=names, **numbers)
+        return self.words.format(value=value, limit=self.limit, **numbers)
 
 
 DETECTORS: dict[str, Detector] = {
@@ -267,11 +238,6 @@ DETECTORS: dict[str, Detector] = {
         "one view fits badly: its error after the fit is {value:.1f} times that of the views "
         "around it (limit {limit:.2f}); check its pose, mask and image",
     ),
-    "blur": Detector(
-        3.0,  # training rocks: up to 2.4
-        "blurred: {pictures}; outlines are up to {value:.1f} pixels wide (limit {limit:.0f}); take "
-        "these pictures again or leave them out, or make all images smaller",
-    ),
     "means": Detector(
         4.0,  # means that were free on 2 and 4 views moved by 1.3 and 1.7, and did no harm
         "the means have left the prior's surface: they moved by {value:.1f} standard deviations of "
@@ -291,17 +257,11 @@ DETECTORS: dict[str, Detector] = {
 """Detector of each indicator, by its name."""
 
 
-def alarms(
-    indicators: Mapping[str, float],
-    before: Mapping[str, float] | None = None,
-    pictures: Sequence[str] = (),
-) -> list[str]:
-    """Warnings of a step: for each number that exceeds its limit and did not in the step before.
-
-    pictures: names of the blurred ones."""
+def alarms(indicators: Mapping[str, float], before: Mapping[str, float] | None = None) -> list[str]:
+    """Warnings of a step: for each number that exceeds its limit and did not in the step before."""
     before = before or {}
     return [
-        row.said(indicators[name], pictures)
+        row.said(indicators[name])
         for name, row in DETECTORS.items()
         if indicators.get(name, -np.inf) > row.limit >= before.get(name, -np.inf)
     ]
