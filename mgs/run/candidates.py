@@ -271,7 +271,8 @@ def refusals(
     reasons = {
         "inside the object": within,
         f"nearer to it than {safe_distance:.3g}": near,
-        "behind what the images show": back | hidden(eyes, taken, walls),
+        "behind a surface that faces one way": back,
+        "behind what the images show": hidden(eyes, taken, walls),
         f"not between {low:g} and {high:g} degrees": beyond,
         "taken already": _are_taken(poses, taken, far),
         "the same as one before": [keys.index(key) < k for k, key in enumerate(keys)],
