@@ -248,7 +248,7 @@ def test_photographs_alone_are_one_command_to_the_next_picture(
     root.mkdir()
     for frame in frames[:7]:
         shutil.copy(frame.image_path, root)
-    assert "7 photographs" in refused(capsys, ["suggest", root, *few], site)
+    assert f"{root}: 7 photographs" in refused(capsys, ["suggest", root, *few], site)
     shutil.copy(frames[7].image_path, root)
     extract = pycolmap.extract_features
 

@@ -162,7 +162,8 @@ def _placed(photographs: Path, site: Path, console: Terminal) -> Path:
     from mgs.data.photographs import photographs_in
     from mgs.prior.photographs import check_enough
 
-    check_enough(len(photographs_in(photographs)))  # more than can be placed: minutes earlier
+    # Refuses minutes before pictures are placed.
+    check_enough(len(photographs_in(photographs)), str(photographs))
     with progress_bar("reading", console):
         dataset, notes = dataset_at(photographs, site)
     for note in notes:

@@ -62,11 +62,11 @@ def choose_source(dataset: Dataset, source: str | None = None, points: Path | No
     raise InputError(f"{dataset.root}: has {lack}; {', or '.join(cures)}")
 
 
-def check_enough(photographs: int) -> None:
-    """Raise InputError for under LEAST_PHOTOGRAPHS."""
+def check_enough(photographs: int, where: str = "prior") -> None:
+    """Raise InputError for under LEAST_PHOTOGRAPHS. where: their folder or use, for the message."""
     if photographs < LEAST_PHOTOGRAPHS:
         raise InputError(
-            f"prior: {photographs} photographs without depth are too few; "
+            f"{where}: {photographs} photographs without depth are too few; "
             f"take at least {LEAST_PHOTOGRAPHS}, from all sides"
         )
 
