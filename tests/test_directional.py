@@ -54,17 +54,21 @@ seeds, degrees = st.integers(0, 10_000), st.integers(0, 3)
 taus = st.sampled_from([0.03, 0.1, 0.3, 1.0])
 
 
+def squares(points, views, degree):
+    """[V,N,K,K] W y y^T, one view and one Gaussian at a time."""
+    size = (degree + 1) ** 2
+    made = np.zeros((*views.seen.shape, size, size))
+    for v, j in np.ndindex(views.seen.shape):
+        direction = points[j] - views.positions[v]
+        y = reference.sh_basis((direction / np.linalg.norm(direction))[None], degree)[0]
+        made[v, j] = views.seen[v, j] * np.outer(y, y)
+    return made
+
+
 def posterior(points, views, degree, tau):
-    """[N,K,K] the inverse of Lambda + sum W y y^T, one view and one Gaussian at a time."""
-    found = []
-    for j, point in enumerate(points):
-        total = np.diag(directional.precision(degree, tau, LAM))
-        for position, seen in zip(views.positions, views.seen, strict=True):
-            direction = (point - position) / np.linalg.norm(point - position)
-            y = reference.sh_basis(direction[None], degree)[0]
-            total = total + seen[j] * np.outer(y, y)
-        found.append(np.linalg.inv(total))
-    return np.array(found)
+    """[N,K,K] the inverse of Lambda + sum W y y^T."""
+    prior = np.diag(directional.precision(degree, tau, LAM))
+    return np.linalg.inv(prior + squares(points, views, degree).sum(0))
 
 
 @given(seeds, degrees, taus)

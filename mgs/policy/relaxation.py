@@ -9,10 +9,11 @@ views taken before. `Coverage` counts Gaussians instead. `mgs.policy.certificate
 all sets of k candidates."""
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,13 +46,26 @@ class Bound(NamedTuple):
     stopped: str = "steps"
 
 
-class Bounded:
-    """A concave criterion: `steps(x, box)` yields its value at weights in the box of 0 and 1 whose
-    size is sum x, and a bound by tangents there. coarse: the same for fewer Gaussians, or itself.
-    pairs: of a candidate and a Gaussian, by which the time of a bound grows."""
+class Bounded(ABC):
+    """A concave criterion."""
+
+    @property
+    @abstractmethod
+    def pairs(self) -> int:
+        """Pairs of a candidate and a Gaussian, by which the time of a bound grows."""
+
+    @property
+    @abstractmethod
+    def coarse(self) -> "Bounded":
+        """The same for fewer Gaussians, or itself."""
+
+    @abstractmethod
+    def steps(self, x: Floats, box: tuple[Floats, Floats]) -> Iterator[tuple[float, Bound]]:
+        """Yield the value at weights in the box of 0 and 1 whose size is sum x, and a bound by
+        tangents there."""
 
     def bound(
-        self: Any,
+        self,
         x: Floats,
         box: tuple[Floats, Floats],
         tolerance: float,
