@@ -246,9 +246,9 @@ def _decompress_sh(path: Path, ply: PlyData, n: int) -> dict[str, np.ndarray]:
 
 def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
     """Write Gaussians (NumPy fields) as a compressed PLY (`_decompress`); the file appears
-    complete. Gaussians are sorted such that those of a chunk are neighbours, which keeps the steps
-    of their positions small. Raises InputError as `mgs.files.atomic_path`."""
-    g = gaussians[cKDTree(gaussians.means, leafsize=CHUNK).indices]
+    complete. Gaussians are sorted such that neighbours follow each other, which keeps the steps
+    of positions of a chunk small. Raises InputError as `mgs.files.atomic_path`."""
+    g = gaussians[cKDTree(gaussians.means, leafsize=2).indices]
     n, rest = len(g), 3 * (g.sh.shape[1] - 1)
     starts = np.arange(0, n, CHUNK)
     chunks, shares = dict[str, tuple[np.ndarray, str]](), []
@@ -275,7 +275,8 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
     elements = {"chunk": chunks, "vertex": packed}
     if rest:
         higher = np.transpose(g.sh[:, 1:], (0, 2, 1)).reshape(n, rest)
-        # 0 lies between two steps. Taking the upper one everywhere would tint the whole model.
+        # 0 lies between two steps. Taking the upper one everywhere would tint the whole model;
+        # neighbours take opposite ones.
         steps = (higher / 8 + 0.5) * 256
         odd = (np.arange(n)[:, None] & 1) != (np.arange(rest) & 1)
         steps -= (steps == np.floor(steps)) & odd

@@ -63,7 +63,7 @@ export async function playcanvas(file, width, height, projection, poses) {
   app.start();
   // As 3DGS: antialiased, none too small, widened by 0.3 square pixels instead of 0.3 / 4, without
   // the lowered tail of each Gaussian, and to where alpha is 1/255 instead of 2.8 standard deviations.
-  Object.assign(app.scene.gsplat, { antiAlias: true, minPixelSize: 0 });
+  Object.assign(app.scene.gsplat, { antiAlias: true, minPixelSize: 0, dataFormat: pc.GSPLATDATA_LARGE });
   const chunks = pc.ShaderChunks.get(app.graphicsDevice, pc.SHADERLANGUAGE_GLSL);
   for (const [name, old, constant] of [
     ['gsplatCornerVS', '0.3', '1.2'],
