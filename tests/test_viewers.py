@@ -32,8 +32,12 @@ pytestmark = pytest.mark.slow
 # PlayCanvas takes what a compressed PLY lacks below degree 3 as -0.016.
 PADDED = "padded.compressed.ply"
 HOST, NEAR, FAR = "http://localhost/", 0.01, 100.0
-# Most dB that colours of 8 bits, rounded at each blend, cost in the demo's twelve test views.
-ROUNDING = 0.15
+# Least agreement, and most that PSNR is off, dB: on a canvas of 8 bits, rounded at each blend; and
+# in half floats. Those of RUN are of the demo (docs/howto/look.md).
+LIMITS = OF_PADDED = (45, 0.1), (50, 0.1)
+AS_IT_COMES = (45, 0.1), (45, 0.1)
+if "RUN" in os.environ:
+    LIMITS, OF_PADDED = ((45, 0.2), (55, 0.1)), ((45, 0.25), (55, 0.12))
 
 PAGE = """<script type="importmap">{"imports": {
     "three": "/three/build/three.module.js",
@@ -42,7 +46,8 @@ PAGE = """<script type="importmap">{"imports": {
     "playcanvas": "/playcanvas/build/playcanvas.mjs"
 }}</script><body></body>"""
 
-READ = [("spark", kind) for kind in ("ply", "compressed-ply", "spz")]
+READ = [("sparkAsItComes", "ply")]
+READ += [("spark", kind) for kind in ("ply", "compressed-ply", "spz")]
 READ += [("playcanvas", kind) for kind in ("ply", "compressed-ply", "glb")]
 """Formats that each viewer reads."""
 
@@ -95,11 +100,13 @@ def floats(picture: str, camera) -> np.ndarray:
 
 @pytest.mark.parametrize(("viewer", "kind"), READ)
 def test_a_viewer_shows_what_was_measured(browser, packages, run, viewer, kind):
+    if viewer == "sparkAsItComes" and "RUN" in os.environ:
+        pytest.skip("single views of the demo are off by up to 0.3 dB in Spark as it comes")
     run, root = run
     frames, file = run.dataset.test_views().frames, root / f"export{FORMATS[kind]}"
-    camera = frames[0].camera
+    camera, limits = frames[0].camera, AS_IT_COMES if viewer == "sparkAsItComes" else LIMITS
     if (viewer, kind) == ("playcanvas", "compressed-ply"):
-        file = root / PADDED
+        file, limits = root / PADDED, OF_PADDED
     turn = np.eye(4)  # from the run's world to that of the file
     if kind == "glb":
         turn[:3, :3] = to_y_up(run.dataset.world.up)
@@ -127,11 +134,11 @@ def test_a_viewer_shows_what_was_measured(browser, packages, run, viewer, kind):
     for frame, row in zip(frames, measured, strict=True):
         drawn = srgb_from_linear(render_view(gaussians, frame.camera)[0])
         truth = srgb_from_linear(frame.target()[0][..., :3])
-        for most in (0.1 + ROUNDING, 0.1):  # on the canvas of 8 bits; in half floats
+        for least, most in limits:
             shown = floats(next(pictures), frame.camera)
             lost = row["psnr"] - psnr(shown, truth)
             print(viewer, kind, f"{psnr(shown, drawn):.1f} {lost:.3f} of {most}")
-            assert psnr(shown, drawn) >= 45
+            assert psnr(shown, drawn) >= least
             assert abs(lost) <= most
 
 

@@ -17,7 +17,9 @@ async function settled(picture, show) {
   return last;
 }
 
-export async function spark(file, width, height, projection, poses) {
+export const sparkAsItComes = (...asked) => spark(...asked, false);
+
+export async function spark(file, width, height, projection, poses, as3dgs = true) {
   const THREE = await import('three');
   const { SparkRenderer, SplatMesh } = await import('@sparkjsdev/spark');
   const renderer = new THREE.WebGLRenderer({ preserveDrawingBuffer: true });
@@ -28,8 +30,9 @@ export async function spark(file, width, height, projection, poses) {
   // As 3DGS: sorted by depth instead of distance, and drawn to where alpha is 1/255 instead of 2.8
   // standard deviations. `ext`: 32 bytes a Gaussian instead of 16.
   const tails = { maxStdDev: Math.sqrt(2 * Math.log(255)), minAlpha: 1 / 255 };
-  const drawer = new SparkRenderer({ renderer, sortRadial: false, accumExtSplats: true, ...tails });
-  const mesh = new SplatMesh({ url: file, extSplats: true });
+  const patch = as3dgs ? { sortRadial: false, accumExtSplats: true, ...tails } : {};
+  const drawer = new SparkRenderer({ renderer, ...patch });
+  const mesh = new SplatMesh({ url: file, extSplats: as3dgs });
   await mesh.initialized;
   const picture = () => {
     renderer.render(scene, camera);
