@@ -37,7 +37,7 @@ HOST, NEAR, FAR = "http://localhost/", 0.01, 100.0
 LIMITS = OF_PADDED = (45, 0.1), (50, 0.1)
 AS_IT_COMES = (45, 0.1), (45, 0.1)
 if "RUN" in os.environ:
-    LIMITS, OF_PADDED = ((45, 0.2), (55, 0.1)), ((45, 0.25), (55, 0.12))
+    LIMITS, OF_PADDED = ((45, 0.2), (55, 0.1)), ((45, 0.25), (55, 0.1))
 
 PAGE = """<script type="importmap">{"imports": {
     "three": "/three/build/three.module.js",
