@@ -369,6 +369,17 @@ def test_masks_by_projecting_a_mesh_or_from_files(dataset, tmp_path, capsys):
         assert (a.mask() & ~mask).sum() < 0.15 * mask.sum()
 
 
+def test_a_mask_beside_its_photograph(dataset, tmp_path):
+    folder = dataset.root / "images"
+    for frame in dataset.frames:
+        frame.mask_path.rename(folder / f"{frame.image_path.stem}_mask.png")
+    out = tmp_path / "out"
+    command("import", dataset.root, "--out", out, "--masks", folder)
+    for made, frame in zip(load_dataset(out).frames, dataset.frames, strict=True):
+        mask = synthetic.cast(frame.camera, [(synthetic.CENTRE, synthetic.AXES)])[1]
+        assert np.array_equal(made.mask(), mask)
+
+
 STRUCK = """
 import os, signal, sys
 from mgs.data import importers

@@ -100,14 +100,18 @@ def _mask_file(masks: Path, shot: Shot, shots: Sequence[Shot]) -> Path:
     """Mask file of a shot, named as its image with or without folders."""
     if not masks.is_dir():
         raise InputError(f"{masks}: no such folder; give the folder of the masks")
-    if path := find_image(masks, shot.name):
+    photograph = None
+    if (path := find_image(masks, shot.name)) and not path.samefile(shot.image):
         return path
     for end in (3, 2, 1):
         image = Path(*shot.image.parts[-end:])
         stem = image.with_suffix("").as_posix()
         # The last two: as Metashape exports masks, and as COLMAP names them.
         for name in (stem, f"{stem}_mask", image.as_posix()):
-            if path := find_image(masks, name):
+            path = find_image(masks, name)
+            if path and path.samefile(shot.image):  # a mask may lie beside it
+                photograph = path
+            elif path:
                 others = [one for one in shots if one.image.parts[-end:] == image.parts]
                 if len(others) > 1:
                     raise InputError(
@@ -116,6 +120,8 @@ def _mask_file(masks: Path, shot: Shot, shots: Sequence[Shot]) -> Path:
                         f"{others[0].name} and {others[1].name}"
                     )
                 return path
+    if photograph:
+        return photograph
     raise InputError(f"{masks}: no mask for image {shot.image.name}; name masks as their images")
 
 
