@@ -1,4 +1,4 @@
-"""What a choice by the diagonal of J^T J, or by its blocks, loses against the whole matrix.
+"""Loss of a choice by the diagonal of J^T J, or by its blocks, against the whole matrix.
 
 Eq. 7 with the diagonal (`d-optimal`), with a block for each Gaussian (`block_d`) and with the whole
 matrix (`full_d` of `studies.policies`) choose from one pool after the same seeds. At each step of
@@ -35,7 +35,7 @@ SIZES = {
     "quick": SetupSize(images=5, gaussians=4000),
     "paper": SetupSize(320, 240, 24, 16, images=8, gaussians=25_000),
 }
-"""Of images before they are halved, with about the automatic number of Gaussians after that."""
+"""Sizes before images are halved, with about the automatic number of Gaussians after that."""
 
 
 def cells_of(size: SetupSize) -> list[Cell]:

@@ -89,7 +89,7 @@ def _carved(frames: Sequence[Frame]) -> Surface:
         filled = _filled(views, mesh)
         if np.nanmedian(filled) >= AGREEMENT:
             break
-    if not np.nanmedian(filled) >= AGREEMENT:
+    else:
         share = f"{np.nanmedian(filled):.0%} of the median mask"
         what = f"the masks carve away most of the object (the hull fills {share})"
         raise _Contradiction(what, frames, _odd_one(views, points))

@@ -301,14 +301,15 @@ def _draw_lines(axis: "Axes", panel: Panel, rows: Sequence[Row]) -> None:
 
 
 def logarithmic(axis: "Axes") -> None:
-    """Make the x axis logarithmic, with plain numbers at 1, 2 and 5 where it spans few decades."""
+    """Make the x axis logarithmic, with plain numbers where it spans few decades."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     low, high = axis.dataLim.intervalx
     axis.set_xscale("log")
     axis.xaxis.set_minor_formatter(NullFormatter())
     if low > 1e-3 and high < min(1e6, 300 * low):
-        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        subs = (1, 2, 5) if high > 3 * low else range(1, 10)
+        axis.xaxis.set_major_locator(LogLocator(subs=subs))
         axis.xaxis.set_major_formatter(lambda x, _: f"{x:g}" if x < 1e4 else f"{x / 1000:g}k")
 
 
