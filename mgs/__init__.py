@@ -8,8 +8,7 @@ Functions take and return NumPy arrays. `render` and `jvp` return Dr.Jit tensors
 fields wherever they are accepted (`as_drjit`).
 
 Lengths are metres, the world is +Z up, cameras are OpenCV's (x right, y down, z forward), colours
-are linear RGB.
-"""
+are linear RGB."""
 
 import lazy_loader
 

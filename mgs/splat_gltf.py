@@ -2,8 +2,7 @@
 
 A primitive of points holds positions, rotations (x y z w), scales (standard deviations), opacities
 in [0,1], and the coefficients of spherical harmonics: linear, activated values, not the logarithms
-and logits of a PLY. `colorSpace` names the space in which colours are blended.
-"""
+and logits of a PLY. `colorSpace` names the space in which colours are blended."""
 
 import json
 import struct

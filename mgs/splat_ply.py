@@ -2,8 +2,7 @@
 
 The layout of 3DGS has one vertex per Gaussian: x y z; nx ny nz (zero); f_dc_0..2, the coefficients
 of degree 0; f_rest_*, those of higher degrees, all of red, then all of green, then all of blue;
-opacity (its logit); scale_0..2 (natural logarithms); rot_0..3 (quaternion w x y z).
-"""
+opacity (its logit); scale_0..2 (natural logarithms); rot_0..3 (quaternion w x y z)."""
 
 import re
 from collections.abc import Mapping
@@ -52,8 +51,7 @@ def write_ply(
     It opens in any splat viewer. Viewers that expect sRGB show linear RGB too dark. marks: {name:
     [N] bool}, extra properties of the vertices, bytes of 0 or 1, which `read_ply` and viewers
     ignore. Comments record that Gaussians are linear or antialiased. Positions are doubles where
-    they have an origin. Raises InputError as `mgs.files.atomic_path`.
-    """
+    they have an origin. Raises InputError as `mgs.files.atomic_path`."""
     g, n = gaussians, len(gaussians)
     names = _ply_names(g.sh.shape[1])
     rest = np.transpose(g.sh[:, 1:, :], (0, 2, 1)).reshape(n, 3 * (g.sh.shape[1] - 1))
@@ -75,8 +73,7 @@ def read_ply(path: str | Path) -> Gaussians:
     Properties are found by name, in any order; others are ignored. Only files of mgs say that
     they are linear. The smoothing filter of Mip-Splatting (`filter_3D`) is applied. Raises
     InputError if the file is missing, is not a PLY, lacks a property, or holds values that
-    `Gaussians.check` refuses.
-    """
+    `Gaussians.check` refuses."""
     return parse_ply(path).check(path)
 
 
@@ -176,8 +173,7 @@ def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
     (PACKED). Their numbers are fractions between the least and the largest value within a chunk of
     256 splats, given in the element `chunk`. Some files have no range of colours, which is then 0
     to 1. Raises InputError if an element or a property is missing or of another type, or sizes do
-    not match.
-    """
+    not match."""
     vertices, n = ply["vertex"].data, len(ply["vertex"].data)
     chunks = ply["chunk"].data if "chunk" in ply else np.empty(0, [])
     present = chunks.dtype.names or ()

@@ -127,8 +127,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Run a command and end the process. arguments: of the command line; default: the process's.
 
     Bad input and wrong options print one line and end with exit code 2, an interruption with 130.
-    Always raises SystemExit, except that errors of the program itself pass through.
-    """
+    Always raises SystemExit, except that errors of the program itself pass through."""
     arguments = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     for argument in arguments:
         if any("\udc80" <= character <= "\udcff" for character in argument):

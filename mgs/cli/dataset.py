@@ -20,8 +20,7 @@ def dataset(action: Literal["check", "masks"], path: Path, prior: Path | None = 
 
     - action: check or masks: see above.
     - path: Folder of the dataset.
-    - prior: For masks: folder of the prior. Default: DATASET/prior.
-    """
+    - prior: For masks: folder of the prior. Default: DATASET/prior."""
     if action == "masks":
         _make_masks(path, prior or path / "prior")
     else:

@@ -28,8 +28,7 @@ def demo(out: Annotated[Path, typer.Argument()] = Path("demo"), seed: Seed = 0) 
     """Run all steps in a minute: render a rock orbit, build the prior, choose views by five
     policies, compare, draw. Every command is shown as it is run.
 
-    - out: Folder for everything; the same command again continues or shows it.
-    """
+    - out: Folder for everything; the same command again continues or shows it."""
     from mgs.cli.nbv import resume_and_print, start_and_print
     from mgs.run.folder import open_run
     from mgs.run.nbv import scene_of

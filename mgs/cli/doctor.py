@@ -20,8 +20,7 @@ def doctor() -> None:
     """Print versions, the libLLVM that is used, processor and memory; say what is wrong and how to
     mend it.
 
-    The exit code is 0 if all is well, and 2 if something prevents mgs from working.
-    """
+    The exit code is 0 if all is well, and 2 if something prevents mgs from working."""
     rows = _software() + _machine() + _resources()
     table = Table(show_header=False, box=None, pad_edge=False)
     for name, value, problem in rows:

@@ -41,8 +41,7 @@ def evaluate(
     - subjects RUN|SPLATS...: Folders that `mgs nbv` wrote, or PLY, GLB, SPZ, MGS.
     - dataset: Dataset for a file. Default: that of the run whose folder holds it.
     - prior: Folder of the prior that an mgs file was written with, if it needs one.
-    - pictures: Write truth, render and difference of each view to RUN/renders.
-    """
+    - pictures: Write truth, render and difference of each view to RUN/renders."""
     from mgs.reports.evaluation import evaluate as measured
     from mgs.reports.evaluation import evaluate_run
     from mgs.reports.simplify import PRUNED, REFITTED
@@ -83,8 +82,7 @@ def diagnose(runs: list[Path], views: str | None = None, force: bool = False) ->
     PNG that shows them; and information.ply, a point for each Gaussian, coloured by its
     information.
 
-    - views: Frames to draw, as kf_0003,kf_0010. Default: a few held-out ones.
-    """
+    - views: Frames to draw, as kf_0003,kf_0010. Default: a few held-out ones."""
     from mgs.reports.diagnostics import diagnose as mapped
     from mgs.run.folder import open_run
 
@@ -125,8 +123,7 @@ def simplify(
     - method: prune: fewer Gaussians, no new fit; refit: fewer parameters, fitted again.
     - learn: Of refit: auto (default), each Gaussian learns the kinds of parameters that the
       evidence supports; all: all kinds.
-    - sh: Of refit: SH degree 0, or auto (default): 1 if it predicts left-out views better.
-    """
+    - sh: Of refit: SH degree 0, or auto (default): 1 if it predicts left-out views better."""
     from mgs.reports.simplify import PRUNED, REFITTED, prune_run, refit_run
     from mgs.run.folder import open_run
 
@@ -197,8 +194,7 @@ def report(
     - runs: Run folders, or folders of them; all of one dataset.
     - out: Folder for the figures and the table. Default: report; with --html none.
     - figures: Format of the figures. Default: png.
-    - html: Interactive HTML page to write; one file that opens without a network.
-    """
+    - html: Interactive HTML page to write; one file that opens without a network."""
     if figures and html is not None and out is None:
         raise InputError(f"--figures {figures}: --html alone writes no figures; give --out, too")
     if html is not None:

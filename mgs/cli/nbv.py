@@ -80,8 +80,7 @@ def nbv(
       options of live capture again.
     - capture_command COMMAND: Program that takes a picture: 'CMD {pose} {out}' reads a JSON file,
       writes a PNG.
-    - capture_folder: Folder to which poses are written; pictures are awaited there.
-    """
+    - capture_folder: Folder to which poses are written; pictures are awaited there."""
     console = Terminal()
     values = parse_settings(settings, nbv)
     live = live_capture(capture_command, capture_folder, values.pop("capture", {}))
@@ -165,8 +164,7 @@ def resume_and_print(
     """Run or resume the loop of a run with a line for each step, evaluate, print the quality.
 
     policy: FILE.py:FUNCTION where the run has a policy of the user's own. live: of its pictures.
-    like: as in `mgs.run.nbv.scene_of`.
-    """
+    like: as in `mgs.run.nbv.scene_of`."""
     from mgs.cli.printing import print_run, step_lines
     from mgs.reports.evaluation import drawn_test_view, evaluate_run
     from mgs.run.folder import open_run
@@ -228,8 +226,7 @@ def fit(
     - density: The defaults of adaptive are those of 3DGS. Default: split of photographs without a
       prior (of whole scenes without --gaussians), else fixed.
     - gaussians: Build a prior of this many Gaussians in the run, or of an object, with split, of a
-      fifth of them.
-    """
+      fifth of them."""
     from mgs.run.nbv import start_fit
 
     console = Terminal()

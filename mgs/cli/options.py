@@ -44,8 +44,7 @@ def describe(command: Any, docstring: str, keys: Sequence[Row]) -> None:
     The list at its end has an item `- NAME METAVAR: help` for each option that is not in SHARED.
     Where an option is a setting (keys: rows of `keys_of`), the text of the setting and its default
     come first. A switch that is off by default has no form that turns it off. `keys` of the command
-    are the settings that are no option.
-    """
+    are the settings that are no option."""
     train_first = sorted(keys, key=lambda row: not row[0].startswith("train."))  # `seed` wins
     settings = {key.removeprefix("train."): row for key, *row in train_first}
     shared = _items(SHARED)[1]
@@ -106,8 +105,7 @@ def with_keys(model: type[BaseModel], *fields: str) -> Callable[[Command], Comma
 def parse_settings(pairs: Sequence[str] | None, command: Any) -> dict[str, Any]:
     """Nested settings of texts KEY=VALUE, with the values of TOML; other values are strings.
 
-    Raises InputError for a text of another form, and for a key that the command does not take.
-    """
+    Raises InputError for a text of another form, and for a key that the command does not take."""
     settings = dict[str, Any]()
     for pair in pairs or ():
         key, equals, text = pair.partition("=")

@@ -111,8 +111,7 @@ def prior(
     - mesh: Mesh to sample, world coordinates. GLB is converted from +Y up to +Z up.
     - backing: Gaussians behind the surface for each on it, to keep it opaque; in the paper 0.
     - poisson_depth: Octree depth of the Poisson surface, 3 to 12. Default: from the cloud's
-      density.
-    """
+      density."""
     from mgs.data.check import taken_frames
     from mgs.data.dataset import load_dataset
     from mgs.data.meshes import GLTF

@@ -56,8 +56,7 @@ def render(
       file says, else not.
     - background R G B: Colour behind the Gaussians, sRGB, each from 0 to 1. Default: black.
     - prior: Folder of the prior that an mgs file was written with, if it needs one.
-    - exr: Write an EXR too: linear R G B, opacity A, z-depth Z in metres (0: none).
-    """
+    - exr: Write an EXR too: linear R G B, opacity A, z-depth Z in metres (0: none)."""
     from mgs.data.dataset import load_cameras, load_origin
     from mgs.reports.exporting import read_model
     from mgs.reports.video import draw_views
@@ -104,8 +103,7 @@ def view(
     - subject RUN|SPLATS: Folder that `mgs nbv` wrote, or a PLY, GLB or SPZ.
     - port: Port to serve on; 0: any free one.
     - host: Address to serve on. With any but 127.0.0.1, other machines can reach the page.
-    - follow: Show every new step of a run in progress.
-    """
+    - follow: Show every new step of a run in progress."""
     from mgs.view.server import Viewer
 
     runtime.start()
@@ -157,8 +155,7 @@ def export(
       than mgs get fewer Gaussians, fitted once more.
     - psnr: Write the smallest model of a run of so many dB in the views taken.
     - shared_prior: For mgs: the reader has the run's prior, and no positions are written.
-    - prior: Folder of the prior that an mgs file was written with, to read it.
-    """
+    - prior: Folder of the prior that an mgs file was written with, to read it."""
     from mgs.reports.exporting import read_model, to_y_up
     from mgs.splat_files import FORMATS, write_gaussians
 
@@ -303,8 +300,7 @@ def video(
     - story: Show the model after each view of the run; repeats the fits.
     - seconds: Length, seconds. Default: 8, or 1 per view with --story.
     - fps: Frames per second of a turntable. Default: 25.
-    - width: Width of a picture in pixels. Default: the cameras' own.
-    """
+    - width: Width of a picture in pixels. Default: the cameras' own."""
     from mgs.reports.video import check_film, path_frames, story_frames, write_film
     from mgs.run.folder import open_run
 

@@ -104,8 +104,7 @@ def suggest(
     - origin: Where the world's origin is: LAT,LON,ALT or, if +Y is not north, ...,BEARING.
     - policy: Default: that of the run, or of `mgs nbv`.
     - prior: Folder of `mgs prior`. Default: DATASET/prior, or one built now.
-    - gaussians N|auto: Build a prior of this many Gaussians.
-    """
+    - gaussians N|auto: Build a prior of this many Gaussians."""
     from mgs.data.on_site import holds_photographs
 
     console = Terminal()

@@ -36,8 +36,7 @@ def survey(
     - poses: estimated: by odometry, registration and loop closure. exact: the true poses.
     - sensor_noise: Factor on the depth camera's noise; 0: exact depth. Default: as the dataset's
       scene says, else 1.
-    - drift: Factor on the errors of odometry. Default: as the dataset's scene says, else 1.
-    """
+    - drift: Factor on the errors of odometry. Default: as the dataset's scene says, else 1."""
     from mgs.data.dataset import load_dataset
     from mgs.survey.flight import SurveySettings, fly, save_survey
     from mgs.synth.scene_file import sensor_of

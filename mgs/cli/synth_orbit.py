@@ -64,8 +64,7 @@ def synth_orbit(
     - on_demand: Render no frames yet, only test views and a survey for `mgs prior`; `mgs nbv OUT`
       renders each frame that it chooses.
     - pose_noise: Error of camera positions in transforms.json: standard deviation per axis, metres.
-    - rotation_noise: The same of camera rotations, degrees.
-    """
+    - rotation_noise: The same of camera rotations, degrees."""
     runtime.start()
     from mgs.synth.orbit import PoseNoise
     from mgs.synth.rendering import synth_orbit as rendered

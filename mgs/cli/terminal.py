@@ -76,8 +76,7 @@ def progress_bar(stage: str = "reading", console: Terminal | None = None) -> Ite
     """Show progress while the context is open, on a terminal or in a notebook; nothing of it stays.
 
     It listens to `mgs.progress.report`, and what it yields may be called as progress(stage, done,
-    total).
-    """
+    total)."""
     name = TextColumn("{task.description}", markup=False)
     columns = name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     console = console or Terminal()

@@ -112,8 +112,7 @@ class Tree:
 
     topic: of poses that take precedence; of a PoseStamped they are those of the frame that static
     transforms make the root of the camera, or of the camera. Raises InputError where a step has two
-    sources, or the topic no poses.
-    """
+    sources, or the topic no poses."""
 
     def __init__(self, path: Path, reader: Any, camera: str, topic: str | None) -> None:
         sources: dict[str, dict[str, Samples]] = defaultdict(lambda: defaultdict(dict))

@@ -128,8 +128,7 @@ def seen_through(
     depth, other_depth: [H,W] z-depth, metres. mask: [H,W] bool, the rock in `frame`. Other things
     can hide a point of the rock, but nothing can be measured behind it. So the share is near 0 for
     right poses and depths. To allow for large pixels, depth is the least of 3x3 pixels, and pixels
-    at the outline do not count.
-    """
+    at the outline do not count."""
     inner = binary_erosion(mask, np.ones((3, 3)), border_value=1)  # outlines mix two depths
     points = frame.camera.unproject(depth)[(inner if inner.any() else mask) & (depth > 0)]
     pixels, z = other.camera.project(points)

@@ -35,8 +35,7 @@ FILES = {  # path fields of `Frame` -> their keys in transforms.json
 class Dataset:
     """A folder of keyframes in order of time.
 
-    Cameras are in a world with +Z up. world: that of the files, which may stand otherwise.
-    """
+    Cameras are in a world with +Z up. world: that of the files, which may stand otherwise."""
 
     root: Path
     frames: tuple[Frame, ...]
@@ -106,8 +105,7 @@ def load_dataset(
     points upwards in the files, by default as transforms.json says, else +Z; cameras are turned so
     that it is +Z. Raises InputError if the folder or a file is missing, intrinsics are missing,
     images are distorted, a pose is not finite or singular, there are no frames, or two frames have
-    the same name.
-    """
+    the same name."""
     root = Path(root)
     path = root / "transforms.json"
     if not root.is_dir():

@@ -30,8 +30,7 @@ class Origin:
     """Place of the world's origin, degrees and metres.
 
     bearing: of the level part of the world's +Y (of +Z where +Y is steep), degrees clockwise from
-    north. Positions have +Z up and that direction as +Y (`mgs.data.world.World`).
-    """
+    north. Positions have +Z up and that direction as +Y (`mgs.data.world.World`)."""
 
     latitude: float
     longitude: float

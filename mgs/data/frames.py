@@ -56,8 +56,7 @@ class Frame:
     on_demand: the files exist only after a run has taken the frame. Reading a file that does not
     exist yet raises InputError. In a live capture (`mgs.run.live`), capture_path is the record of
     the picture, None before it is taken; asked is the camera asked for, if the picture was taken
-    from another; given_up says that no picture could be taken.
-    """
+    from another; given_up says that no picture could be taken."""
 
     name: str
     camera: Camera
@@ -101,8 +100,7 @@ class Frame:
         rgba is linear RGB premultiplied by alpha, and alpha, the share of the pixel that the rock
         covers. weight is 1 where rgba is known, else 0. With a rock image, weight is 1 everywhere.
         With a mask only, alpha is 0 or 1, which is wrong along the outline, so the `boundary` of
-        the mask has weight 0. With neither, alpha and weight are 1. Raises InputError as `rgb`.
-        """
+        the mask has weight 0. With neither, alpha and weight are 1. Raises InputError as `rgb`."""
         if self.rock_path is not None:
             rgba = read_rock_image(self._existing(self.rock_path))
             return rgba, np.ones(rgba.shape[:2], np.float32)

@@ -29,8 +29,7 @@ class Gltf:
 
     handled: pattern of the extensions that are read. resolve: returns the bytes of a file that is
     named beside it. Raises InputError if it needs another extension (`extensionsRequired`), and
-    errors of many types if it is damaged (`mgs.files.parsing`).
-    """
+    errors of many types if it is damaged (`mgs.files.parsing`)."""
 
     def __init__(
         self, path: Path, handled: str, resolve: Callable[[str], bytes] | None = None

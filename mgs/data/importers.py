@@ -51,8 +51,7 @@ def import_source(
     When an interrupted import continues, a finished frame is made again only if one of its files
     is newer; the result is the same bit for bit. A finished import is loaded as it is. Raises
     InputError as `read_mesh`; if a file is missing, damaged or of another size than its camera; if
-    `out` holds anything else or is locked by another process. Finished frames are kept.
-    """
+    `out` holds anything else or is locked by another process. Finished frames are kept."""
     shots, silhouette = source.shots, None
     every = [*shots, *(tests.shots if tests else ())]
     if masks is not None:

@@ -198,8 +198,7 @@ def read_fitting(
     read: Callable[[Path], np.ndarray], path: Path, camera: Camera, turned: bool = False
 ) -> np.ndarray:
     """Pixels of an image file, turned by its EXIF orientation if `turned`, or if only that fits its
-    camera's size. Raises InputError, before anything is decoded, if neither size fits.
-    """
+    camera's size. Raises InputError, before anything is decoded, if neither size fits."""
     size, real = (camera.width, camera.height), image_size(path)
     orientation = exif_orientation(path) if turned or real == size[::-1] != size else 1
     if size != (real[::-1] if orientation >= 5 else real):

@@ -236,8 +236,7 @@ def _wound_against(faces: np.ndarray) -> np.ndarray:
     Neighbours share an edge with no third face, and are wound alike if they traverse it in opposite
     directions. Method: a graph with nodes f ("keep") and F + f ("flip"), and an edge between nodes
     of neighbours that go together; its connected components decide. One-sided pieces (Moebius
-    strips) are left as they are.
-    """
+    strips) are left as they are."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     forward = edges[:, 0] < edges[:, 1]
     order, edge = _numbered(np.sort(edges, axis=1))

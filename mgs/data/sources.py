@@ -90,8 +90,7 @@ def read_source(
     bag and the matches of photographs, by default SOURCE.unpacked. pose: topic of a bag's poses.
     exclude: names of images to leave out. Raises InputError if no format is recognised, no image
     exists, a frame is listed twice, a camera model is not supported, photographs cannot be placed,
-    or there is no such test split.
-    """
+    or there is no such test split."""
     source = Path(source)
     source.exists()  # an OSError of the source itself is not one of a file that it names
     try:

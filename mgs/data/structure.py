@@ -36,8 +36,7 @@ class Matcher:
 
     pictures: files. cameras: of pycolmap, one for each picture, by default as EXIF says; equal ones
     are taken as one camera.
-    folder: of the database, which a later Matcher of the same pictures, or of more, continues.
-    """
+    folder: of the database, which a later Matcher of the same pictures, or of more, continues."""
 
     def __init__(self, pictures: Sequence[Path], folder: Path, cameras: Sequence[Any] = ()) -> None:
         import PIL.Image  # noqa: F401  # after pycolmap, writing a PNG would crash in its zlib

@@ -31,8 +31,7 @@ def visible(
 
     points [N,3] world, metres; normals [N,3] unit; depth [H,W] z-depth, metres, 0 = no return;
     tolerance: largest depth difference, metres; two_sided: include points that face away. The
-    tolerance grows by the size of a pixel times the slope, since depth varies within a pixel.
-    """
+    tolerance grows by the size of a pixel times the slope, since depth varies within a pixel."""
     pixels, z = camera.project(points)
     view = camera.position - points
     cosine = np.einsum("nk,nk->n", normals, view) / np.maximum(np.linalg.norm(view, axis=1), 1e-30)

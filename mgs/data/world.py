@@ -68,8 +68,7 @@ def up_of_cameras(cameras: Sequence[Camera]) -> Vector:
     A level camera has a horizontal right-hand axis, however steeply it looks down. The result is
     the last right singular vector of the stacked axes, on the side of the cameras' upward axes.
     Cameras that look one way, but are held every way round, look down. Raises InputError if the
-    upward axes of others cancel.
-    """
+    upward axes of others cancel."""
     forward = np.stack([camera.world_to_camera[2, :3] for camera in cameras]).mean(0)
     right = np.stack([camera.world_to_camera[0, :3] for camera in cameras])
     upward = -np.stack([camera.world_to_camera[1, :3] for camera in cameras]).mean(0)

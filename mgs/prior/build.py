@@ -54,8 +54,7 @@ class Prior:
       standard deviations of depth noise, whichever is largest; for a given mesh, the spacing.
     - numbers: contents of prior.json, where `up` is the dataset's upward direction in its files.
     - backed: the first `backed` points, evenly spread, have a second Gaussian behind the surface
-      (`mgs.prior.initial`).
-    """
+      (`mgs.prior.initial`)."""
 
     mesh: Mesh
     points: np.ndarray
@@ -112,8 +111,7 @@ def build_prior(
       dataset has. points: PLY file in place of the dataset's points.
     - shown: frames whose masks a "random" prior may read, by default all.
 
-    Raises InputError if the dataset lacks the source, or no surface is found that a frame sees.
-    """
+    Raises InputError if the dataset lacks the source, or no surface is found that a frame sees."""
     dataset = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     settings = replace(settings or PriorSettings(), **fields)
     if source == "random" and shown is not None:
@@ -270,8 +268,7 @@ def prior_from_mesh(
     source: a file, or vertices [V,3], metres, and faces [F,3], indices of vertices. The cameras of
     the dataset decide the number of Gaussians if the settings do not. Without a dataset the mesh
     has +Z up, and lengths are metres. Raises InputError if the mesh cannot be read or sampled, if
-    no camera sees it, and for settings that only a cloud has: poisson_depth and density.
-    """
+    no camera sees it, and for settings that only a cloud has: poisson_depth and density."""
     settings.refuse_shaping("`mesh` gives one")
     from mgs.data.raycast import mesh_in_sight  # imported here because it loads Mitsuba
 

@@ -36,8 +36,7 @@ def visual_hull(frames: Sequence[Frame]) -> Surface:
 
     A few masks that cut away what no others do are left out, with a warning. Raises InputError if
     all masks are empty or full, if they share no point of space, or if the hull fills too little of
-    them, because poses and masks do not fit; the message names frames.
-    """
+    them, because poses and masks do not fit; the message names frames."""
     others = list(frames)
     while True:
         try:

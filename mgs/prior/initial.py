@@ -62,8 +62,7 @@ def initial_gaussians(
     Returns (N + backed Gaussians of degree 0, seen [N] bool). A frame sees a sample that lies in
     its rock mask, faces the camera and agrees with the depth image (or else the mesh's depth) up to
     `prior.depth_tolerance` and the slope. A sample that no frame sees is grey. Raises InputError if
-    a file of a frame cannot be read, and as `mesh_depth`.
-    """
+    a file of a frame cannot be read, and as `mesh_depth`."""
     if prior.kind == "random":
         start, seen = round_gaussians(prior.points, frames, gains, linear)
         return replace(start, antialiased=antialiased), seen

@@ -202,8 +202,7 @@ def scattered(
     lie outside, evenly in the logarithm of their distance, as background. Well triangulated points
     of the dataset's cloud, in the masks, come first. The mesh is the ball; normals point outwards,
     those of the cloud to its cameras. Raises InputError if the settings shape a surface, or the
-    masks share no point of the ball.
-    """
+    masks share no point of the ball."""
     import trimesh  # here, because it takes 0.2 s and no other prior needs it
 
     shown = dataset.frames if shown is None else shown

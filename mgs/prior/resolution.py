@@ -41,8 +41,7 @@ def resolution(
     pixels: spacing of the samples over the size of the closest pixel. The pixel on a face is
     z-depth / focal length, whatever the slant; the smallest counts among the cameras that have the
     face in their image and in front, occluded or not. N is the sum over faces of area / (pixels
-    pixel)^2; faces in no image do not count. Raises InputError if none is.
-    """
+    pixel)^2; faces in no image do not count. Raises InputError if none is."""
     middles = mesh.vertices[mesh.faces[mesh.seen]].mean(1)
     crosses, areas = mesh.crosses[mesh.seen], mesh.areas[mesh.seen]
     pixel = np.full(len(areas), np.inf)

@@ -70,8 +70,7 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
     RANSAC sees at most 10,000 points, drawn by the seed. The plane is then refined three times on
     its inliers near what the cameras look at, within three of their standard deviations, but at
     least two voxels. Raises InputError if the plane holds under a fifth of the cloud, or nothing
-    near the focus.
-    """
+    near the focus."""
     from skimage.measure import ransac
 
     target = focus(frames)
@@ -128,8 +127,7 @@ def rock_cluster(
     (EQUAL_SIZE) the nearest to the target; with it go the clusters of which belongs(points of the
     cluster, points of the rock so far) is true. Returns (inside [N] bool, eps in metres, number of
     clusters). Raises InputError if there is no cluster, or two that do not belong together are
-    equally large and about equally near.
-    """
+    equally large and about equally near."""
     from sklearn.cluster import DBSCAN
 
     thin, cell = points, voxel

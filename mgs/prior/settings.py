@@ -24,8 +24,7 @@ class PriorSettings:
     - parts: number of Gaussians into which a fit will split each; there are as many times fewer.
     - seed: of all random draws.
 
-    Raises InputError if a number is out of range, or `gaussians` and `spacing` are both given.
-    """
+    Raises InputError if a number is out of range, or `gaussians` and `spacing` are both given."""
 
     gaussians: int | Literal["auto"] | None = None
     spacing: float | None = None

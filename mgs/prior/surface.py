@@ -45,8 +45,7 @@ def poisson_mesh(
     depth: of the octree, None for finest cells of at most 1.5 voxels. The reconstruction closes the
     underside with a bulge that no data supports; the cut replaces it by a flat base, not seen.
     Raises InputError if there is no closed surface above the ground. Sources: Kazhdan and Hoppe
-    2013, by pymeshlab; the cut by manifold3d.
-    """
+    2013, by pymeshlab; the cut by manifold3d."""
     solid, depth = _closed_solid(points, normals, voxel, depth, plane)
     solid = _supported(solid.trim_by_plane(plane.normal, plane.offset), points)
     if solid.is_empty():
@@ -156,8 +155,7 @@ def sample_surface(
     the largest that leaves at least N; the few too many, nearest to a neighbour, are dropped.
     Returns (points [N,3], unit normals [N,3], spacing: sqrt(area / N), metres). Raises InputError
     for fewer than two samples, more than memory holds, and if float32 cannot tell neighbours apart
-    at their distance from the origin.
-    """
+    at their distance from the origin."""
     areas = np.where(mesh.seen, mesh.areas, 0.0)
     area = float(areas.sum())
     if count is None:

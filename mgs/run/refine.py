@@ -35,8 +35,7 @@ def refined(
     gain of all together before and after.
 
     A view climbs with the others where they are, within the limits of the flight.
-    derivatives(camera): as `mgs.fisher_derivatives`. flyable(camera): other limits of a pose.
-    """
+    derivatives(camera): as `mgs.fisher_derivatives`. flyable(camera): other limits of a pose."""
     home, frames = state.frames[way[0]].camera, list(state.frames)
 
     def F(camera: Camera) -> np.ndarray:

@@ -7,8 +7,7 @@ all of them together. A `ListCache` passed to all calls makes them faster for ca
 They start Dr.Jit themselves (`mgs.runtime.start`).
 
 `import mgs.splat.plugins` registers the Mitsuba integrator `mgs_splat` (plugins/mgs_splat.py),
-which draws the same images.
-"""
+which draws the same images."""
 
 from mgs.splat.information import ESTIMATORS, MEANS, fisher, fisher_derivatives, groups
 from mgs.splat.jacobian import jvp, vjp

@@ -3,8 +3,7 @@ back.
 
 A splat that touches five blocks makes five (splat, block) *pairs*. Blocks are grouped into square
 *tiles*; splats are stored tile by tile, and the position of one is its *place*. Lists stay valid
-while no footprint changes (`changes`), and their depth order while the means stay.
-"""
+while no footprint changes (`changes`), and their depth order while the means stay."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -123,8 +122,7 @@ def build(splats: Splats, camera: Camera, older: BlockLists | None = None) -> Bl
 
     Pairs are made front to back and then sorted by block. The sort is stable, so each block's list
     is front to back, too. A splat touches a block if its ellipse does, not its bounding box. Raises
-    InputError for more than MAX_PAIRS pairs, or too many for the memory, before taking memory.
-    """
+    InputError for more than MAX_PAIRS pairs, or too many for the memory, before taking memory."""
     # First block (column, row) on the film, and number of blocks that the window touches.
     left, top = camera.corner
     right, bottom = left + camera.width, top + camera.height
@@ -240,8 +238,7 @@ def _pairs(
     drawn.
 
     It first makes (splat, row of blocks) pairs, then the blocks of each row, so the work grows with
-    the pairs that are kept. The bounding box of a slanted needle would contain many more blocks.
-    """
+    the pairs that are kept. The bounding box of a slanted needle would contain many more blocks."""
     n = len(order)
     dr.eval(foot)
     u, v, k, p, e, q = (
@@ -331,8 +328,7 @@ def _blocks_of_row(
     The ellipse counts between the centres of the row's first and last pixels. At height y from the
     splat's centre its right rim is x = k y + sqrt(q - e^2 y^2) / p (letters: docs/notation.md),
     which is concave in y. So in this band it is largest at its own maximum, or at the end of the
-    band nearest to that. The left rim is its mirror image.
-    """
+    band nearest to that. The left rim is its mirror image."""
     u, v, k, p = dr.gather(mi.Vector4f, shapes, 2 * splat)
     e, q, first_row, _ = dr.gather(mi.Vector4f, shapes, 2 * splat + 1)
     # Band of the row's pixel centres, cut to the ellipse: y from low to high.

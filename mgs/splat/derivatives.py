@@ -7,8 +7,7 @@ from moments, sums over pixels of |s|^2 or w s_c times monomials of xi and eta, 
 w^2 (`mgs.splat.kernels.fisher`).
 
 A polynomial is a dict {(a, b): coefficient of xi^a eta^b}; moments are dicts with the same keys.
-Symbols: docs/notation.md.
-"""
+Symbols: docs/notation.md."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -78,8 +77,7 @@ def geometry(gaussians: Gaussians, camera: Any, splats: Any) -> Geometry:
     det S / det(S + EPS2D I) = r, it is s (4 ln2^2 / r sum_k s_k^2 (b_k x b_i) (b_k x b_j) - 2 ln2
     b_i.b_j).
 
-    gaussians: TensorXf fields. camera: `camera_array`. splats: their projection.
-    """
+    gaussians: TensorXf fields. camera: `camera_array`. splats: their projection."""
     mean = mi.Vector3d(rows_as_vectors(gaussians.means, mi.Vector3f))
     quats = mi.Vector4d(rows_as_vectors(gaussians.quats, mi.Vector4f))
     log_scales = mi.Vector3d(rows_as_vectors(gaussians.log_scales, mi.Vector3f))

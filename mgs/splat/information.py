@@ -5,8 +5,7 @@ Jacobian J of the rgb image, all pixels and channels, by the parameters.
 
 A Gaussian has P = 3K + 8 columns: 3K spherical-harmonic coefficients (coefficient by coefficient,
 r g b in each), 3 log-scales, 4 of the quaternion, 1 opacity logit; then 0 or 3 of the mean
-(`MEANS`). Symbols: docs/notation.md.
-"""
+(`MEANS`). Symbols: docs/notation.md."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -94,8 +93,7 @@ def fisher(
 
     Raises InputError for an unknown estimator; as `render`; for blocks of 2^31 numbers or more, or
     too large for the memory; for unusable means, alpha_weight, weights or indices, or an estimator
-    that does not support them; and with means for too many pairs (`MAX_SUMS`).
-    """
+    that does not support them; and with means for too many pairs (`MAX_SUMS`)."""
     if not isinstance(camera, Camera):
         model, cache = as_drjit(gaussians), cache or ListCache()
         each = [None] * len(camera) if weights is None else weights
@@ -298,8 +296,7 @@ def fisher_derivatives(
 
     Of the estimator `exact` with frozen means, in two passes over the image for each. Thresholds
     and depth order are not differentiated, as in `render`; with many Gaussians of a pixel or two,
-    differences of moved cameras also have the steps at ALPHA_MIN. Raises InputError as `fisher`.
-    """
+    differences of moved cameras also have the steps at ALPHA_MIN. Raises InputError as `fisher`."""
     model, size = as_drjit(gaussians).map(dr.detach), groups(gaussians.sh_degree)["opacity"].stop
     if len(gaussians) == 0:
         return np.zeros((7, 0, size), np.float32)
@@ -353,8 +350,7 @@ def _diagonal_tangent(
     """Derivative of the columns of `exact` along a tangent of the camera (`_interleaved`).
 
     sums: of `kernels.fisher` with means. changes: of `kernels.fisher_jvp`. polynomial: tangent of
-    ln alpha, which is ln 2 (log2 o' - 2 xi xi' - 2 eta eta').
-    """
+    ln alpha, which is ln 2 (log2 o' - 2 xi xi' - 2 eta eta')."""
     # xi' and eta' are polynomials of first order in xi and eta.
     half = {power: c / (-2 * kernels.LN2) for power, c in polynomial.items()}
     d_xi = {(-1, 0): half[1, 0], (0, 0): half[2, 0], (-1, 1): half[1, 1]}

@@ -34,8 +34,7 @@ def jvp(
       "logit_opacities", "sh"), NumPy or Dr.Jit of the parameter's shape. Others are constant.
 
     Returns the derivatives by t of rgb, alpha and depth, of the shapes of `render`. Raises
-    InputError as `render`, and for a tangent of an unknown name, of a wrong shape or not finite.
-    """
+    InputError as `render`, and for a tangent of an unknown name, of a wrong shape or not finite."""
     model = as_drjit(gaussians)
     tensors = {name: _checked_tangent(model, name, tangent) for name, tangent in tangents.items()}
     with dr.resume_grad():
@@ -95,8 +94,7 @@ def vjp(
     - by: names of the parameters to differentiate by, as in `jvp`.
 
     Returns the derivatives by name, float32 of the parameter's shape. Raises InputError as
-    `render`, for an unknown name, and for a cotangent of another shape.
-    """
+    `render`, for an unknown name, and for a cotangent of another shape."""
     if unknown := [name for name in by if name not in ARRAYS]:
         raise InputError(f"by: {unknown[0]!r} is no parameter; choose from {', '.join(ARRAYS)}")
     with dr.resume_grad():

@@ -4,8 +4,7 @@ docs/notation.md.
 
 The last three draw the image front to back once more and subtract, S = C - (colour so far), so they
 make the same decisions. They store sums for each (splat, block) pair, and a second kernel adds
-those of each splat in a fixed order.
-"""
+those of each splat in a fixed order."""
 
 from collections.abc import Callable
 from typing import Any
@@ -62,8 +61,7 @@ def forward(lists: BlockLists, packed: Any, whole: bool) -> tuple[Any, ...]:
     alpha is sum w; depth is sum w z, metres, not divided by alpha.
 
     Without `whole`, alpha is computed as 1 - T, which saves a sum. For the expected depth, a
-    quotient by alpha, that difference has too few digits in faint pixels.
-    """
+    quotient by alpha, that difference has too few digits in faint pixels."""
     lane, T = lanes(lists)
     # Depth and alpha as sums of w z and w: a quotient of both keeps its digits.
     if whole:
@@ -244,8 +242,7 @@ def adjoint(
 
     Sums: w dL for red, green, blue and depth (4). With s the derivative of the loss by ln alpha at
     the pixel: s times 1, xi^2, xi eta, eta^2 (4), and, if means have gradients, s times xi, eta
-    (2).
-    """
+    (2)."""
     # State of a pixel: T, and the loss behind the current splat, <dL, S>: it starts as <dL, C> and
     # falls by <dL, c> w with each splat. One number replaces the colours behind.
     lane, T = lanes(lists)
@@ -379,8 +376,7 @@ def fisher(
         `forward`. Channel c and its s_c are multiplied by them, and w^2 is summed by channel.
 
     Off-diagonal entries of blocks are sums that cancel, so for blocks give splats packed in double
-    (`project64`). Pixels are then computed in double; only sums within a block are single.
-    """
+    (`project64`). Pixels are then computed in double; only sums within a block are single."""
     # First pass: the finished colour C of each pixel, from which the second subtracts.
     real = type(packed)
     lane, T = lanes(lists)
@@ -484,8 +480,7 @@ def fisher_jvp(
 
     They are 2 w dw, then 2 <s, ds> times the monomials, whose change the caller adds. With S the
     colour behind, ds_c = c dw + w dc - dS_c alpha / (1 - alpha) - S_c dalpha / (1 - alpha)^2.
-    out, d_out: rgba of `forward` and of `jvp`. background: Color3f, linear RGB.
-    """
+    out, d_out: rgba of `forward` and of `jvp`. background: Color3f, linear RGB."""
     lane, T = lanes(lists)
     # State of a pixel: T, the tangent of its alpha so far, S and dS, at first of the whole pixel.
     pixels: list[list[Any]] = []

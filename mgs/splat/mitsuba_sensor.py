@@ -19,8 +19,7 @@ def camera_from_sensor(sensor: Any) -> Camera:
     principal point is 0.5 minus the sensor's offset, as a share of the film. Near clip, far clip
     and shutter are ignored (near plane: `mgs.splat.constants.NEAR`). The camera keeps the gradients
     of to_world, x_fov and the principal point, if enabled. Raises InputError for any other sensor,
-    and for a pose that is not rigid.
-    """
+    and for a pose that is not rigid."""
     params = mi.traverse(sensor)
     if "x_fov" not in params or sensor.needs_aperture_sample():
         raise InputError(

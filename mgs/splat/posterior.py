@@ -44,8 +44,7 @@ class Information:
     - cache: pass the same one to all calls, to reuse the block lists of cameras.
 
     Raises InputError as `fisher`. Sources: Ubaru, Chen and Saad 2017 (stochastic Lanczos
-    quadrature); Papandreou and Yuille 2010 (samples by perturbation).
-    """
+    quadrature); Papandreou and Yuille 2010 (samples by perturbation)."""
 
     gaussians: Gaussians
     cameras: Sequence[Camera]
@@ -127,8 +126,7 @@ class Information:
         trace log A with A = L^-1 (H + lam) L^-T. That trace is the mean of z^T log(A) z over
         `probes` random vectors z of +1 and -1, each by `steps` of the Lanczos iteration: the error
         is that of the mean. Half of z^T A z, whose mean is known, is subtracted, which leaves about
-        two thirds of the error. Raises InputError for fewer than two probes or steps.
-        """
+        two thirds of the error. Raises InputError for fewer than two probes or steps."""
         if probes < 2 or steps < 2:
             raise InputError(
                 f"information: probes {probes}, steps {steps}: give at least 2 of each"

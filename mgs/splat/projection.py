@@ -3,8 +3,7 @@
     xi = white_x (dx - shear dy),   eta = white_y dy,   alpha = 2^(log2_opacity - xi^2 - eta^2),
 
 in double, rounded to float32 once (docs/splatting.md, Project). Where a splat is drawn, xi and eta
-are of order one, so the fourth powers in the Fisher information lose no digits.
-"""
+are of order one, so the fourth powers in the Fisher information lose no digits."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -56,8 +55,7 @@ def camera_array(camera: Camera) -> Any:
 
     Layout: rotation (9, row by row) and translation (3) of `world_to_camera`; fx, fy, cx, cy,
     pixels; lower and upper bound of x/z, then of y/z (4, FRUSTUM_MARGIN); camera centre (3),
-    metres.
-    """
+    metres."""
     camera = camera.film or camera
     if camera.traced is None:
         K, pose, centre = camera.K, camera.world_to_camera, list(camera.position)
@@ -102,8 +100,7 @@ def moved(camera: Camera, motion: Any, zoom: Any = 0.0) -> Camera:
 
     motion: Dr.Jit Float or Float64 [6]: rotation vector, radians, then translation, metres, in the
     axes of the camera (x right, y down, z forward); points turn and shift the other way. zoom:
-    logarithm of the factor on both focal lengths. Derivatives are exact also where motion is 0.
-    """
+    logarithm of the factor on both focal lengths. Derivatives are exact also where motion is 0."""
     number = [dr.gather(mi.Float64, mi.Float64(motion), mi.UInt32(i)) for i in range(6)]
     w, shift = mi.Vector3d(*number[:3]), mi.Vector3d(*number[3:])
     # Rodrigues: R = 1 + sin(a)/a [w] + (1 - cos(a))/a^2 [w]^2 with a = |w|; near 0 the series.
@@ -183,8 +180,7 @@ def axes2d(mean: Any, quats: Any, camera: Any) -> tuple[Any, list[Any], Any]:
     mean: Vector3d, world, metres. quats: Vector4d. camera: `camera_array`.
     Returns (x px, y px, z-depth m) of the centres, with depth 1 where not visible, to avoid
     divisions by 0; the images of the three unit axes, pixels per metre, Vector2d; and the mask of
-    centres in front of the near plane.
-    """
+    centres in front of the near plane."""
     R = [mi.Vector3d(*_numbers(camera, 3 * i, 3 * i + 3)) for i in range(3)]
     t = mi.Vector3d(*_numbers(camera, 9, 12))
     fx, fy, cx, cy, x0, x1, y0, y1 = _numbers(camera, 12, 20)
@@ -207,8 +203,7 @@ def whitening(axes: list[Any]) -> tuple[Any, Any, Any, Any]:
 
     axes: the three semi-axes of the Gaussian in the image, pixels, Vector2d.
     The determinant is a sum of squared 2x2 minors of the axes (Cauchy-Binet formula). All terms are
-    positive, so nothing cancels, however thin the footprint.
-    """
+    positive, so nothing cancels, however thin the footprint."""
     # Sigma = [a b; b c] = sum of axis axis^T + EPS2D I, of which only b, c and trace are needed.
     c = sum(a.y * a.y for a in axes) + EPS2D
     b = sum(a.x * a.y for a in axes)

@@ -23,8 +23,7 @@ def one_at_a_time(function: Function) -> Function:
     covers everything from the start to the end of a drawing.
 
     Ctrl-C within a call that Dr.Jit makes to Python comes out of it as a RuntimeError, and is
-    raised as KeyboardInterrupt again.
-    """
+    raised as KeyboardInterrupt again."""
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -58,8 +57,7 @@ def frozen(
 
     Threads may draw at once if each has its own `ListCache`; decorated functions run one at a time.
     Not protected: a `ListCache` or a gradient shared by threads, and threads that switch the
-    collector on or off.
-    """
+    collector on or off."""
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         recorded = dr.freeze(

@@ -171,8 +171,7 @@ def margins(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     Decisions: whether alpha is below ALPHA_MIN; whether it is above ALPHA_MAX, where its derivative
     jumps; whether the pixel is finished (a relative error of the alphas makes one of T that is sum
     alpha / (1 - alpha) times as large); and which of two drawn splats is in front (0 if float32 may
-    round their depths to the same number).
-    """
+    round their depths to the same number)."""
     p = project(gaussians, camera)
     order, alpha, _, _ = composite(p, camera)
     pixels = _pixels(camera)

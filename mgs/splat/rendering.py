@@ -29,8 +29,7 @@ class Image:
     """A rendered view, Dr.Jit TensorXf.
 
     rgb: linear, over the background [H,W,3]. alpha: [H,W]. depth: expected z-depth sum w z / sum w,
-    metres, 0 where alpha is 0 [H,W].
-    """
+    metres, 0 where alpha is 0 [H,W]."""
 
     rgb: Any
     alpha: Any
@@ -59,8 +58,7 @@ class ListCache:
     each time. The camera used longest ago is then often needed next, so least-recently-used
     replacement may never find anything. Here a new camera replaces the one used longest ago only if
     it was itself used less than half as long ago. Otherwise its lists are used once and dropped. If
-    the caller turns to other cameras, these take over within three rounds.
-    """
+    the caller turns to other cameras, these take over within three rounds."""
 
     def __init__(self, budget: int = CACHE_BYTES) -> None:
         self.budget = budget
@@ -168,8 +166,7 @@ class _Rasterise(dr.CustomOp):
     every splat.
 
     packed, lists: of these splats. places: from `_block_major`. means: whether mean_x and mean_y
-    have gradients. channels: number of outputs, from red on, at least 3.
-    """
+    have gradients. channels: number of outputs, from red on, at least 3."""
 
     def eval(
         self,
@@ -268,8 +265,7 @@ def render(
     Raises InputError inside another `dr.freeze`, since it records kernels of its own; if a
     parameter is not finite or a colour beyond SH_MAX, naming parameter and first Gaussian; if a
     number of the background is (a Dr.Jit colour is not checked); for a view with too many pairs
-    (`mgs.splat.blocks.MAX_PAIRS`); and for no cameras, or cameras of different sizes.
-    """
+    (`mgs.splat.blocks.MAX_PAIRS`); and for no cameras, or cameras of different sizes."""
     runtime.start()
     if not isinstance(camera, Camera):
         model, cache = as_drjit(gaussians), cache or ListCache()

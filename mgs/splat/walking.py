@@ -41,8 +41,7 @@ def pack(s: Splats, place: Any) -> Any:
     Splats from `project` become Float [16 N], one cache line each: (mean_x, mean_y, shear,
     white_x), (white_y, log2_opacity, mean_x_rest, mean_y_rest), (red, green, blue, shear_rest),
     (depth, 0, 0, 0). Depth comes last, in a packet of its own that most kernels need not read.
-    Splats from `project64` become Float64 [12 N]: the same without rests, depth after opacity.
-    """
+    Splats from `project64` become Float64 [12 N]: the same without rests, depth after opacity."""
     # Four numbers at a time: a lane reads a splat in as few packets as possible.
     parts = [[s.mean_x, s.mean_y, s.shear, s.white_x]]
     if s.mean_x_rest is None:
@@ -188,8 +187,7 @@ def block_rows(lane: Lane, s: Splats) -> list[PixelRow]:
     miss the block; then nothing of it is drawn in rows whose exponent is too small.
 
     The offset of the lane's first pixel from the splat is computed in double: far along a slanted
-    needle, xi is a small difference of large numbers.
-    """
+    needle, xi is a small difference of large numbers."""
     # (dx, dy): the lane's first pixel minus the splat's centre; corner: xi there.
     real, centre_column, centre_row = type(s.white_x), lane.columns // 2, lane.rows // 2
     dx, dy = mi.Float64(lane.left) - s.mean_x, mi.Float64(lane.top) - s.mean_y
@@ -245,8 +243,7 @@ def blend(raw: Any, T: Any) -> tuple[Any, Any, Any, Any]:
     leaves less than TRANSMITTANCE_MIN, so none is drawn, and the pixel's alpha is still known.
 
     Thresholds are comparisons and selects, because dr.minimum and dr.maximum take five
-    instructions to propagate NaN.
-    """
+    instructions to propagate NaN."""
     # after = T (1 - alpha); the splat is drawn if that leaves more than TRANSMITTANCE_MIN.
     alpha = dr.select(raw >= ALPHA_MIN, dr.select(raw < ALPHA_MAX, raw, ALPHA_MAX), 0)
     after = dr.fma(-alpha, T, T)
@@ -261,8 +258,7 @@ def computed_after(x: Any, before: list[Any]) -> Any:
     these are first the state of all 32 pixels and then the sums over them, and everything between
     would leave the registers for the stack. A dependence of each pixel on the sums over the pixels
     before it finishes those first. It costs nothing: what is added to x is a bit that is always
-    zero, which LLVM removes, but Dr.Jit does not.
-    """
+    zero, which LLVM removes, but Dr.Jit does not."""
     if not before:
         return x
     # (bits & 1) >> 1 is 0: x | 0 = x, but computed after `before`.
@@ -293,8 +289,7 @@ def walk(
         `start`.
 
     Returns the final state. The numbers of a pixel stay together in the list, because the compiler
-    keeps that order and finishes each pixel before the next one needs registers.
-    """
+    keeps that order and finishes each pixel before the next one needs registers."""
 
     def visit(i: Any, pairs: list[tuple[Any, Splats, list[PixelRow]]], pixels: Any) -> Any:
         # Pixel by pixel, all splats of this iteration, so that a pixel's state is read once.
@@ -331,8 +326,7 @@ def walk_and_store(
     that were not visited because all pixels of their block were finished. A lane that draws a whole
     block writes to its own list's pairs in order, so no atomic operations are needed, and cache
     lines are filled at once. Lanes that share a block are a warp: it adds up their sums in a fixed
-    order and makes one addition to zeros.
-    """
+    order and makes one addition to zeros."""
     packets, whole = packet_count(count), lane.columns * lane.rows == PIXELS
     by_pair = (dr.empty if whole else dr.zeros)(mi.Float, len(lists.splat) * 4 * packets)
 

@@ -3,8 +3,7 @@ z-depth in metres, 0 = no return.
 
 Sources: Nguyen, Izadi and Lovell, 3DIMPVT 2012 (axial and lateral noise); Khoshelham and Elberink,
 Sensors 12(2), 2012 (quantisation). Lost returns on grazing surfaces have no published curve; ours
-is linear.
-"""
+is linear."""
 
 import numpy as np
 

@@ -28,8 +28,7 @@ def capture_of(dataset: Dataset) -> Callable[[Frame], Frame]:
     The files are bit for bit those of `synth_orbit` without `on_demand`. The scene is built at the
     first call, in seconds. capture raises InputError if the dataset has no config.json of `mgs
     synth-orbit --on-demand`, its mesh has changed or is gone, its denoiser is not installed, or the
-    frame is not one of the scene's orbit.
-    """
+    frame is not one of the scene's orbit."""
     prepared = cache(lambda: photographer_of(dataset.root))
 
     def capture(frame: Frame) -> Frame:

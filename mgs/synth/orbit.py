@@ -20,8 +20,7 @@ MOST_NOISE = 1000.0  # largest error of positions, metres: far beyond any orbit
 class PoseNoise:
     """Standard deviations of the pose errors in transforms.json, per axis: metres and degrees.
 
-    Raises InputError if one is negative, NaN or absurdly large.
-    """
+    Raises InputError if one is negative, NaN or absurdly large."""
 
     position: float = 0.0
     rotation: float = 0.0
@@ -46,8 +45,7 @@ def orbit_positions(settings: Orbit, frames: int, target: np.ndarray) -> np.ndar
     settings.kind: circle, of fixed radius and altitude (paper); rings, `turns` circles at rising
     elevations; spiral, `turns` turns of rising elevation; hemisphere, spread evenly between the
     elevations (Fibonacci lattice), sorted by azimuth. Frame k is then moved away from the target
-    [3] to settings.distances[k % len] times its distance.
-    """
+    [3] to settings.distances[k % len] times its distance."""
     step = np.arange(frames)
     low, high = np.radians(settings.elevations)
     along = step / max(frames - 1, 1)

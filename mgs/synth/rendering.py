@@ -93,8 +93,7 @@ def synth_orbit(
     An interrupted call is completed by a second one, with the same files as after one call. A
     finished dataset is loaded as it is. Raises InputError if the scene or preset is unknown, `out`
     is not empty, not writable or locked by another process, the mesh is bad, or the rock is not
-    wholly in every view or is hidden.
-    """
+    wholly in every view or is hidden."""
     runtime.start()
     out = Path(out)
     settings = scene if isinstance(scene, SceneFile) else load_scene_file(scene)

@@ -26,8 +26,7 @@ class Noise:
     """Gaussian noise in space, zero mean, unit variance, of one octave: wavelengths 1 to 2.
 
     White noise in a periodic volume, band-passed in Fourier space, so that octaves of different
-    scale share no frequencies (as wavelet noise, Cook and DeRose 2005); interpolated linearly.
-    """
+    scale share no frequencies (as wavelet noise, Cook and DeRose 2005); interpolated linearly."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng, self.threads = rng, ThreadPoolExecutor(2)
@@ -125,8 +124,7 @@ def load_rock(
     up: "y" or "z", by default `up_axis`. Returns the mesh, +Z up, and the scale. Faces without area
     and repeated faces are removed: normals of opposite faces cancel, and a vertex without normal
     has no shading. Raises InputError as `load_mesh`, and if all vertices are one point or at one
-    height.
-    """
+    height."""
     mesh = load_mesh(path)
     _leave_out_bad_faces(mesh)
     if mesh.extents.max() == 0:

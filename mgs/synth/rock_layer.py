@@ -22,8 +22,7 @@ class RockLayer(mi.SamplingIntegrator):
     Channels: those of the inner integrator (RGB, then its AOVs); the same again, where samples
     whose camera ray meets something else first count as 0; and the share of the samples that count.
     The inner integrator sees the whole scene and the same random numbers as without this class, so
-    its channels are the same bit for bit.
-    """
+    its channels are the same bit for bit."""
 
     def __init__(self, inner: Any, rock: Any) -> None:
         super().__init__(mi.Properties())
@@ -47,8 +46,7 @@ class Guides(mi.SamplingIntegrator):
     """Integrator of the denoiser's guides: channels of a `RockLayer` whose inner integrator gives
     black, albedo and shading normal.
 
-    The same numbers, to rounding, as with Mitsuba's `aov` integrator inside, with half the rays.
-    """
+    The same numbers, to rounding, as with Mitsuba's `aov` integrator inside, with half the rays."""
 
     def __init__(self, rock: Any) -> None:
         super().__init__(mi.Properties())
@@ -122,8 +120,7 @@ def with_coverage(values: np.ndarray, share: np.ndarray, coverage: np.ndarray) -
 
     values [H,W,C], share [H,W]: from `render_layers`; coverage [H,W]: share of the pixel that the
     rock covers. At the outline, few random samples give a noisy share. The result is the mean over
-    the samples that met the rock, or over the 3x3 pixels around if none did, times the coverage.
-    """
+    the samples that met the rock, or over the 3x3 pixels around if none did, times the coverage."""
     own = values / np.maximum(share, SHARE_MIN)[..., None]
     shares = np.maximum(uniform_filter(share, 3), SHARE_MIN)
     around = uniform_filter(values, (3, 3, 1)) / shares[..., None]

@@ -108,8 +108,7 @@ class MitsubaScene:
 
         Pixels that the rock covers wholly are the same in the image and in the picture of the rock
         alone. At the outline the latter is denoised on its own, guided by albedo and normals of the
-        rock alone.
-        """
+        rock alone."""
         return self.trace(camera, spp, seed, denoise).developed()
 
     def trace(self, camera: Camera, spp: int, seed: int, denoise: bool) -> Traced:
