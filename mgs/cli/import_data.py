@@ -114,13 +114,7 @@ def import_data(
         finished = os.path.isfile(out / "transforms.json")  # else the import refuses what is there
         source_shots, tests = shots.set_apart(test_every)
         result = import_source(
-            source_shots,
-            out,
-            masks=masks,
-            mesh=mesh,
-            downscale=downscale,
-            up=upward,
-            tests=tests,
+            source_shots, out, masks=masks, mesh=mesh, downscale=downscale, up=upward, tests=tests
         )
         poses, cloud = shots.fit, shots.sparse
         if shots.kind != PHOTOGRAPHS:

@@ -172,10 +172,7 @@ def prior(
 
 
 def _built(
-    dataset: "Dataset",
-    settings: "PriorSettings",
-    folder: Path,
-    **options: Any,
+    dataset: "Dataset", settings: "PriorSettings", folder: Path, **options: Any
 ) -> "tuple[Prior, SegmentedCloud | None]":
     """`prior_and_cloud`. A refused cloud is drawn beside `folder`; the error names the picture."""
     from mgs.prior.build import prior_and_cloud

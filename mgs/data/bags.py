@@ -146,9 +146,8 @@ class Tree:
         kind = next((name for name in (main, "tf") if name in by_kind), min(by_kind))
         others = sorted({*by_kind} - {kind})
         if others and kind not in (main, "tf"):
-            raise InputError(
-                f"{path}: poses of {child} come from {kind} and {others[0]}; give one as pose"
-            )
+            cure = "give one as pose"
+            raise InputError(f"{path}: poses of {child} come from {kind} and {others[0]}; {cure}")
         self.unused += [f"{name} (tf has the poses of {child})" for name in others]
         parent = max(by_kind[kind], key=lambda name: len(by_kind[kind][name]))
         if len(by_kind[kind]) > 1:
@@ -197,10 +196,8 @@ def read_bag(
                 f"record /tf and /tf_static with it{give}"
             )
         if not there:
-            raise InputError(
-                f"{path}: no image of {topic} has a pose at its time; "
-                "record poses and images together, by one clock"
-            )
+            cure = "record poses and images together, by one clock"
+            raise InputError(f"{path}: no image of {topic} has a pose at its time; {cure}")
         if len(there) > 1 and poses_agree([pose for _, pose in there]):
             raise InputError(
                 f"{path}: the camera does not move: the transforms that lead to {frame} are "

@@ -89,9 +89,8 @@ class Dataset:
             return self
         folder = self.root / SURVEY_FOLDER
         if not folder.is_dir():
-            raise InputError(
-                f"{self.root}: has neither images nor a survey for a prior; give one with `prior`"
-            )
+            cure = "give one with `prior`"
+            raise InputError(f"{self.root}: has neither images nor a survey for a prior; {cure}")
         return load_dataset(folder, up=self.world.up)
 
 
@@ -109,18 +108,16 @@ def load_dataset(
     root = Path(root)
     path = root / "transforms.json"
     if not root.is_dir():
-        raise InputError(
-            f"{root}: no such dataset folder; make one with `mgs import` or `mgs synth-orbit`"
-        )
+        cure = "make one with `mgs import` or `mgs synth-orbit`"
+        raise InputError(f"{root}: no such dataset folder; {cure}")
     data, records = read_records(path)
     upward = up or data.get("up") or PLUS_Z
     world = World(unit_up(upward), unit_of(path, data) or "m", _origin_of(path, data))
     frames = [_frame(path, data, i, record, to_capture, world) for i, record in enumerate(records)]
     for name, count in Counter(frame.name for frame in frames).items():
         if count > 1:  # runs and pictures refer to a frame by its name
-            raise InputError(
-                f"{path}: lists {count} frames named {name}; remove or rename all but one"
-            )
+            cure = "remove or rename all but one"
+            raise InputError(f"{path}: lists {count} frames named {name}; {cure}")
     ordered = tuple(sorted(frames, key=lambda frame: (frame.timestamp, frame.name)))
     return Dataset(root, ordered, world)
 
@@ -165,24 +162,20 @@ def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]
     both = data | record
     distorted = any(both.get(key) not in (None, 0) for key in DISTORTION)
     if distorted or (both.get("camera_model") or "OPENCV") not in PINHOLES:
-        raise InputError(
-            f"{where} is distorted, or no pinhole camera; undistort images with `mgs import`"
-        )
+        cure = "undistort images with `mgs import`"
+        raise InputError(f"{where} is distorted, or no pinhole camera; {cure}")
     absent = [key for key in INTRINSICS if both.get(key) is None]
     if absent:
-        raise InputError(
-            f"{where} lacks {absent[0]}; correct the intrinsics "
-            "(`mgs import` reads files with camera_angle_x)"
-        )
+        cure = "correct the intrinsics (`mgs import` reads files with camera_angle_x)"
+        raise InputError(f"{where} lacks {absent[0]}; {cure}")
     try:
         fl_x, fl_y, cx, cy, w, h = (both[key] for key in INTRINSICS)
         K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]], np.float64)
         width, height = float(w or 0), float(h or 0)
         pose = np.array(record["transform_matrix"], np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(
-            f"{where} has no usable intrinsics or pose; give fl_x fl_y cx cy w h, a 4x4 matrix"
-        ) from None
+        cure = "give fl_x fl_y cx cy w h, a 4x4 matrix"
+        raise InputError(f"{where} has no usable intrinsics or pose; {cure}") from None
     return posed_camera(where, K, width, height, pose)
 
 
@@ -192,9 +185,8 @@ def posed_camera(
     """Camera of a transform_matrix: OpenGL camera-to-world [4,4]. Raises InputError, which begins
     with `where`, if the pose or the intrinsics are bad."""
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise InputError(
-            f"{where} has a transform_matrix that is not a finite 4x4 matrix; correct the pose"
-        )
+        cure = "correct the pose"
+        raise InputError(f"{where} has a transform_matrix that is not a finite 4x4 matrix; {cure}")
     try:
         return Camera(K, width, height, opencv_from_opengl(pose))  # type: ignore[arg-type]
     except np.linalg.LinAlgError:
@@ -261,9 +253,8 @@ def _frame(
     for field, key in FILES.items():
         paths[field] = root / record[key] if record.get(key) else None
         if paths[field] and not on_demand and not paths[field].is_file():
-            raise InputError(
-                f"{where}: {key} {record[key]} does not exist; restore it or remove the frame"
-            )
+            cure = "restore it or remove the frame"
+            raise InputError(f"{where}: {key} {record[key]} does not exist; {cure}")
     name = Path(record["file_path"]).stem
     return as_captured(Frame(name, camera, timestamp, **paths, on_demand=on_demand), world)
 
@@ -330,9 +321,8 @@ def target_of(frame: Frame, with_alpha: bool = False) -> np.ndarray:
     is `padded`, so that a fit uses its memory in place of a copy. Raises InputError if the mask is
     empty, since a fit to black would remove the rock."""
     if not frame.mask().any():
-        raise InputError(
-            f"{frame.mask_path}: its rock mask is empty; correct it, or remove frame {frame.name}"
-        )
+        cure = f"correct it, or remove frame {frame.name}"
+        raise InputError(f"{frame.mask_path}: its rock mask is empty; {cure}")
     rgba, weight = frame.target()
     alpha = [rgba[..., 3]] if with_alpha else []
     return padded(np.dstack([rgba[..., :3], weight, *alpha]))

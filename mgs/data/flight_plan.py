@@ -93,9 +93,8 @@ class Stop:
 def check_plan_path(path: Path) -> None:
     """Raise InputError if no flight plan is written with this suffix."""
     if path.suffix.lower() not in WRITERS:
-        raise InputError(
-            f"plan {path}: flight plans are written as {', '.join(WRITERS)}; choose another ending"
-        )
+        cure = "choose another ending"
+        raise InputError(f"plan {path}: flight plans are written as {', '.join(WRITERS)}; {cure}")
 
 
 def write_flight_plan(

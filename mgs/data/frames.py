@@ -78,9 +78,8 @@ class Frame:
         """z-depth float32 [H,W], metres, 0 = no return. Raises InputError as `rgb`, and if the
         frame has no depth file."""
         if self.depth_path is None:
-            raise InputError(
-                f"frame {self.name}: has no depth_file_path; this command needs RGB-D frames"
-            )
+            cure = "this command needs RGB-D frames"
+            raise InputError(f"frame {self.name}: has no depth_file_path; {cure}")
         depth = read_depth(self._existing(self.depth_path))
         return np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
 

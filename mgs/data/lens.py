@@ -53,13 +53,11 @@ class Lens:
         if "f" in names and not np.isclose(K[0, 0], K[1, 1]):
             raise InputError(f"{where} has two focal lengths, and {model} has one; correct them")
         if not names or "w" in names:
-            raise InputError(
-                f"{where}: camera model {model} is not supported; undistort the images first"
-            )
+            cure = "undistort the images first"
+            raise InputError(f"{where}: camera model {model} is not supported; {cure}")
         if lacking := [name for name in values if name not in names]:
-            raise InputError(
-                f"{where} has {lacking[0]}, which the model {model} lacks; undistort the images"
-            )
+            cure = "undistort the images"
+            raise InputError(f"{where} has {lacking[0]}, which the model {model} lacks; {cure}")
         if model == "PINHOLE":
             return None
         return cls(model, tuple(float({**intrinsic, **values}.get(name, 0)) for name in names))

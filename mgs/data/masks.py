@@ -43,9 +43,8 @@ def make_masks(dataset: Dataset, mesh: Mesh) -> Dataset:
         frames.append(replace(frame, mask_path=path))
         thumbnails.append(_outlined(rgb, mask))
     if not visible:
-        raise InputError(
-            f"{dataset.root}: the mesh is in no image; make masks with one that fits the poses"
-        )
+        cure = "make masks with one that fits the poses"
+        raise InputError(f"{dataset.root}: the mesh is in no image; {cure}")
     write_sheet(dataset.root / SHEET, thumbnails, ACROSS)
     write_transforms(dataset.root, frames, dataset.world)
     return replace(dataset, frames=tuple(frames))

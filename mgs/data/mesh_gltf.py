@@ -98,9 +98,8 @@ def _visual(
     factor, texture = _base_colour(gltf, primitive)
     colours = gltf.accessor(attributes["COLOR_0"])[:, :3] if "COLOR_0" in attributes else None
     if (texture or textured) and colours is not None and (colours < 0.99).any():
-        raise InputError(
-            f"{gltf.path}: has vertex colours beside a texture; bake them into the texture"
-        )
+        cure = "bake them into the texture"
+        raise InputError(f"{gltf.path}: has vertex colours beside a texture; {cure}")
     white = np.ones(3) if factor is None else factor
     if not texture and not textured:
         if factor is None and colours is None:
@@ -132,9 +131,8 @@ def _coordinates(gltf: Gltf, attributes: dict[str, int], texture: dict[str, Any]
     wraps = {} if sampler is None else gltf.json["samplers"][sampler]
     repeats = all(wraps.get(axis, REPEAT) == REPEAT for axis in ("wrapS", "wrapT"))
     if not repeats and not ((uv > -1e-3) & (uv < 1.001)).all():
-        raise InputError(
-            f"{gltf.path}: its texture is clamped or mirrored beyond its edge; bake it anew"
-        )
+        cure = "bake it anew"
+        raise InputError(f"{gltf.path}: its texture is clamped or mirrored beyond its edge; {cure}")
     return uv
 
 

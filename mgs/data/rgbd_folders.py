@@ -73,9 +73,8 @@ def calibration(folder: Path) -> tuple[np.ndarray, Lens | None]:
         )
     values = numbers(path, [word for words in rows(path, 1) for word in words])
     if len(values) not in (4, 8, 9):
-        raise InputError(
-            f"{path}: has {len(values)} numbers; give fx fy cx cy, or fx fy cx cy k1 k2 p1 p2 k3"
-        )
+        cure = "give fx fy cx cy, or fx fy cx cy k1 k2 p1 p2 k3"
+        raise InputError(f"{path}: has {len(values)} numbers; {cure}")
     fx, fy, cx, cy, *distortion = values
     K = np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]])
     return K, opencv_lens(str(path), K, distortion)
@@ -126,9 +125,8 @@ def read_open3d(folder: Path, spacing: Spacing) -> Source:
     words = [word for line in rows(path, 3) for word in line]
     values = numbers(path, words)
     if not len(values) or len(values) % 19:
-        raise InputError(
-            f"{path}: needs three numbers and a 4x4 matrix for each image; record it again"
-        )
+        cure = "record it again"
+        raise InputError(f"{path}: needs three numbers and a 4x4 matrix for each image; {cure}")
     raw = np.array(values).reshape(-1, 19)[:, 3:].reshape(-1, 4, 4)
     matrices, mended = zip(*map(orthonormal, raw), strict=True)
     images, depths = (
@@ -142,9 +140,8 @@ def read_open3d(folder: Path, spacing: Spacing) -> Source:
                 "make them equal"
             )
     if unnumbered := [path for path in images if not re.search(r"\d", path.name)]:
-        raise InputError(
-            f"{unnumbered[0]}: its name has no number, which gives its pose; rename it"
-        )
+        cure = "rename it"
+        raise InputError(f"{unnumbered[0]}: its name has no number, which gives its pose; {cure}")
     times = OPEN3D_INTERVAL * np.arange(len(images))
     K, lens = calibration(folder)
     shots: list[Shot] = []
@@ -217,9 +214,8 @@ def _pose(path: Path, row: list[float]) -> np.ndarray:
     try:
         return rigid(row[:3], row[3:])
     except ValueError:
-        raise InputError(
-            f"{path}: has a quaternion whose length is not 1; correct the line"
-        ) from None
+        cure = "correct the line"
+        raise InputError(f"{path}: has a quaternion whose length is not 1; {cure}") from None
 
 
 def _shot(

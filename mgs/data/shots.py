@@ -68,9 +68,8 @@ class Source:
     def in_metres(self, unit: float) -> Source:
         """Scale cameras and points by `unit` metres. Raises InputError unless it is positive."""
         if not 1e-9 <= unit <= 1e9:
-            raise InputError(
-                f"import: unit {unit} must be a number of metres, 1e-9 to 1e9; correct it"
-            )
+            cure = "correct it"
+            raise InputError(f"import: unit {unit} must be a number of metres, 1e-9 to 1e9; {cure}")
         shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
         sparse, (x, y, z) = self.sparse and self.sparse.scaled(unit), self.origin
         origin = x * unit, y * unit, z * unit

@@ -120,10 +120,8 @@ def _recognised(
 ) -> Source:
     """`read_source` without checks of the shots. Raises OSError for names that are too long."""
     if not source.exists():
-        raise InputError(
-            f"{source}: no such file or folder; "
-            "give a transforms.json, its folder, or a COLMAP folder"
-        )
+        cure = "give a transforms.json, its folder, or a COLMAP folder"
+        raise InputError(f"{source}: no such file or folder; {cure}")
     if source.suffix.lower() in PICTURE_SUFFIXES and source.is_file():
         raise InputError(f"{source}: is one picture; give the folder of all photographs")
     if source.suffix.lower() in UNREAD and source.is_file():
@@ -268,16 +266,13 @@ def record_camera(
         values = {key: float(record[key]) for key in COEFFICIENTS if key in record}
         pose = np.array(record["transform_matrix"], np.float64)
     except (KeyError, TypeError, ValueError, ArithmeticError):
-        raise InputError(
-            f"{where} has no usable intrinsics or pose; give fl_x (or camera_angle_x) and a matrix"
-        ) from None
+        cure = "give fl_x (or camera_angle_x) and a matrix"
+        raise InputError(f"{where} has no usable intrinsics or pose; {cure}") from None
     if record.get("is_fisheye") and "FISHEYE" not in str(model):
         model = "OPENCV_FISHEYE"
     if values.get("k4") and model in ("OPENCV", "PINHOLE"):
-        raise InputError(
-            f"{where} has k4, which the OPENCV model lacks; undistort the images first, or give "
-            "camera_model FULL_OPENCV or OPENCV_FISHEYE"
-        )
+        cure = "undistort the images first, or give camera_model FULL_OPENCV or OPENCV_FISHEYE"
+        raise InputError(f"{where} has k4, which the OPENCV model lacks; {cure}")
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0, 0, 0, 1]])
     pose, mended = orthonormal(pose)

@@ -92,10 +92,8 @@ def unit_up(vector: Sequence[float] | np.ndarray) -> Vector:
     with np.errstate(over="ignore"):
         length = np.linalg.norm(values)
     if values.shape != (3,) or not np.isfinite(length) or length == 0:
-        raise InputError(
-            "up: must be three finite numbers that are not all zero; "
-            "correct `up`, here or in transforms.json"
-        )
+        cure = "correct `up`, here or in transforms.json"
+        raise InputError(f"up: must be three finite numbers that are not all zero; {cure}")
     x, y, z = (values / length + 0.0).tolist()
     return x, y, z
 

@@ -357,9 +357,8 @@ def load_prior(folder: str | Path) -> Prior:
     missing, damaged or holds NaN."""
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(
-            f"{folder}: no such prior; make one with `mgs prior DATASET --out {folder}`"
-        )
+        cure = f"make one with `mgs prior DATASET --out {folder}`"
+        raise InputError(f"{folder}: no such prior; {cure}")
     numbers = read_json(folder / "prior.json")
     path = folder / "points.ply"
     if not path.is_file():
@@ -371,18 +370,16 @@ def load_prior(folder: str | Path) -> Prior:
         spacing, tolerance = float(numbers["spacing"]), float(numbers["depth_tolerance"])
         backed, world = int(numbers["backed"]), World(unit_up(numbers["up"]))
     if not np.isfinite(columns).all() or len(columns) < 2:
-        raise InputError(
-            f"{path}: has NaN values, or fewer than two points; make it again with `mgs prior`"
-        )
+        cure = "make it again with `mgs prior`"
+        raise InputError(f"{path}: has NaN values, or fewer than two points; {cure}")
     if not (0 < spacing < np.inf and 0 < tolerance < np.inf):
         raise InputError(
             f"{folder / 'prior.json'}: spacing and depth_tolerance must be positive metres; "
             "make the prior again"
         )
     if not 0 <= backed <= len(columns):
-        raise InputError(
-            f"{folder / 'prior.json'}: backed must be a number of the points; make the prior again"
-        )
+        cure = "make the prior again"
+        raise InputError(f"{folder / 'prior.json'}: backed must be a number of the points; {cure}")
     mesh = read_mesh(folder / "mesh.ply")
     points, normals = columns[:, :3], columns[:, 3:]
     prior = Prior(mesh, points, normals, spacing, tolerance, numbers, backed)

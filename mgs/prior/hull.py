@@ -149,9 +149,8 @@ def _bounds(frames: Sequence[Frame]) -> tuple[np.ndarray, float]:
         tangent = np.linalg.norm(pixels - middle, axis=1).max() / K[0, 0]
         cones.append((frame.camera.position, tangent))
     if not cones:
-        raise InputError(
-            "prior: every mask is empty or full; give masks that are white on the object only"
-        )
+        cure = "give masks that are white on the object only"
+        raise InputError(f"prior: every mask is empty or full; {cure}")
     centre = nearest_point([position for position, _ in cones], rays)
     half = MARGIN * max(np.linalg.norm(at - centre) * tangent for at, tangent in cones)
     return centre - half, float(2 * half)

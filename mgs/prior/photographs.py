@@ -65,10 +65,8 @@ def choose_source(dataset: Dataset, source: str | None = None, points: Path | No
 def check_enough(photographs: int, where: str = "prior") -> None:
     """Raise InputError for under LEAST_PHOTOGRAPHS. where: their folder or use, for the message."""
     if photographs < LEAST_PHOTOGRAPHS:
-        raise InputError(
-            f"{where}: {photographs} photographs without depth are too few; "
-            f"take at least {LEAST_PHOTOGRAPHS}, from all sides"
-        )
+        cure = f"take at least {LEAST_PHOTOGRAPHS}, from all sides"
+        raise InputError(f"{where}: {photographs} photographs without depth are too few; {cure}")
 
 
 def check_photographs(frames: Sequence[Frame], of_object: bool) -> None:
@@ -94,10 +92,7 @@ def check_masks(frames: Sequence[Frame]) -> None:
 
 
 def surface_of(
-    dataset: Dataset,
-    source: str,
-    settings: PriorSettings,
-    points: Path | None = None,
+    dataset: Dataset, source: str, settings: PriorSettings, points: Path | None = None
 ) -> Surface:
     """Surface of the source "points" or "hull". points: file of the cloud, by default the dataset's
     own. With masks, the hull bounds the surface of the points and closes it. Raises InputError as

@@ -80,9 +80,8 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
     if len(sample) > 10_000:
         sample = rng.choice(sample, 10_000, replace=False)
     if len(sample) < 3:
-        raise InputError(
-            f"cloud: only {len(sample)} points; too few for a plane, give more depth frames"
-        )
+        cure = "too few for a plane, give more depth frames"
+        raise InputError(f"cloud: only {len(sample)} points; {cure}")
     model, inliers = ransac(sample, Plane, 3, tolerance, max_trials=300, rng=rng)
     share = 0.0 if inliers is None else float(np.mean(inliers))
     if share < PLANE_MIN_SHARE:
@@ -96,9 +95,8 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
         residual = model.residuals(around)
         core = np.abs(residual) < tolerance
         if core.sum() < 3:
-            raise InputError(
-                "cloud: no ground near what the cameras look at; photograph it, or give `mesh`"
-            )
+            cure = "photograph it, or give `mesh`"
+            raise InputError(f"cloud: no ground near what the cameras look at; {cure}")
         spread = np.abs(residual[core] - np.median(residual[core]))
         sigma = SIGMA_FROM_MAD * float(np.median(spread))
         tolerance = min(tolerance, max(3 * sigma, 2 * cloud.voxel))

@@ -44,21 +44,18 @@ class PriorSettings:
         """Raise InputError if a Poisson depth is set, which needs a cloud. why: end of the message,
         what the surface is made of instead."""
         if self.poisson_depth is not None:
-            raise InputError(
-                f"prior: `poisson_depth` shapes a mesh of a cloud, but {why}; leave out either"
-            )
+            cure = "leave out either"
+            raise InputError(f"prior: `poisson_depth` shapes a mesh of a cloud, but {why}; {cure}")
 
     def __post_init__(self) -> None:
         if isinstance(self.gaussians, int) and self.gaussians < 2:
-            raise InputError(
-                f"prior: {self.gaussians} Gaussians are too few for a model; raise `gaussians`"
-            )
+            cure = "raise `gaussians`"
+            raise InputError(f"prior: {self.gaussians} Gaussians are too few for a model; {cure}")
         if self.spacing is not None and not self.spacing > 0:
             raise InputError(f"prior: spacing {self.spacing} m must be positive")
         if self.gaussians is not None and self.spacing is not None:
-            raise InputError(
-                "prior: `gaussians` and `spacing` fix the same number; give one of them"
-            )
+            cure = "give one of them"
+            raise InputError(f"prior: `gaussians` and `spacing` fix the same number; {cure}")
         if self.density is not None and not 0 < self.density < np.inf:
             raise InputError(f"prior: density {self.density} must be positive; correct it")
         if self.poisson_depth is not None and not 3 <= self.poisson_depth <= 12:
@@ -66,6 +63,5 @@ class PriorSettings:
                 f"prior: `poisson_depth` {self.poisson_depth} is not within 3 to 12; correct it"
             )
         if not 0 <= self.backing <= 1:
-            raise InputError(
-                f"prior: {self.backing} Gaussians per sample are not 0 to 1; correct `backing`"
-            )
+            cure = "correct `backing`"
+            raise InputError(f"prior: {self.backing} Gaussians per sample are not 0 to 1; {cure}")

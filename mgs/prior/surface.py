@@ -49,10 +49,8 @@ def poisson_mesh(
     solid, depth = _closed_solid(points, normals, voxel, depth, plane)
     solid = _supported(solid.trim_by_plane(plane.normal, plane.offset), points)
     if solid.is_empty():
-        raise InputError(
-            f"prior: Poisson at depth {depth} gives nothing above the ground; "
-            "give more frames, or take the source hull"
-        )
+        cure = "give more frames, or take the source hull"
+        raise InputError(f"prior: Poisson at depth {depth} gives nothing above the ground; {cure}")
     mesh = _from_solid(solid)
     limit = 1e-6 * np.ptp(mesh.vertices, axis=0).max()
     on_ground = np.abs(plane.height(mesh.vertices)) < limit
@@ -87,9 +85,8 @@ def intersection(a: Mesh, b: Mesh) -> Mesh:
     """Largest piece of the intersection of watertight meshes. Raises InputError if empty."""
     pieces = (_to_solid(a.vertices, a.faces) ^ _to_solid(b.vertices, b.faces)).decompose()
     if not pieces:
-        raise InputError(
-            "prior: no point lies in the hull of the masks; correct poses, points or masks"
-        )
+        cure = "correct poses, points or masks"
+        raise InputError(f"prior: no point lies in the hull of the masks; {cure}")
     return _from_solid(max(pieces, key=lambda part: part.volume()))
 
 
@@ -139,10 +136,8 @@ def _closed_solid(
             solid = _to_solid(vertices, faces)
             if solid.status() == manifold3d.Error.NoError and not solid.is_empty():
                 return solid, depth
-    raise InputError(
-        f"prior: Poisson at depth {depth} gives no closed surface; "
-        "try another `poisson_depth`, more frames, or take the source hull"
-    )
+    cure = "try another `poisson_depth`, more frames, or take the source hull"
+    raise InputError(f"prior: Poisson at depth {depth} gives no closed surface; {cure}")
 
 
 def sample_surface(

@@ -53,10 +53,8 @@ def error_to_truth(
         # Faces of a scanned rock may be wound either way.
         seen |= visible(surface, normals, frame.camera, frame.depth(), tolerance, two_sided=True)
     if not seen.any():
-        raise InputError(
-            f"{truth}: no frame sees the true rock; it is of another dataset or in other "
-            "coordinates, so remove or replace it"
-        )
+        cure = "it is of another dataset or in other coordinates, so remove or replace it"
+        raise InputError(f"{truth}: no frame sees the true rock; {cure}")
     there = distances_to_mesh(points, true.vertices, true.faces)
     back = distances_to_mesh(surface[seen], mesh.vertices, mesh.faces)
     return {

@@ -43,10 +43,7 @@ class Compacted:
 
 
 def compact_run(
-    run: Run,
-    size: int | None = None,
-    psnr: float | None = None,
-    shared: bool = False,
+    run: Run, size: int | None = None, psnr: float | None = None, shared: bool = False
 ) -> Compacted:
     """Make the best model of at most `size` bytes, or the smallest of `psnr` dB in the views taken.
 
@@ -101,12 +98,7 @@ def refitting(run: Run) -> Callable[[Gaussians], Gaussians]:
     return lambda g: fit_gaussians(g, *given, cache=scene.cache, lam=lam).gaussians
 
 
-def thin_run(
-    run: Run,
-    kind: str,
-    size: int | None = None,
-    psnr: float | None = None,
-) -> Compacted:
+def thin_run(run: Run, kind: str, size: int | None = None, psnr: float | None = None) -> Compacted:
     """Make a file of another format (`mgs.splat_files.FORMATS`) with as many Gaussians as fit into
     `size` bytes, or as few as have `psnr` dB in the views taken.
 

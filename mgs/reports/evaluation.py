@@ -24,10 +24,7 @@ from mgs.splat_places import from_source
 
 
 def evaluate_run(
-    run: str | Path | Run,
-    *,
-    pictures: bool = True,
-    say: Callable[[str], None] = lambda text: None,
+    run: str | Path | Run, *, pictures: bool = True, say: Callable[[str], None] = lambda text: None
 ) -> dict[str, Any]:
     """Evaluate a run of `mgs nbv` on its dataset and its test views; write RUN/metrics.json and,
     with `pictures`, RUN/renders. Returns the contents of metrics.json.

@@ -91,10 +91,7 @@ class Checks:
         return entry
 
     def indicators(
-        self,
-        state: State,
-        views: list[detectors.ViewIndicators],
-        steps: Sequence[dict[str, Any]],
+        self, state: State, views: list[detectors.ViewIndicators], steps: Sequence[dict[str, Any]]
     ) -> dict[str, Any]:
         """`indicators` of the last step, and `warnings` where one now exceeds its limit."""
         assert state.fit is not None

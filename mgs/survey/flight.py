@@ -75,9 +75,8 @@ def fly(dataset: Dataset, settings: SurveySettings) -> Survey:
     frames, or one has no depth image or too few returns to be registered."""
     frames = dataset.frames
     if len(frames) < 3:
-        raise InputError(
-            f"{dataset.root}: {len(frames)} frames are too few for a survey; at least 3 are needed"
-        )
+        cure = "at least 3 are needed"
+        raise InputError(f"{dataset.root}: {len(frames)} frames are too few for a survey; {cure}")
     depths = []
     for k, frame in enumerate(frames):
         report("depth", k, len(frames))

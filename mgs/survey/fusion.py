@@ -66,9 +66,8 @@ def fuse_frames(frames: Sequence[Frame]) -> Cloud:
     returns = [depth[depth > 0] for depth in depths]
     total = sum(map(len, returns))
     if total == 0:
-        raise InputError(
-            "cloud: no depth image has a return; check the depth files, or their unit (metres)"
-        )
+        cure = "check the depth files, or their unit (metres)"
+        raise InputError(f"cloud: no depth image has a return; {cure}")
     stride = max(1, int(np.ceil(np.sqrt(total / MAX_FUSED_PIXELS))))
     # The lower quartile of depths is about that of the rock; most of a frame is ground behind it.
     focal = [frame.camera.K[0, 0] for frame in frames]
@@ -90,9 +89,8 @@ def fuse_frames(frames: Sequence[Frame]) -> Cloud:
         views.append(view / np.linalg.norm(view, axis=1, keepdims=True))
     p, index = voxel_means(np.concatenate(points), voxel)
     if len(p) == 0:
-        raise InputError(
-            "cloud: no usable depth near what the cameras look at; check the depth files and poses"
-        )
+        cure = "check the depth files and poses"
+        raise InputError(f"cloud: no usable depth near what the cameras look at; {cure}")
     view = _group_means(np.concatenate(views), index, len(p))
     norm = np.linalg.norm(view, axis=1, keepdims=True)
     unit = view / np.where(norm > 0, norm, 1.0)

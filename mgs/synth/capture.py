@@ -74,10 +74,8 @@ def photographer_of(root: Path) -> tuple[Photographer, dict[str, Frame], bool]:
     if mesh is not None:
         with reading(Path(mesh), f"mesh, of which {root} is made"):
             if made_of != fingerprint(mesh) | {"up": made_of["up"]}:
-                raise InputError(
-                    f"{mesh}: has changed since {root} was made of it; "
-                    "restore it, or make the dataset again"
-                )
+                cure = "restore it, or make the dataset again"
+                raise InputError(f"{mesh}: has changed since {root} was made of it; {cure}")
     rock, _ = rock_of(settings, seed, mesh, made_of and made_of["up"])
     cameras = rock_cameras(settings, (preset.width, preset.height), preset.frames, rock)
     scene = MitsubaScene(settings, rock, cameras[0], seed)

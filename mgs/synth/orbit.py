@@ -115,9 +115,8 @@ def _aimed(
     for index, camera in enumerate(cameras):
         planes = borders @ camera.K @ camera.world_to_camera[:3]
         if ((planes[:, :3] @ visible).min(1) + planes[:, 3] < [0, 0, 0, 0, 1e-9]).any():
-            raise InputError(
-                f"scene: the rock is not wholly in {what} {index}; raise orbit.radius or camera.fov"
-            )
+            cure = "raise orbit.radius or camera.fov"
+            raise InputError(f"scene: the rock is not wholly in {what} {index}; {cure}")
     return cameras
 
 

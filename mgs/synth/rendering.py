@@ -324,9 +324,8 @@ def _meter(
         rgb, _, _ = scene.light(cameras[index], 2, meter_seed)
         depth, mask = scene.cast(cameras[index])
         if not mask.any():
-            raise InputError(
-                f"scene: frame {index} shows no rock; raise orbit.altitude, or lower rock.buried"
-            )
+            cure = "raise orbit.altitude, or lower rock.buried"
+            raise InputError(f"scene: frame {index} shows no rock; {cure}")
         means.append(float(rgb[mask].mean()))
         if not np.isfinite(means[-1]):
             bad = f"the rock has pixels that are NaN or infinite in frame {index}"

@@ -152,6 +152,5 @@ def sensor_of(dataset: Path) -> Sensor:
     try:
         return Sensor.model_validate(recorded.get("scene", {}).get("sensor", {}))
     except (ValidationError, AttributeError):
-        raise InputError(
-            f"{path}: its scene.sensor is damaged; correct it or give `sensor_noise` and `drift`"
-        ) from None
+        cure = "correct it or give `sensor_noise` and `drift`"
+        raise InputError(f"{path}: its scene.sensor is damaged; {cure}") from None
