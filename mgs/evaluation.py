@@ -161,8 +161,7 @@ def evaluate_model(
 
     - images: number of training frames.
     - test (if there are test views), all, held_out: number of views ("count") and the mean of each
-      of METRICS, and of each of SURFACE_METRICS that the data has a truth for; None if no view has
-      it.
+      of METRICS, and of each of SURFACE_METRICS that the data has a truth for; None without a view.
     - views, test_views: for each view its "name", "trained" (bool) and its metrics, None if there
       is no pixel to measure, as in an empty mask.
 
@@ -225,8 +224,7 @@ def write_comparison(
     """Write one PNG with three panels side by side: truth, render, and their absolute difference,
     brightened. A strip above holds their captions.
 
-    truth, rendered: [H,W,3] linear RGB; decibels: the PSNR. Raises InputError if the file cannot be
-    written."""
+    truth, rendered: [H,W,3] linear RGB; decibels: the PSNR. Raises InputError as `write_png`."""
     from PIL import Image, ImageDraw, ImageFont
 
     a, b = srgb_from_linear(truth), srgb_from_linear(rendered)

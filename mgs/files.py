@@ -131,8 +131,7 @@ def reading(path: Path, what: str = "file") -> Iterator[None]:
 
 @contextmanager
 def parsing(path: Path, what: str, cure: str) -> Iterator[None]:
-    """Context manager: turns errors of a damaged file into an InputError, and bounds the memory
-    (`mgs.memory.decoding`).
+    """Context manager: turns errors of a damaged file into an InputError; bounds the memory.
 
     what: kind of file. cure: end of the line. All errors count, since libraries raise many types.
     """
@@ -147,8 +146,7 @@ def parsing(path: Path, what: str, cure: str) -> Iterator[None]:
 
 
 def copy_file(source: Path, path: Path) -> None:
-    """Copy a file; the copy appears complete. Raises InputError if the source cannot be read or the
-    copy cannot be written."""
+    """Copy a file; the copy appears complete. Raises InputError as `reading` and `atomic_path`."""
     with reading(source):
         data = source.read_bytes()
     with atomic_path(path) as temporary:
@@ -240,8 +238,7 @@ def read_csv(path: str | Path) -> list[tuple[int, list[str]]]:
 
 
 def read_xml(path: str | Path) -> Any:
-    """Root element of an XML file without entities. Raises InputError if it is missing, unreadable
-    or not valid XML."""
+    """Root element of an XML file without entities. Raises InputError as `read_json`."""
     from defusedxml.ElementTree import fromstring
 
     return _parsed(path, "XML", fromstring)

@@ -26,8 +26,7 @@ def visible(
     *,
     two_sided: bool = False,
 ) -> np.ndarray:
-    """Whether points are seen, bool [N]: in the image, facing the camera, and at the depth of their
-    pixel.
+    """Whether points are seen, bool [N]: in the image, facing the camera, at the pixel's depth.
 
     points [N,3] world, metres; normals [N,3] unit; depth [H,W] z-depth, metres, 0 = no return;
     tolerance: largest depth difference, metres; two_sided: include points that face away. The

@@ -27,8 +27,7 @@ LARGEST_LOSS = 10.0  # of `refit_run`, dB: with that next to nothing is learned 
 @dataclass(frozen=True)
 class PrunedRun:
     """Numbers of Gaussians before and after, rms change of the training images, predicted and
-    actual, and PSNR before and after on `views`, "test" or "held-out", dB; None if there are
-    none."""
+    actual, and PSNR before and after on `views`, "test" or "held-out", dB, if any."""
 
     before: int
     after: int
@@ -39,8 +38,7 @@ class PrunedRun:
 
 
 def prune_run(run: str | Path, noise: float = PRUNE_NOISE) -> PrunedRun:
-    """Prune the model of a run by its training views (`mgs.fit.pruning.prune`), and write
-    RUN/PRUNED.
+    """Prune the model of a run by its training views (`mgs.fit.pruning`); write RUN/PRUNED.
 
     Both models are compared on the test views of the dataset, or without them on the held-out
     views. Raises InputError as `open_run` and `prune`."""
@@ -61,8 +59,7 @@ def prune_run(run: str | Path, noise: float = PRUNE_NOISE) -> PrunedRun:
 @dataclass(frozen=True)
 class RefittedRun:
     """Learned parameters of the run, the refitted model, and PSNR on `views`, "test" or "held-out",
-    dB: of the run's own model, of one refitted with all parameters, and of the refitted one, or
-    None."""
+    dB: of the run's own model, of one refitted with all parameters, and of the refitted one."""
 
     before: int
     lean: "LeanModel"
@@ -81,8 +78,7 @@ def refit_run(
     A vertex of the file has a byte for each kind of parameter, `learned_colour` and so on: 1 if it
     was learned; else the file holds the prior's value. The models are compared on the test views,
     or without them on the held-out views. Raises InputError as `open_run` and `lean_fit`, for wrong
-    arguments, for a run whose density is not fixed, and if the prior or the images are not those of
-    the run."""
+    arguments, for a run whose density is not fixed, and if prior or images have changed."""
     from mgs.fit.evidence import lean_fit
     from mgs.learning import images_of
     from mgs.scene import Scene

@@ -39,8 +39,7 @@ def report(
 ) -> list[Path]:
     """Write all figures and the table of runs into the folder `out`; return the paths of the files.
 
-    runs: runs, their folders, or a folder of runs. kind: format of the figures, one of
-    `mgs.plotting.FORMATS`.
+    runs: runs, their folders, or a folder of runs. kind: one of `mgs.plotting.FORMATS`.
 
     - orbit.png, gain.png, coverage.png (`mgs.reports.figures`): only if a run has chosen views;
     - comparison.png: a view as `shown_view` chooses it;
@@ -90,8 +89,7 @@ def _draw_choices(paths: Mapping[str, Path], runs: Mapping[str, Run]) -> None:
 
 
 def shown_view(runs: Sequence[Run]) -> tuple[Frame, str]:
-    """The view that the comparison shows, and the key of metrics.json that lists it, "test_views"
-    or "views".
+    """The view that the comparison shows, and its key in metrics.json, "test_views" or "views".
 
     It is one of the test views if all runs were measured on them, else of those that the fewest
     runs were trained on: the one whose PSNRs are closest to the runs' means, in least squares. Of

@@ -94,8 +94,7 @@ def _last_line(log: Path) -> str:
 
 def watched(timeout: float) -> Transport:
     """Transport that waits until somebody puts the picture beside the pose. A picture is complete
-    when it can be read and no file of the answer changed between two looks. timeout: seconds to
-    wait."""
+    when it can be read and no file of the answer changed between two looks. timeout: seconds."""
 
     def deliver(pose: Path, out: Path) -> None:
         said = f"waiting at most {timeout:g} s for {out} (pose in {pose.name})"
