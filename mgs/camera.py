@@ -25,9 +25,9 @@ class Camera:
 
     - K: [3,3] float64, intrinsics in pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
     - width, height: of the image, pixels.
-    - world_to_camera: [4,4] float64, rigid transform in metres, to OpenCV axes. - film, corner: of
-      a crop window, the camera of the whole film, and the window's left and top on it, pixels
-      (`cropped`). Splats are projected as for the film: tiles fit bit for bit.
+    - world_to_camera: [4,4] float64, rigid transform in metres, to OpenCV axes.
+    - film, corner: of a crop window, the camera of the whole film, and the window's left and top on
+      it, pixels (`cropped`). Splats are projected as for the film: tiles fit bit for bit.
 
     K and world_to_camera may be Dr.Jit tensors. `mgs.render` then differentiates the image by them;
     `traced` holds both, and the fields their values.

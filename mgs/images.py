@@ -3,7 +3,7 @@
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from io import BytesIO
 from pathlib import Path
@@ -234,10 +234,7 @@ def read_mask(path: str | Path) -> np.ndarray:
 
 
 def write_exr(
-    path: str | Path,
-    channels: dict[str, np.ndarray],
-    camera: Camera | None = None,
-    unit: str | None = None,
+    path: str | Path, channels: Mapping[str, Any], camera: Camera | None = None, unit: str = ""
 ) -> None:
     """Write an OpenEXR file with a float32 channel for each array [H,W]; the file appears complete.
 
@@ -249,7 +246,7 @@ def write_exr(
     data = {name: np.ascontiguousarray(array, np.float32) for name, array in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     header |= {"software": f"mgs {mgs.__version__}"}
-    header |= {} if unit is None else {"unit": unit}
+    header |= {"unit": unit} if unit else {}
     if camera is not None:
         K, pose = camera.K, np.diag([1.0, -1, -1, 1]) @ camera.world_to_camera
         header |= {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from mgs.gaussians import Gaussians
     from mgs.run.folder import Checkpoint, Run
     from mgs.run.live import Live
-    from mgs.scene import Scene
 
 NAMES = f"Names (docs/nbv.md): {', '.join(POLICIES)}."
 
@@ -91,7 +89,7 @@ def nbv(
         for name in others | own | values:
             where = f"--resume takes its settings from {resume / 'config.json'}; change it there"
             raise InputError(f"nbv: {name}: {where}")
-        resume_and_print(resume, console, policy, live=live)
+        resume_and_print(resume, console, policy=policy, live=live)
         return
     recorded = settings_in(config) if config else {}
     rule = recorded.get("policy", "")
@@ -107,7 +105,7 @@ def nbv(
     values |= {"prior": prior, "gaussians": parse_gaussians(gaussians), "source": source}
     values.pop("dataset", None)
     run = start_and_print(dataset, out, console, live=live, force=force, **values)
-    resume_and_print(run, console, run.settings.policy, live=live)
+    resume_and_print(run, console, policy=run.settings.policy, live=live)
 
 
 PASSES_BETWEEN = 5  # passes of a fit to all images between two pictures of a test view
@@ -131,11 +129,7 @@ def live_capture(command: str | None, folder: Path | None, values: dict[str, Any
 
 
 def start_and_print(
-    dataset: Path,
-    out: Path,
-    console: Terminal,
-    start: Callable[..., Run] | None = None,
-    **settings: Any,
+    dataset: Path, out: Path, console: Terminal, start: Any = None, **settings: Any
 ) -> Run:
     """`mgs.run.nbv.start_run`, or another start, with its progress; print which prior was found in
     the dataset."""
@@ -154,17 +148,9 @@ def start_and_print(
     return run
 
 
-def resume_and_print(
-    run: Path | Run,
-    console: Terminal,
-    policy: str | None = None,
-    live: Live | None = None,
-    like: Scene | None = None,
-) -> None:
+def resume_and_print(run: Path | Run, console: Terminal, **options: Any) -> None:
     """Run or resume the loop of a run with a line for each step, evaluate, print the quality.
-
-    policy: FILE.py:FUNCTION where the run has a policy of the user's own. live: of its pictures.
-    like: as in `mgs.run.nbv.scene_of`."""
+    options: `policy`, `live` and `like` of `mgs.run.nbv.resume_nbv`."""
     from mgs.cli.printing import print_run, step_lines
     from mgs.reports.evaluation import drawn_test_view, evaluate_run
     from mgs.run.folder import open_run
@@ -186,7 +172,7 @@ def resume_and_print(
                 path, psnr = drawn_test_view(run, model)
                 progress.print(f"pass {done} of {most}: {psnr:.2f} dB, {path}")
 
-        state = resume_nbv(run, on_step, progress, policy, live, on_pass, like).state
+        state = resume_nbv(run, on_step, progress, on_pass=on_pass, **options).state
         metrics = evaluate_run(run.folder, pictures=False)
     print_run(run.folder, state, metrics, console)
 
@@ -240,7 +226,7 @@ def fit(
     if prior is None and (seen := run.prior.numbers.get("triangulated")) is not None:
         others = run.prior.numbers["n"] - seen
         console.print(f"start: {seen:,} points of the cameras and {others:,} random ones")
-    resume_and_print(run, console, run.settings.policy)
+    resume_and_print(run, console, policy=run.settings.policy)
 
 
 def moves_in_words(moves: dict[str, dict[str, float]], unit: str) -> str:

@@ -176,13 +176,13 @@ def _pose_topics(reader: Any) -> str:
 
 
 def read_bag(
-    path: Path, unpack: Path, topic: str | None, poses: str | None, spacing: Spacing
+    path: Path, images: Path | None, spacing: Spacing, unpack: Path, poses: str | None
 ) -> Source:
-    """Keyframes of a bag, unpacked into a folder. topic: of the colour images; needed where there
-    are several. poses: topic of poses, `Tree`. Raises InputError where the bag has no colour
+    """Keyframes of a bag, unpacked into a folder. images: topic of the colour images; needed where
+    there are several. poses: topic of poses, `Tree`. Raises InputError where the bag has no colour
     images, calibration or poses of them, or they never move, and as `opened`."""
     with opened(path) as reader:
-        topic = colour_topic(path, reader, topic)
+        topic = colour_topic(path, reader, str(images) if images else None)
         camera_at, lens, frame = _lens(path, reader, topic)
         tree = Tree(path, reader, frame, poses)
         times = dict.fromkeys(seconds(message) for _, message in messages(reader, topic=topic))

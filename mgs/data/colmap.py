@@ -48,8 +48,11 @@ def _is_whole(path: Path) -> bool:
                 place += struct.calcsize(items) + size * number
             elif path.name == "cameras.bin":
                 place += 8 * _parameters(*struct.unpack_from("<i", data, start + 4))
-            else:
-                place += _bytes_of_sensors(data, place)
+            else:  # the sensors of a rig, the first without a pose
+                (sensors,) = struct.unpack_from("<I", data, place)
+                place += 12 if sensors else 4
+                for _ in range(1, sensors):
+                    place += 65 if data[place + 8] else 9
             if place > len(data):
                 return False
     except (struct.error, ValueError, OverflowError, LookupError):
@@ -64,15 +67,6 @@ def _parameters(model: int) -> int:
 
     names = {int(each): name for name, each in CameraModelId.__members__.items() if int(each) >= 0}
     return len(parameter_names(names[model]))
-
-
-def _bytes_of_sensors(data: bytes, place: int) -> int:
-    """Bytes of the sensors of a rig. Raises IndexError beyond the data."""
-    (sensors,) = struct.unpack_from("<I", data, place)
-    end = place + (12 if sensors else 4)
-    for _ in range(1, sensors):
-        end += 65 if data[end + 8] else 9
-    return end - place
 
 
 def models_in(source: Path) -> list[Path]:
@@ -156,11 +150,11 @@ def _opened(model: Path) -> tuple[Any, dict[int, str]]:
         if (model / file).is_file() and not _is_whole(model / file):
             raise InputError(f"{model / file}: is damaged or cut off; export the model again")
     with parsing(model, "COLMAP model", "export it again"), TemporaryDirectory() as scratch:
-        texts = [path for path in model.glob("*.txt") if path.is_file()]
-        has_mark = any(_has_mark(path) for path in texts)  # pycolmap takes the mark for a word
-        for path in texts if has_mark else ():
-            text = path.read_bytes().removeprefix(codecs.BOM_UTF8)
-            Path(scratch, path.name).write_bytes(text)
+        texts = {path: path.read_bytes() for path in model.glob("*.txt") if path.is_file()}
+        # pycolmap takes the mark for a word
+        has_mark = any(text.startswith(codecs.BOM_UTF8) for text in texts.values())
+        for path, text in texts.items() if has_mark else ():
+            Path(scratch, path.name).write_bytes(text.removeprefix(codecs.BOM_UTF8))
         reconstruction = pycolmap.Reconstruction(scratch if has_mark else model)
         names = {number: image.name for number, image in reconstruction.images.items()}
     if (model / "images.bin").is_file():
@@ -172,11 +166,6 @@ def _opened(model: Path) -> tuple[Any, dict[int, str]]:
             "read; the file is cut off or damaged, export it again"
         )
     return reconstruction, every_name
-
-
-def _has_mark(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8
 
 
 def _names_in_text(path: Path) -> dict[int, str]:

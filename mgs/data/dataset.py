@@ -3,7 +3,7 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -101,8 +101,8 @@ def load_dataset(
     Checks that image files exist, unless the dataset is on demand. Pixels are read later, by the
     methods of `Frame`. to_capture: frames without an image are on demand, too. up: vector that
     points upwards in the files, by default as transforms.json says, else +Z; cameras are turned so
-    that it is +Z. Raises InputError if the folder or a file is missing, intrinsics are missing,
-    images are distorted, a pose is not finite or singular, there are none, or two of one name."""
+    that it is +Z. Raises InputError if the folder, a file or intrinsics are missing, images are
+    distorted, a pose is not finite or singular, or there is no frame or two of one name."""
     root = Path(root)
     path = root / "transforms.json"
     if not root.is_dir():
@@ -111,7 +111,21 @@ def load_dataset(
     data, records = read_records(path)
     upward = up or data.get("up") or PLUS_Z
     world = World(unit_up(upward), unit_of(path, data) or "m", _origin_of(path, data))
-    frames = [_frame(path, data, i, record, to_capture, world) for i, record in enumerate(records)]
+    frames = list[Frame]()
+    for index, record in enumerate(records):
+        where = f"{path}: frame {index}"
+        camera = world.enter(_camera(where, data | record))
+        on_demand = data.get("on_demand") is True
+        on_demand |= to_capture and not (root / record["file_path"]).is_file()
+        paths: dict[str, Any] = {}
+        for field, key in FILES.items():
+            paths[field] = root / record[key] if record.get(key) else None
+            if paths[field] and not on_demand and not paths[field].is_file():
+                cure = "restore it or remove the frame"
+                raise InputError(f"{where}: {key} {record[key]} does not exist; {cure}")
+        name, time = Path(record["file_path"]).stem, timestamp_of(where, index, record)
+        frame = Frame(name, camera, time, **paths, on_demand=on_demand)
+        frames.append(as_captured(frame, world))
     for name, count in Counter(frame.name for frame in frames).items():
         if count > 1:  # runs and pictures refer to a frame by its name
             cure = "remove or rename all but one"
@@ -128,9 +142,8 @@ def load_cameras(path: str | Path, like: Camera | None = None) -> list[tuple[str
     data, records = read_records(path)
     if like is not None and not any(key in data | records[0] for key in INTRINSICS):
         data = intrinsics(like) | data
-    return [
-        (record["file_path"], _camera(path, data, i, record)) for i, record in enumerate(records)
-    ]
+    cameras = [_camera(f"{path}: frame {i}", data | one) for i, one in enumerate(records)]
+    return [(one["file_path"], camera) for one, camera in zip(records, cameras, strict=True)]
 
 
 def read_records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -155,19 +168,16 @@ def read_records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     return data, records
 
 
-def _camera(path: Path, data: dict[str, Any], index: int, record: dict[str, Any]) -> Camera:
-    where = f"{path}: frame {index}"
-    both = data | record
-    distorted = any(both.get(key) not in (None, 0) for key in DISTORTION)
-    if distorted or (both.get("camera_model") or "OPENCV") not in PINHOLES:
+def _camera(where: str, record: dict[str, Any]) -> Camera:
+    distorted = any(record.get(key) not in (None, 0) for key in DISTORTION)
+    if distorted or (record.get("camera_model") or "OPENCV") not in PINHOLES:
         cure = "undistort images with `mgs import`"
         raise InputError(f"{where} is distorted, or no pinhole camera; {cure}")
-    absent = [key for key in INTRINSICS if both.get(key) is None]
-    if absent:
+    if absent := [key for key in INTRINSICS if record.get(key) is None]:
         cure = "correct the intrinsics (`mgs import` reads files with camera_angle_x)"
         raise InputError(f"{where} lacks {absent[0]}; {cure}")
     try:
-        fl_x, fl_y, cx, cy, w, h = (both[key] for key in INTRINSICS)
+        fl_x, fl_y, cx, cy, w, h = (record[key] for key in INTRINSICS)
         K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]], np.float64)
         width, height = float(w or 0), float(h or 0)
         pose = np.array(record["transform_matrix"], np.float64)
@@ -234,29 +244,6 @@ def _origin_of(path: Path, data: dict[str, Any]) -> Vector:
     return x, y, z
 
 
-def _frame(
-    path: Path,
-    data: dict[str, Any],
-    index: int,
-    record: dict[str, Any],
-    to_capture: bool,
-    world: World,
-) -> Frame:
-    root, where = path.parent, f"{path}: frame {index}"
-    camera = world.enter(_camera(path, data, index, record))
-    on_demand = data.get("on_demand") is True
-    on_demand |= to_capture and not (root / record["file_path"]).is_file()
-    timestamp = timestamp_of(where, index, record)
-    paths: dict[str, Any] = {}
-    for field, key in FILES.items():
-        paths[field] = root / record[key] if record.get(key) else None
-        if paths[field] and not on_demand and not paths[field].is_file():
-            cure = "restore it or remove the frame"
-            raise InputError(f"{where}: {key} {record[key]} does not exist; {cure}")
-    name = Path(record["file_path"]).stem
-    return as_captured(Frame(name, camera, timestamp, **paths, on_demand=on_demand), world)
-
-
 def intrinsics(camera: Camera) -> dict[str, float]:
     K = camera.K
     values = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height)
@@ -264,10 +251,7 @@ def intrinsics(camera: Camera) -> dict[str, float]:
 
 
 def write_transforms(
-    root: str | Path,
-    frames: list[Frame] | tuple[Frame, ...],
-    world: World = UPRIGHT,
-    notes: Mapping[str, str | float] | None = None,
+    root: str | Path, frames: Sequence[Frame], world: World = UPRIGHT, **notes: str | float
 ) -> None:
     """Write transforms.json into the folder `root`, with paths relative to it if they are below it.
     world: the one to write them in; the frames have +Z up. notes: more entries. Frames are either
@@ -294,7 +278,7 @@ def write_transforms(
         own = intrinsics(frame.camera)
         record |= {key: value for key, value in own.items() if value != header[key]}
         records.append(record)
-    about = header | place | demand | dict(notes or {})
+    about = header | place | demand | notes
     write_json(root / "transforms.json", about | {"frames": records})
 
 

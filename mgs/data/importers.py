@@ -1,7 +1,6 @@
 """Imports of a `Source` into a dataset folder, with lens distortion undone."""
 
 import hashlib
-import json
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -23,6 +22,8 @@ from mgs.errors import InputError, Notice
 from mgs.files import copy_file, fingerprint, folder_locked, remove_file, write_json
 from mgs.images import PNG_BIT_DEPTH, read_depth, read_mask, read_rgba, write_exr, write_png
 from mgs.progress import report
+
+Silhouette = Callable[[Camera], np.ndarray]  # mask of a camera, bool [H,W]
 
 CHECKED = 4  # about the number of pictures that are checked before an import
 RECORD = "import.json"  # record of what is imported; an interrupted import of the same continues
@@ -91,7 +92,7 @@ def import_source(
         world = World(up, source.unit or "unit", source.origin)
         upright = [replace(frame, camera=world.enter(frame.camera)) for frame in frames]
         place = {"place": source.place} if source.place and up == PLUS_Z else {}
-        write_transforms(out, upright, world, place)
+        write_transforms(out, upright, world, **place)
     return load_dataset(out)
 
 
@@ -126,34 +127,15 @@ def _mask_file(masks: Path, shot: Shot, shots: Sequence[Shot]) -> Path:
 
 def _digest(shots: list[Shot]) -> str:
     """SHA-256 of names, cameras, times and paths of the shots, but not of file contents."""
-    rows = [
-        (
-            shot.name,
-            shot.camera.K.tolist(),
-            shot.camera.width,
-            shot.camera.height,
-            shot.camera.world_to_camera.tolist(),
-            shot.lens and [shot.lens.model, *shot.lens.parameters],
-            shot.timestamp,
-            shot.depth_unit,
-            shot.float_unit,
-            shot.turned,
-            [
-                path and str(path.resolve())
-                for path in (shot.image, shot.depth, shot.mask, shot.rock)
-            ],
-        )
-        for shot in shots
-    ]
-    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
+    digest = hashlib.sha256()
+    for shot in shots:
+        for value in (vars(shot) | {"camera": shot.camera.key}).values():
+            digest.update(repr(value.resolve() if isinstance(value, Path) else value).encode())
+    return digest.hexdigest()
 
 
 def import_shot(
-    shot: Shot,
-    out: Path,
-    silhouette: Callable[[Camera], np.ndarray] | None,
-    downscale: int,
-    begin: Callable[[], None],
+    shot: Shot, out: Path, silhouette: Silhouette | None, downscale: int, begin: Callable[[], None]
 ) -> Frame:
     """Write the files of a frame, the image last, unless the image exists and is no older than its
     sources. silhouette: mask of a camera by `silhouette_of`. begin: makes the output folder, called
@@ -242,7 +224,7 @@ def _warn_of_bits(shots: Sequence[Shot]) -> None:
         warnings.warn(Notice(text), stacklevel=2)
 
 
-def silhouette_of(mesh: Mesh) -> Callable[[Camera], np.ndarray]:
+def silhouette_of(mesh: Mesh) -> Silhouette:
     """Return mask(camera): bool [H,W], pixels whose centre shows the mesh."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 

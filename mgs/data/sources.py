@@ -54,12 +54,7 @@ folder of the images, or of a bag their topic."""
 
 # Recordings of robots and cameras of other programs: kind -> (whether a path is one, its reader).
 RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
-    "ROS bag": (
-        is_bag,
-        lambda path, images, spacing, unpack, pose: read_bag(
-            path, unpack, str(images) if images else None, pose, spacing
-        ),
-    ),
+    "ROS bag": (is_bag, read_bag),
     "TUM RGB-D": (is_tum, lambda path, _, spacing, *__: read_tum(path, spacing)),
     "Open3D": (is_open3d, lambda path, _, spacing, *__: read_open3d(path, spacing)),
     "RTAB-Map": (is_rtabmap, lambda path, _, spacing, *__: read_rtabmap(path, spacing)),
@@ -189,11 +184,9 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
             left_out["whose file is missing"] += 1
             continue
         keys = ("depth_file_path", "mask_path", "rock_file_path")
+        names = [record.get(key) or "" for key in keys]
         depth, mask, rock = (
-            (_named(path.parent, None, record[key]) or path.parent / record[key])
-            if record.get(key)
-            else None
-            for key in keys
+            (_named(path.parent, None, one) or path.parent / one) if one else None for one in names
         )
         where = f"{path}: frame {index}"
         about = {**data, **record}

@@ -61,18 +61,10 @@ class Visibility:
         copied = lambda frame: np.array(exact(cameras[frame]))  # noqa: E731
         self.information = kept_within(IMAGE_BYTES, copied, lambda F: F.nbytes)
 
-    def gains(
-        self,
-        taken: Sequence[int],
-        candidates: Sequence[int],
-        degree: int,
-        tau: float,
-        over_dome: bool,
-    ) -> Array:
+    def gains(self, taken: Sequence[int], candidates: Sequence[int], model: Model) -> Array:
         """Directional gain of each candidate after the views taken [C]. It is fast if the views
         taken begin with those of the call before. Where gains do not fit into the memory, they are
         computed from scratch."""
-        model = degree, tau, over_dome
         state = self.states.get(model)
         if state is None or state.taken != list(taken[: len(state.taken)]):
             state = self.plan_gains(model)

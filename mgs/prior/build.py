@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from plyfile import PlyData
 from scipy.ndimage import binary_dilation, binary_erosion
 
@@ -118,11 +117,7 @@ def build_prior(
 
 
 def prior_and_cloud(
-    dataset: Dataset,
-    settings: PriorSettings,
-    *,
-    source: str | None = None,
-    points: Path | None = None,
+    dataset: Dataset, settings: PriorSettings, source: str | None = None, points: Path | None = None
 ) -> tuple[Prior, SegmentedCloud | None]:
     """Build the prior of a dataset. Returns it, and the cloud of its mesh (None for a hull).
     Arguments as `build_prior`. Raises InputError as `choose_source`, `check_masks`, `surface_of`,
@@ -257,9 +252,7 @@ def _samples(
 
 
 def prior_from_mesh(
-    source: str | Path | tuple[ArrayLike, ArrayLike],
-    settings: PriorSettings,
-    dataset: Dataset | None = None,
+    source: str | Path | tuple[Any, Any], settings: PriorSettings, dataset: Dataset | None = None
 ) -> Prior:
     """Sample a mesh in the coordinates of the dataset's files, all over.
 

@@ -225,7 +225,7 @@ def _blue_noise(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
 
 
 def _independent(pairs: np.ndarray, n: int) -> np.ndarray:
-    """Take 0, 1,... n-1 in turn, except partners in `pairs` [P,2] of one taken before. Vectorised
+    """Take 0, 1, ... n-1 in turn, except partners in `pairs` [P,2] of one taken before. Vectorised
     rounds: one is taken if it has no smaller undecided partner; its partners are dropped."""
     low, high = pairs.min(1), pairs.max(1)
     undecided, members = np.ones(n, bool), np.zeros(n, bool)

@@ -30,11 +30,7 @@ class Checks:
     policy: Policy
 
     def entries(
-        self,
-        state: State,
-        before: Gaussians | None,
-        new: Sequence[int],
-        steps: Sequence[dict[str, Any]],
+        self, state: State, before: Gaussians | None, new: Sequence[int], steps: Sequence[Any]
     ) -> dict[str, Any]:
         """Entries of the last line in `steps`, the lines of all steps: `residual`, `indicators`,
         `warnings` and `prediction`. new: views that the model `before` was not fitted to."""
@@ -79,7 +75,7 @@ class Checks:
         views: all views taken, under the model. new_views: the new ones, under the model before."""
 
         def mean_gain(before: Sequence[int], poses: Sequence[int]) -> float:
-            gains = self.scene.surface(state).gains(before, poses, *DIRECTIONAL_D.model)
+            gains = self.scene.surface(state).gains(before, poses, DIRECTIONAL_D.model)
             return float(gains.mean())
 
         entry = {"fitted": float(np.mean([view.srgb_error for view in views]))}

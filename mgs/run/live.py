@@ -15,7 +15,7 @@ from mgs.camera import Camera, heading_and_pitch, opengl_from_opencv
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import FILES, Dataset, intrinsics, load_dataset, read_records
 from mgs.data.frames import Frame, as_captured, capture_record
-from mgs.data.importers import import_shot, silhouette_of
+from mgs.data.importers import Silhouette, import_shot, silhouette_of
 from mgs.data.lens import Lens
 from mgs.data.shots import Shot
 from mgs.data.sources import record_camera
@@ -164,7 +164,7 @@ def _received(
     out: Path,
     live: Live,
     centre: np.ndarray,
-    silhouette: Callable[[], Callable[[Camera], np.ndarray]],
+    silhouette: Callable[[], Silhouette],
 ) -> Frame:
     image, files = picture(out), answers(out)
     camera, lens = frame.camera, None
@@ -197,11 +197,7 @@ def _flown(path: Path, frame: Frame, image: Path, world: World) -> tuple[Camera,
 
 
 def _commit(
-    root: Path,
-    frame: Frame,
-    shot: Shot,
-    silhouette: Callable[[], Callable[[Camera], np.ndarray]],
-    world: World,
+    root: Path, frame: Frame, shot: Shot, silhouette: Callable[[], Silhouette], world: World
 ) -> Frame:
     """Import a picture, check it, and write its record, which comes last."""
     remove_file(root, frame.image_path)  # of a picture that was refused or interrupted

@@ -230,7 +230,7 @@ class Directional:
         return self.degree, self.tau, self.over_dome
 
     def __call__(self, scene: Scene, state: State, views: list[int]) -> np.ndarray:
-        return scene.surface(state).gains(state.taken, views, *self.model)
+        return scene.surface(state).gains(state.taken, views, self.model)
 
     def plan(
         self, scene: Scene, state: State, views: list[int], count: int, nearest: int | None

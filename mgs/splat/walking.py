@@ -274,12 +274,7 @@ TOGETHER = 2  # splats drawn in an iteration: the pixels' state does not fit the
 
 
 def walk(
-    lists: BlockLists,
-    packed: Any,
-    lane: Lane,
-    pixels: list[list[Any]],
-    draw: Callable[..., Any],
-    start: Any,
+    lists: BlockLists, packed, lane: Lane, pixels: list[list[Any]], draw: Callable, start
 ) -> Any:
     """Draw each lane's list front to back, until it ends or all pixels of the block are finished.
 
@@ -310,12 +305,7 @@ def walk(
 
 
 def walk_and_store(
-    lists: BlockLists,
-    packed: Any,
-    lane: Lane,
-    pixels: list[list[Any]],
-    visit: Callable[..., Any],
-    count: int,
+    lists: BlockLists, packed, lane: Lane, pixels: list[list[Any]], visit: Callable, count: int
 ) -> Any:
     """Draw each lane's list as `walk` does, and store sums over the pixels of each pair.
 
@@ -377,12 +367,7 @@ def pair_at(
 
 
 def _walk_until_done(
-    lists: BlockLists,
-    packed: Any,
-    lane: Lane,
-    pixels: list[list[Any]],
-    visit: Callable[..., Any],
-    together: int,
+    lists: BlockLists, packed, lane: Lane, pixels: list[list[Any]], visit: Callable, together: int
 ) -> tuple[Any, list[list[Any]]]:
     """The loop of `walk`. Returns the pair after the last visited one, and the pixels' state.
     visit(pair, pairs, pixels) -> (pixels, alive), with `pairs` the results of `pair_at` for
