@@ -1,9 +1,12 @@
 """Points triangulated at given poses, and poses of photographs alone, against the truth."""
 
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -18,7 +21,10 @@ from mgs.cli.suggest import _place
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.importers import import_source
+from mgs.data.photographs import sharpest_frames
 from mgs.data.sources import read_source
+from mgs.data.tracks import Spacing
+from mgs.errors import Notice
 from mgs.files import read_json
 from mgs.fit.poses import displaced, motion_between
 from mgs.images import write_png
@@ -207,13 +213,15 @@ def test_a_distance_gives_the_scale(placed):
         fails("distance", placed[1].with_distance, wrong)
 
 
-@pytest.mark.parametrize("case", ["one", "apart", "file", "none"])
+@pytest.mark.parametrize("case", ["one", "apart", "file", "none", "tripod"])
 def test_photographs_that_cannot_be_placed_are_refused(case, frames, tmp_path, capsys):
     root = tmp_path / "photos"
     root.mkdir()
-    picked = {"one": frames[:1], "file": frames[:1], "none": [], "apart": frames[::5]}[case]
+    picked = {"one": frames[:1], "file": frames[:1], "apart": frames[::5]}.get(case, [])
     for frame in picked:
         shutil.copy(frame.image_path, root)
+    for quality in range(80, 84) if case == "tripod" else ():
+        Image.open(frames[0].image_path).save(root / f"{quality}.jpg", quality=quality)
     if case == "apart":
         noise = np.random.default_rng(1).random((2, HEIGHT, WIDTH, 3)).astype(np.float32)
         for k, pixels in enumerate(noise):
@@ -221,8 +229,33 @@ def test_photographs_that_cannot_be_placed_are_refused(case, frames, tmp_path, c
     source = root / frames[0].image_path.name if case == "file" else root
     assert exit_code("import", source, "--out", tmp_path / "d") == 2
     words = {"one": "1 can be used", "apart": "can be placed", "file": "the folder of all"}
-    assert words.get(case, "holds no photographs") in said(capsys)[1]
+    words |= {"tripod": "all were taken from one place", "none": "holds no photographs"}
+    assert words[case] in said(capsys)[1]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]
+
+
+def test_a_video_gives_the_sharpest_frames_up_to_where_it_ends(tmp_path):
+    """Of 24 frames at 10 a second, the last of each five is sharp; the copy is cut at 60 %."""
+    rng, whole = np.random.default_rng(0), tmp_path / "whole.avi"
+    film = cv2.VideoWriter(str(whole), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+    for k in range(24):
+        film.write(rng.integers(0, 255 if k % 5 == 4 else 120, (48, 64, 3), np.uint8))
+    film.release()
+    spacing = Spacing.parse("0.5s")
+    paths = sharpest_frames(whole, tmp_path / "whole", spacing)
+    assert len(paths) == 5
+    assert all(np.ptp(Image.open(path)) > 200 for path in paths[:4])
+    part = whole.read_bytes()
+    (tmp_path / "cut.avi").write_bytes(part[: len(part) * 3 // 5])
+    with pytest.warns(Notice, match="only 1[2-5] of 24 frames can be read"):
+        found = sharpest_frames(tmp_path / "cut.avi", tmp_path / "cut", spacing)
+    for one, other in zip(found[:2], paths, strict=False):
+        assert one.read_bytes() == other.read_bytes()
+    (tmp_path / "no.mp4").write_bytes(b"no video")
+    words = [sys.executable, "-m", "mgs", "import", tmp_path / "no.mp4", "--out", tmp_path / "d"]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "not a readable video" in done.stderr
 
 
 def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, monkeypatch):

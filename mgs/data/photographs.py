@@ -2,7 +2,9 @@
 structure from motion (pycolmap)."""
 
 import hashlib
+import os
 import shutil
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
@@ -17,7 +19,7 @@ from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, frame_name, natural
 from mgs.data.structure import Matcher
 from mgs.data.tracks import Spacing
 from mgs.data.world import PLUS_Z
-from mgs.errors import InputError
+from mgs.errors import InputError, Notice
 from mgs.files import read_json, write_json
 from mgs.images import exif_orientation, read_rgba, write_png
 from mgs.progress import report
@@ -94,7 +96,8 @@ def read_photographs(
 def _usable(paths: Sequence[Path]) -> tuple[list[Path], dict[str, str]]:
     """Photographs that can be read and are no copies, and why the others are left out, by name."""
     usable, dropped, seen = [], dict[str, str](), dict[str, str]()
-    for path in paths:
+    for k, path in enumerate(paths):
+        report("reading photographs", k, len(paths))
         if path.suffix.lower() in UNREAD:
             dropped[path.name] = "that are HEIC or raw: convert them to JPEG"
             continue
@@ -178,6 +181,8 @@ def _reasons(
             why[name] = "that are blurred or blank"
         elif number not in overlapping:
             why[name] = "that overlap with no other"
+        elif not placed:
+            why[name] = "that share too few points, or all were taken from one place"
         else:
             why[name] = "that share too few points with those placed"
     return why
@@ -238,13 +243,15 @@ def _to_gps(model: Any, database: Any) -> str | None:
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 JUDGED = 640  # longer side, pixels, to which frames are reduced to compare how sharp they are
+WHOLE = 0.95  # least share of a video's frames that can be read; their number may be an estimate
 
 
 def sharpest_frames(video: Path, folder: Path, spacing: Spacing) -> list[Path]:
     """Write the sharpest frame of each time of `spacing` into a folder, and return their files. The
     sharpest has the largest variance of the Laplacian. A video that ends in the middle gives the
-    frames before. A folder that already holds them is taken as it is. Raises InputError for a
-    spacing in metres, and if the video cannot be read."""
+    frames before and a warning. A folder that already holds them is taken as it is. Raises
+    InputError for a spacing in metres, and if the video cannot be read."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else it prints the faults of a video
     import cv2
 
     if spacing.metres:
@@ -278,5 +285,10 @@ def sharpest_frames(video: Path, folder: Path, spacing: Spacing) -> list[Path]:
     capture.release()
     if number == 0:
         raise InputError(f"{video}: not a readable video, or cut off; convert it to MP4 (H.264)")
+    if number < WHOLE * total:
+        read = f"only {number} of {total} frames can be read, and are used"
+        warnings.warn(
+            Notice(f"{video}: {read}; copy the file again if it is cut off"), stacklevel=2
+        )
     write_json(record, about)
     return sorted(folder.glob("*.png"))
