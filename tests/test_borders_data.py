@@ -1,5 +1,6 @@
 """Imports judged by the truth: cameras of a scene in closed form, written as other programs do."""
 
+import codecs
 import shutil
 
 import cv2
@@ -62,6 +63,18 @@ def test_a_bag_whose_poses_are_not_plain_is_refused(tmp_path, data, pose):
     fails("does not move|come from|no tf", read_source, bag, unpack=tmp_path / "x")
 
 
+@pytest.mark.parametrize(
+    ("kind", "model"), [("plumb_bob", "FULL_OPENCV"), ("equidistant", "OPENCV_FISHEYE")]
+)
+def test_the_lens_of_a_bag(tmp_path, data, kind, model):
+    """D in the order of ROS: k1 k2 p1 p2 k3, of a fisheye k1 to k4."""
+    D = [-0.12, 0.05, 0.004, -0.003, 0.01][: 5 if kind == "plumb_bob" else 4]
+    bag = write_bag(tmp_path / "bag", data, depth=False, distortion=(kind, D))
+    lens = read_source(bag, unpack=tmp_path / "x").shots[0].lens
+    assert lens.model == model
+    assert list(lens.parameters[4 : 4 + len(D)]) == D
+
+
 def test_a_frame_that_is_no_optical_one_is_named(tmp_path, data, monkeypatch):
     monkeypatch.setattr("test_recordings.OPTICAL", "camera_link")
     source = read_source(write_bag(tmp_path / "bag", data, depth=False), unpack=tmp_path / "x")
@@ -110,22 +123,25 @@ def test_a_transforms_json_is_read_as_its_authors_mean_it(tmp_path, data):
     assert source.notes[0].startswith("12 rotations ")
 
 
+FISHEYE = "OPENCV_FISHEYE"
 MODELS = {
     "SIMPLE_RADIAL": {"k1": 0.1},
     "RADIAL_FISHEYE": {"k1": 0.02, "k2": -0.01},
-    "OPENCV_FISHEYE": {"k1": 0.02, "k4": 0.001},
+    FISHEYE: {"k1": 0.02, "k4": 0.001},
     "THIN_PRISM_FISHEYE": {"k1": 0.02, "p1": 0.001, "sx1": 0.001},
     "FOV": {"omega": 0.6},
 }
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_every_lens_of_colmap_is_one_of_transforms_json(data, model):
+@pytest.mark.parametrize(("model", "old"), [*((model, False) for model in MODELS), (FISHEYE, True)])
+def test_every_lens_of_colmap_may_be_that_of_a_frame(data, model, old):
+    """old: as programs wrote a fisheye before camera_model."""
     import pycolmap
 
-    change = {"camera_model": model, **MODELS[model]}
-    synthetic.edit(data.root, lambda json: json.update(change))
-    shot = read_source(data.root).shots[0]
+    change = ({"is_fisheye": True} if old else {"camera_model": model}) | MODELS[model]
+    synthetic.edit(data.root, lambda json: json["frames"][1].update(change))
+    first, shot = read_source(data.root).shots[:2]
+    assert first.lens is None
     K = shot.camera.K
     names = {"k1": "k"} if model == "SIMPLE_RADIAL" else {}
     values = {names.get(key, key): value for key, value in MODELS[model].items()}
@@ -153,13 +169,26 @@ def colmap_text(data, tmp_path, rename=str):
     return tmp_path / "c", path
 
 
-def test_colmap_text_keeps_names_and_loses_no_image(data, tmp_path):
-    source, path = colmap_text(data, tmp_path, lambda name: f"left cam/{name}")
+@pytest.mark.parametrize(
+    ("folder", "encoded"),
+    [
+        ("left cam", lambda text: text),
+        ("left cam", lambda text: codecs.BOM_UTF8 + text),
+        ("Süd 1/b.v1", lambda text: text.replace(b"\n", b"\r\n")),
+    ],
+    ids=["plain", "byte-order mark", "Windows lines"],
+)
+def test_colmap_text_keeps_names_and_loses_no_image(data, tmp_path, folder, encoded):
+    source, path = colmap_text(data, tmp_path, lambda name: f"{folder}/{name}")
     (source / "images").unlink()
-    shutil.copytree(data.root / "images", source / "images/left cam")
+    shutil.copytree(data.root / "images", source / "images" / folder)
+    for file in path.parent.iterdir():
+        file.write_bytes(encoded(file.read_bytes()))
     shots = read_source(source).shots
     assert errors(data, shots).max() < 1e-9
-    assert [shot.name for shot in shots[:2]] == ["left cam_kf_0000", "left cam_kf_0001"]
+    assert np.allclose(shots[0].camera.K, data.frames[0].camera.K)
+    named = folder.replace("/", "_")
+    assert [shot.name for shot in shots[:2]] == [f"{named}_kf_0000", f"{named}_kf_0001"]
     lines = [line for line in path.read_text().splitlines() if line.endswith(".png")]
     path.write_text("\n".join(lines) + "\n")
     fails("has no line of points after that of image", read_source, source)

@@ -105,11 +105,11 @@ class Bag:
         head, form = self.header(time, OPTICAL), f"{encoding}; compressedDepth png"
         self.write(topic, "sensor_msgs/msg/CompressedImage", time, head, form, data)
 
-    def lens(self, topic: str, time: float, camera) -> None:
-        K = opencv_K(camera).ravel()
-        numbers = np.zeros(5), K, np.eye(3).ravel(), np.eye(3, 4).ravel()
+    def lens(self, topic: str, time: float, camera, model: str, distortion) -> None:
+        D, K = np.array(distortion), opencv_K(camera).ravel()
+        numbers = D, K, np.eye(3).ravel(), np.eye(3, 4).ravel()
         roi = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
-        size = camera.height, camera.width, "plumb_bob"
+        size = camera.height, camera.width, model
         head = self.header(time, OPTICAL)
         self.write(topic, "sensor_msgs/msg/CameraInfo", time, head, *size, *numbers, 0, 0, roi)
 
@@ -163,10 +163,11 @@ POSES = {
 
 def write_bag(
     path, dataset, version=2, leave_out="", poses=("mount", "tf"), storage="SQLITE3", compressed="",
-    depth=True,
+    depth=True, distortion=("plumb_bob", np.zeros(5)),
 ):  # fmt: skip
     """Write a bag without the topics whose names contain `leave_out`. compressed: encoding of
-    compressed depth. depth: with depth, and images that are no keyframes."""
+    compressed depth. depth: with depth, and images that are no keyframes. distortion: model of
+    the lens, and its numbers."""
     bag = Bag(path, version, storage)
     with bag.writer:
         for k, frame in enumerate(dataset.frames):
@@ -180,7 +181,7 @@ def write_bag(
                 bag.image("/camera/color/image_raw", time, "bgr8", rgb[..., ::-1])
                 bag.image("/camera/color/image_raw", time + 0.2, "bgr8", 0 * rgb)  # no keyframe
             if leave_out != "camera_info":
-                bag.lens("/camera/color/camera_info", time, camera)
+                bag.lens("/camera/color/camera_info", time, camera, *distortion)
             topic = "/camera/aligned_depth/image_raw"
             if not depth:
                 continue
