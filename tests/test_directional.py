@@ -88,21 +88,6 @@ def test_a_rank_one_update_gives_what_full_inverses_give(seed, degree, tau):
         assert i[c] == pytest.approx(fall, rel=1e-6, abs=1e-9 * whole)
 
 
-@given(seeds, taus)
-def test_degree_zero_is_the_colour_part_of_d_optimality(seed, tau):
-    """In nats: half of Eq. 7, summed over the three channels."""
-    points, pool, _ = scene(seed)
-    taken, candidates = some(pool, [0, 1, 2]), some(pool, [3, 4, 5, 6])
-
-    def colour(seen):
-        return np.repeat(SH_C0**2 * seen[:, None].astype(np.float64), 3, axis=1)
-
-    H = colour(taken.seen.sum(0, dtype=np.float64))
-    eq7 = [criteria.d_optimal(colour(seen), H, np.full(3, LAM)) for seen in candidates.seen]
-    expected = 0.5 * H.size * np.array(eq7)
-    assert gains(points, LAM, 0, tau, taken, candidates) == pytest.approx(expected, rel=1e-9)
-
-
 def test_gaussians_in_parts_add_up(monkeypatch):
     points, pool, dome = scene(0)
     taken, candidates = some(pool, [0, 1, 2]), some(pool, [3, 4, 5, 6])

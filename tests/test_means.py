@@ -12,7 +12,7 @@ from refusals import fails, refused
 from mgs import Camera, diagnose, fit_gaussians, load_dataset, load_prior
 from mgs.fit.objective import objective
 from mgs.fit.settings import MEAN_RATE, TrainSettings
-from mgs.gaussians import LEARNED, Gaussians, sh_from_rgb
+from mgs.gaussians import LEARNED, Gaussians, learned, sh_from_rgb
 from mgs.policy.criteria import DIRECTIONAL_STD, MEAN_STD
 from mgs.rotation import quat_from_normals
 from mgs.run import folder as run_folder
@@ -78,16 +78,20 @@ def test_one_step_is_natural_on_the_gradient_of_the_objective(cameras, targets):
     start, rng = ball(0.02), np.random.default_rng(1)
     for _ in range(2):
         begun = ball(0.02 + 0.01 * rng.standard_normal(N))
+        begun.sh, begun.log_scales = begun.sh - np.float32(0.1), begun.log_scales + np.float32(0.1)
+        begun.logit_opacities -= np.float32(0.3)
         train = settings("free", 1, 0.002).model_copy(update={"loss": "squared"})
         goal = objective(begun, cameras[:1], targets[:1], start, LAM, means="free")
-        model = as_drjit(begun)
-        g, d = (np.asarray(part(model)[-1]) for part in (goal.gradient, goal.diagonal))
-        expected = np.clip(-0.1 * g / (4 * d), -0.002, 0.002)
         moved = fitted(begun, cameras[:1], targets[:1], train, start).gaussians
-        step = moved.means.astype(np.float64) - begun.means
-        assert 0.2 < (np.abs(step) < 0.0019).mean() < 1  # not all are cut
-        assert np.allclose(step, expected, atol=3e-7 + 2e-3 * np.abs(expected))
-        assert np.abs(step).max() > 1e-3
+        parts = goal.gradient(as_drjit(begun)), goal.diagonal(as_drjit(begun))
+        for (name, kind), *of_kind in zip(learned("free").items(), *parts, strict=True):
+            g, d = map(np.asarray, of_kind)
+            rate = train.rates[kind]
+            expected = np.clip(-0.1 * g / (4 * d), -rate, rate)
+            step = getattr(moved, name).astype(np.float64) - getattr(begun, name)
+            assert 0.2 < (np.abs(step) < 0.95 * rate).mean() < 1, kind  # not all are cut
+            assert np.allclose(step, expected, atol=3e-7 + 2e-3 * np.abs(expected)), kind
+            assert np.abs(step).max() > rate / 2
 
 
 def test_displaced_means_move_back_to_the_surface(cameras, targets):

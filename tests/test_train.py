@@ -101,30 +101,6 @@ def test_one_step_is_adam_on_the_gradient_of_the_summed_squared_error(truth, cam
         assert step[i] == pytest.approx(-0.02 * g / (abs(g) + ADAM_EPSILON), rel=1e-2)
 
 
-def test_one_step_is_natural_on_the_gradient_of_the_objective(truth, cameras, targets):
-    """The first step is minus a tenth of the gradient over four times the information, at most the
-    rate. The loss is the objective over the number of pixel values."""
-    lam, start = {"colour": 0.3, "scale": 2.0, "rotation": 5.0, "opacity": 0.1}, grey(truth)
-    begun = replace(truth, log_scales=truth.log_scales + 0.1, quats=truth.quats + 0.05)
-    begun.logit_opacities, begun.sh = truth.logit_opacities - 0.3, np.full_like(truth.sh, 0.2)
-    settings = TrainSettings(passes=1, rates=rates_of(0.01), loss="squared")
-    camera, target = cameras[0], targets[0]
-    found = fit_gaussians(begun, [camera], [target], settings, start=start, lam=lam)
-    away = [getattr(begun, name) - getattr(start, name) for name in LEARNED]
-    prior = sum(w * (part**2).sum() for w, part in zip(lam.values(), away, strict=True))
-    expected = mean_square(begun, [camera], [target]) + prior / target.size
-    assert found.losses == pytest.approx((expected, expected), rel=1e-4)  # the same, in the step
-    steps = (found.gaussians.sh - begun.sh)[:, 0]
-    step, information = steps[:, 0], fisher(begun, camera)[:, 0] + 0.3
-    half_the_rate = np.argsort(np.abs(np.abs(step) - 0.005))[:3]
-    longest = np.argsort(-np.abs(step))[:2]
-    for i in (*half_the_rate, *longest):
-        g = derivative(begun, camera, target, i) + 0.3 * 0.2
-        expected = np.clip(-0.1 * g / (4 * information[i]), -0.01, 0.01)
-        assert step[i] == pytest.approx(expected, rel=1e-2)
-    assert np.abs(steps).max() == pytest.approx(0.01, rel=1e-4)
-
-
 def test_what_no_image_shows_stays_where_the_prior_put_it(truth, cameras, targets):
     start = grey(truth)
     found = fit_gaussians(start, cameras[:1], targets[:1], TrainSettings(passes=1))
