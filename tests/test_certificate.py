@@ -4,8 +4,6 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from refusals import fails
 from scipy.optimize import minimize
 from test_directional import squares
@@ -13,6 +11,7 @@ from test_directional import squares
 from mgs.policy import certificate, criteria, relaxation
 from mgs.policy.certificate import added_bound, best_set, least_bound, upper_bound
 from mgs.policy.directional import Views, precision
+from mgs.policy.relaxation import TOLERANCE
 
 LAM, POSES, POINTS = 0.02**2, 9, 40
 KINDS = ["d", "i", "eq7"]
@@ -61,6 +60,7 @@ def test_every_set_is_below_the_bound_and_branch_and_bound_finds_the_best(kind, 
     bound = upper_bound(made, k)
     assert bound.value >= largest * (1 - 1e-9)
     assert bound.weights.sum() == pytest.approx(k)
+    assert bound.gap <= TOLERANCE
     for some in list(every)[:: max(len(every) // 7, 1)]:
         assert made.gain(some) == pytest.approx(every[some], rel=1e-6, abs=1e-9)
     best = best_set(made, min(every, key=lambda some: every[some]), gap=1e-9)
@@ -113,18 +113,6 @@ def test_the_smaller_bound_counts():
     assert added_bound(case("i")[0], [], 2) == np.inf
 
 
-@settings(max_examples=15)
-@given(st.sampled_from(EVERY), st.integers(0, 10_000), st.randoms(use_true_random=False))
-def test_a_bound_grows_with_k_and_does_not_depend_on_the_order(kind, seed, random):
-    made, _ = case(kind, seed)
-    values = [upper_bound(made, k).value for k in range(1, POSES + 1)]
-    assert np.all(np.diff(values) >= -1e-3 * values[-1])
-    assert values[-1] >= made.gain(range(POSES)) * (1 - 1e-9)
-    order = random.sample(range(POSES), POSES)
-    moved = upper_bound(case(kind, seed, order)[0], 4)
-    assert moved.value == pytest.approx(values[3], rel=2e-3)
-
-
 @pytest.mark.parametrize("kind", EVERY)
 def test_duplicates_have_equal_prices_and_reruns_equal_bits(kind):
     order = [0, 1, 2, 3, 3, 5, 6, 7, 8]
@@ -132,14 +120,6 @@ def test_duplicates_have_equal_prices_and_reruns_equal_bits(kind):
     assert bounds[0].prices[3] == pytest.approx(bounds[0].prices[4], rel=1e-12)
     for one, other in zip(*bounds, strict=True):
         assert np.array_equal(one, other)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_second_picture_from_a_pose_adds_less_but_something(kind):
-    made, _ = case(kind, 5, [0, 1, 2, 3, 3, 5, 6, 7, 8])
-    first, second = made.added([])[3], made.added([4])[3]
-    assert 0 < second < first
-    assert 0 < made.tangent(np.eye(POSES)[4])[1][3] < made.tangent(np.zeros(POSES))[1][3]
 
 
 def test_a_duplicate_of_a_view_that_observes_what_it_sees_has_no_price_under_coverage():

@@ -101,13 +101,6 @@ def test_i_optimal_is_the_fall_of_a_predicted_variance(F, H, weight):
     assert studied.predicted_variance(F, H, LAM, np.ones_like(H)) == criteria.a_optimal(F, H, LAM)
 
 
-@given(information, information)
-def test_blocks_without_correlations_are_a_diagonal(F, H):
-    F_blocks, H_blocks = (values[:, :, None] * np.eye(11) for values in (F, H))
-    before, after = (studied.block_log_determinant(B, LAM) for B in (H_blocks, H_blocks + F_blocks))
-    assert after - before == pytest.approx(criteria.d_optimal(F, H, LAM), rel=1e-6, abs=1e-9)
-
-
 @given(arrays(np.float64, (2, N, 14, 11), elements=st.floats(-10, 10)))
 def test_blocks_are_the_log_determinant_of_the_posterior(jacobians):
     """H_j = J_j^T J_j of a few rows. The diagonal alone overestimates."""
