@@ -303,7 +303,7 @@ class Scene:
         return np.array([frame.camera.position for frame in frames])
 
     def seeds(self, count: int, among: Sequence[int] | None = None) -> list[int]:
-        """Views to begin with, spread over the directions of the poses (`poses.seed_views`).
+        """Views to begin with, spread over the directions of near poses (`poses.seed_views`).
 
         among: indices to choose from, by default all."""
         views = range(len(self.frames)) if among is None else among

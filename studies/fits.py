@@ -16,6 +16,7 @@ from mgs.fit.poses import displaced
 from mgs.fit.settings import MEAN_RATE, PoseNoise
 from mgs.learning import refine_poses
 from mgs.policy.criteria import PRIOR_STD
+from mgs.policy.poses import medoids
 from mgs.seeds import generator
 from studies.frame.case import ROCKS
 from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
@@ -135,7 +136,8 @@ def fit_and_judge(
     settings = settings.model_copy(
         update={**model, "train": settings.train.model_copy(update=train)}
     )
-    frames = tuple(whole.frames[i] for i in whole.seeds(views))
+    positions = whole.positions(whole.frames)
+    frames = tuple(whole.frames[i] for i in medoids(positions, whole.centre, views))
     if change.poses == "noisy":
         rng, std = generator(0, f"poses/{dataset}"), [np.radians(DEGREES)] * 3 + [METRES] * 3
         frames = tuple(replace(f, camera=displaced(f.camera, rng.normal(0, std))) for f in frames)

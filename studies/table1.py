@@ -3,9 +3,8 @@
 3DGS is Kerbl et al. 2023, a model that no surface holds. As in the authors' program: round, nearly
 transparent Gaussians at points, L1 and D-SSIM of sRGB values, Adam with their learning rates,
 adaptive density, and a degree of the spherical harmonics more every 1,000 steps. The points are
-those of the prior, or random inside the masks. Different: colours are blended in linear RGB, and
-density changes at the ends of passes. In fits of less than 30,000 steps it changes during the first
-half of the steps.
+those of the prior, or random inside the masks. Different: density changes at the ends of passes. In
+fits of less than 30,000 steps it changes during the first half of the steps.
 
 Runs are timed one by one: let nothing else run meanwhile.
 """

@@ -292,6 +292,14 @@ def test_seeds_are_spread_over_elevations_too():
     assert dome[top, 2] > np.quantile(dome[:, 2], 0.8), "one seed looks from above"
 
 
+def test_seeds_are_near_the_rock():
+    """Of two shells the seeds are those of the inner one alone; only the poses that it lacks come
+    from the outer one."""
+    shells = np.concatenate([2 * CIRCLE, CIRCLE])
+    assert pose_policies.seed_views(shells, CENTRE, 4) == [12, 15, 18, 21]
+    assert {2, 3} < set(pose_policies.seed_views(shells[10:14], CENTRE, 3))
+
+
 def test_azimuth_is_measured_about_the_rock():
     positions = np.array([[2.0, 1.0, 9.0], [1.0, 2.0, -1.0], [0.0, 1.0, 0.0]])
     found = pose_policies.azimuths(positions, np.array([1.0, 1.0, 0.0]))

@@ -5,6 +5,10 @@ from numpy.typing import NDArray
 
 from mgs.policy.criteria import Array
 
+NEAR = 2**0.5
+"""Distance up to which poses are seeds, over that of the nearest: it sees the surface in half as
+many pixels."""
+
 
 def azimuths(positions: Array, centre: Array) -> NDArray[np.float64]:
     """Azimuths of camera centres [C,3] about `centre` [3], radians in [0, 2 pi), 0 = +X."""
@@ -64,6 +68,17 @@ def path_length(positions: Array) -> float:
 
 
 def seed_views(positions: Array, centre: Array, count: int) -> list[int]:
+    """`count` distinct frames to begin with: `medoids` of the poses near the rock.
+
+    Near are poses up to NEAR times as far as the nearest, because far ones say little about small
+    Gaussians; where these are fewer than `count`, the nearest. Arguments as `medoids`."""
+    distance = _rounded(np.linalg.norm(positions - centre, axis=1))
+    near = distance <= max(NEAR * distance.min(), np.partition(distance, count - 1)[count - 1])
+    frames = np.flatnonzero(near)
+    return [int(frames[k]) for k in medoids(positions[frames], centre, count)]
+
+
+def medoids(positions: Array, centre: Array, count: int) -> list[int]:
     """`count` distinct frames spread over the directions of a pool, in the order of their azimuths.
 
     k-medoids: from the frames nearest to even azimuths, one frame at a time is exchanged as long as

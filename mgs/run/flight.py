@@ -75,8 +75,8 @@ def check_seeds(scene: Scene, mission: Mission) -> None:
 
 
 def seed_views(scene: Scene, mission: Mission) -> list[int]:
-    """Views to begin with, spread over the directions of the poses allowed. Raises InputError if
-    fewer are allowed than seeds are needed."""
+    """Views to begin with, spread over the directions of the near poses allowed. Raises InputError
+    if fewer are allowed than seeds are needed."""
     may = np.flatnonzero(allowed(scene, mission))
     if len(may) < mission.seeds:
         allow = f"flight.no_fly and flight.clearance allow {len(may)} of {len(scene.frames)} poses"

@@ -55,7 +55,7 @@ class Mission(Frozen):
     """Limits of a run: how many views it takes, where the camera may go, and when it ends."""
 
     seeds: Annotated[int, Field(ge=1)] = 4
-    """Number of seed views for the first fit, spread evenly over the directions of the poses."""
+    """Number of seed views for the first fit, spread evenly over the directions of near poses."""
     budget: Annotated[int, Field(ge=0)] = 50
     """Most views to choose beyond the seed views. Default: 50, or all candidates if fewer."""
     enough: Annotated[float, Field(gt=0, le=1)] | None = None
