@@ -429,9 +429,8 @@ def folder_locked(folder: str | Path) -> Iterator[None]:
         new = [each for each in (folder, *folder.parents) if not each.exists()]
         folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
-        raise InputError(
-            f"{folder}: is a file, not a folder; choose another output folder"
-        ) from None
+        why = "is a file, not a folder; choose another output folder"
+        raise InputError(f"{folder}: {why}") from None
     except OSError as error:
         raise not_writable(folder, error) from None
     try:

@@ -151,9 +151,8 @@ def _spz_codec(path: Path) -> Any:
     try:
         import gsply_cpp
     except ImportError:
-        raise InputError(
-            f"{path}: SPZ needs gsply, which is not installed; `pip install gsply`, or use PLY"
-        ) from None
+        why = "SPZ needs gsply, which is not installed"
+        raise InputError(f"{path}: {why}; `pip install gsply`, or use PLY") from None
     return gsply_cpp
 
 

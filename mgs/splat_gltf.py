@@ -109,9 +109,8 @@ def read_glb(path: str | Path) -> Gaussians:
                 if EXTENSION in primitive.get("extensions", {}):
                     parts.append(moved(_gaussians(gltf, primitive), back @ place, path))
         if not parts:
-            raise InputError(
-                f"{path}: no Gaussians in it (no {EXTENSION}); export it as a splat PLY"
-            )
+            why = f"no Gaussians in it (no {EXTENSION})"
+            raise InputError(f"{path}: {why}; export it as a splat PLY")
         whole = _joined(path, parts)
         made_by = str(gltf.json.get("asset", {}).get("generator", ""))
         return mirrored(whole, (-1, -1, 1)) if made_by.startswith(PLAYCANVAS) else whole
@@ -160,10 +159,8 @@ def _gaussians(gltf: Gltf, primitive: dict[str, Any]) -> Gaussians:
     opacities = values(f"{EXTENSION}:OPACITY")[:, 0].astype(np.float64)
     scales = values(f"{EXTENSION}:SCALE")
     if (scales < 0).any():
-        raise InputError(
-            f"{gltf.path}: has negative scales, which are probably logarithms; the program that "
-            "wrote it must write standard deviations"
-        )
+        cure = "the program that wrote it must write standard deviations"
+        raise InputError(f"{gltf.path}: has negative scales, which are probably logarithms; {cure}")
     with np.errstate(divide="ignore"):  # flat Gaussians
         log_scales = np.log(scales)
     return Gaussians(

@@ -43,10 +43,8 @@ def moved(g: Gaussians, matrix: np.ndarray, where: object) -> Gaussians:
         raise InputError(f"{where}: the transform of a node is singular; apply it and export again")
     Q = A / lengths
     if np.abs(Q.T @ Q - np.eye(3)).max() > UNEVEN:
-        raise InputError(
-            f"{where}: the transform of a node has shear; apply it in the program that made the "
-            "file and export again"
-        )
+        cure = "apply it in the program that made the file and export again"
+        raise InputError(f"{where}: the transform of a node has shear; {cure}")
     turn = Q * np.sign(np.linalg.det(Q))  # a covariance is the same under -A
     if np.ptp(lengths) <= UNEVEN * lengths.max():
         w, x, y, z = np.roll(Rotation.from_matrix(turn).as_quat(), 1)

@@ -81,9 +81,8 @@ def parse_ply(path: str | Path) -> Gaussians:
     with reading(path, "file; give a 3DGS PLY"), parsing(path, "3DGS PLY", "export it again"):
         ply = _parse_any_comment(path)
     if "vertex" not in ply:
-        raise InputError(
-            f"{path}: not a 3DGS PLY, it has no vertices; export it with a splatting tool"
-        )
+        why = "not a 3DGS PLY, it has no vertices"
+        raise InputError(f"{path}: {why}; export it with a splatting tool")
     vertices = ply["vertex"].data
     if any(name in vertices.dtype.names for name in PACKED):
         columns = _decompress(path, ply)
@@ -114,9 +113,8 @@ def _from_columns(
     rest = sum(re.fullmatch("f_rest_[0-9]+", name) is not None for name in columns)
     coefficients = 1 + rest // 3
     if rest % 3 or coefficients not in (1, 4, 9, 16):
-        raise InputError(
-            f"{path}: {rest} f_rest properties fit no SH degree; expected 0, 9, 24 or 45"
-        )
+        why = f"{rest} f_rest properties fit no SH degree"
+        raise InputError(f"{path}: {why}; expected 0, 9, 24 or 45")
     names = _ply_names(coefficients)
     wrong = {n: "is missing" for n in names if n not in columns and n not in ("nx", "ny", "nz")}
     if not wrong:
@@ -124,9 +122,8 @@ def _from_columns(
         wrong = {name: "is a list" for name in present if columns[name].dtype.kind == "O"}
     if wrong:
         name, what = next(iter(wrong.items()))
-        raise InputError(
-            f"{path}: not a 3DGS PLY, property {name!r} {what}; export it with a splatting tool"
-        )
+        why = f"not a 3DGS PLY, property {name!r} {what}"
+        raise InputError(f"{path}: {why}; export it with a splatting tool")
 
     def stack(*names: str) -> np.ndarray:
         with np.errstate(over="ignore"):  # an overflow gives infinity, which the caller refuses
@@ -180,13 +177,11 @@ def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
     for table, name, kind in needs + [(vertices, name, "u") for name in PACKED]:
         dtype = table.dtype[name] if name in (table.dtype.names or ()) else None
         if dtype is None or dtype.kind != kind or dtype.itemsize < 4:
-            raise InputError(
-                f"{path}: a compressed PLY without a usable {name!r}; export it uncompressed"
-            )
+            why = f"a compressed PLY without a usable {name!r}"
+            raise InputError(f"{path}: {why}; export it uncompressed")
     if len(chunks) * CHUNK < n:
-        raise InputError(
-            f"{path}: {len(chunks)} chunks are too few for {n} splats; export it again"
-        )
+        why = f"{len(chunks)} chunks are too few for {n} splats"
+        raise InputError(f"{path}: {why}; export it again")
     chunk = np.arange(n) // CHUNK
 
     def share(word: str, lowest: int, bits: int) -> np.ndarray:
@@ -229,9 +224,8 @@ def _decompress_sh(path: Path, ply: PlyData, n: int) -> dict[str, np.ndarray]:
         return {}
     table = ply["sh"].data
     if len(table) != n or any(table.dtype[name] != np.uint8 for name in table.dtype.names):
-        raise InputError(
-            f"{path}: a compressed PLY whose element 'sh' is not {n} rows of bytes; export it again"
-        )
+        why = f"a compressed PLY whose element 'sh' is not {n} rows of bytes"
+        raise InputError(f"{path}: {why}; export it again")
     values = (np.arange(256) + 0.5) / 32 - 4
     values[[0, 255]] = -4, 4
     return {name: values[table[name]] for name in table.dtype.names}

@@ -55,9 +55,8 @@ def opened(path: Path) -> Iterator[Any]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise InputError(
-            f"{path}: a ROS bag needs rosbags, which is not installed; `pip install mgs[ros]`"
-        ) from None
+        why = "a ROS bag needs rosbags, which is not installed"
+        raise InputError(f"{path}: {why}; `pip install mgs[ros]`") from None
     if path.suffix in STORAGE and (path.parent / "metadata.yaml").is_file():
         path = path.parent
     for file in path.iterdir() if path.is_dir() else [path]:
@@ -151,10 +150,8 @@ class Tree:
         self.unused += [f"{name} (tf has the poses of {child})" for name in others]
         parent = max(by_kind[kind], key=lambda name: len(by_kind[kind][name]))
         if len(by_kind[kind]) > 1:
-            raise InputError(
-                f"{path}: {kind} has two parents of {child}: {', '.join(sorted(by_kind[kind]))}; "
-                "give the topic of the right poses as pose"
-            )
+            why = f"{kind} has two parents of {child}: {', '.join(sorted(by_kind[kind]))}"
+            raise InputError(f"{path}: {why}; give the topic of the right poses as pose")
         self.parents[child], self.tracks[child] = parent, Track.of(by_kind[kind][parent])
 
     def pose(self, camera: str, time: float) -> np.ndarray | None:
@@ -191,18 +188,14 @@ def read_bag(
         others = _pose_topics(reader)
         give = f"; if {others} has the camera's poses, give it as pose" if others != "none" else ""
         if frame not in tree.parents:
-            raise InputError(
-                f"{path}: no tf or odometry leads to {frame or 'the frame'} of {topic}; "
-                f"record /tf and /tf_static with it{give}"
-            )
+            why = f"no tf or odometry leads to {frame or 'the frame'} of {topic}"
+            raise InputError(f"{path}: {why}; record /tf and /tf_static with it{give}")
         if not there:
             cure = "record poses and images together, by one clock"
             raise InputError(f"{path}: no image of {topic} has a pose at its time; {cure}")
         if len(there) > 1 and poses_agree([pose for _, pose in there]):
-            raise InputError(
-                f"{path}: the camera does not move: the transforms that lead to {frame} are "
-                f"constant; record what moves it{give}"
-            )
+            why = f"the camera does not move: the transforms that lead to {frame} are constant"
+            raise InputError(f"{path}: {why}; record what moves it{give}")
         keyframes = dict(there[k] for k in spacing.choose(there))
         shots: dict[float, Shot] = {}
         start = next(iter(times))
@@ -252,10 +245,8 @@ def _lens(path: Path, reader: Any, topic: str) -> tuple[Any, Lens | None, str]:
         K, D = P.reshape(3, 4)[:, :3].copy(), np.zeros(5)
     names = LENSES.get(info.distortion_model, ())
     if D.any() and (not names or len(D) > 8):
-        raise InputError(
-            f"{path}: the lens of {topic} is {info.distortion_model}, which is not supported; "
-            "give the topic of its rectified images as `images`"
-        )
+        why = f"the lens of {topic} is {info.distortion_model}, which is not supported"
+        raise InputError(f"{path}: {why}; give the topic of its rectified images as `images`")
     K[:2, 2] += 0.5  # from pixel centres at whole numbers to ours
     size, model = (int(info.width), int(info.height)), "FULL_OPENCV"
     if len(names) == 4:
@@ -278,10 +269,8 @@ def unpack_colour(path: Path, message: Any, stem: Path) -> Path:
         return file
     if message.encoding not in COLOURS:
         encodings = ", ".join(COLOURS)
-        raise InputError(
-            f"{path}: colour images of encoding {message.encoding!r} are not supported, "
-            f"but {encodings}; convert them"
-        )
+        why = f"colour images of encoding {message.encoding!r} are not supported, but {encodings}"
+        raise InputError(f"{path}: {why}; convert them")
     pixels = _rows(message, "u1")[..., COLOURS[message.encoding]]
     write_png(stem.with_suffix(".png"), np.ascontiguousarray(pixels))
     return stem.with_suffix(".png")

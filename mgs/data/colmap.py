@@ -177,10 +177,8 @@ def _names_in_text(path: Path) -> dict[int, str]:
     for line in lines:
         words = line.split(maxsplit=9)
         if points and (len(line.split()) % 3 or not all(map(_is_number, line.split()[-3:]))):
-            raise InputError(
-                f"{path}: has no line of points after that of image {list(names.values())[-1]!r}; "
-                "each image has two lines, and the second may be empty"
-            )
+            what = f"{path}: has no line of points after that of image {list(names.values())[-1]!r}"
+            raise InputError(f"{what}; each image has two lines, and the second may be empty")
         if points or not words or words[0].startswith("#"):
             points = False
             continue

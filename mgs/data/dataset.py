@@ -161,10 +161,8 @@ def read_records(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         for key in FILES.values():
             value = record.get(key) or ""
             if not isinstance(value, str) or not value.isprintable():
-                raise InputError(
-                    f"{path}: frame {index} has a {key} that is no text or cannot be a path; "
-                    "correct it"
-                )
+                why = f"frame {index} has a {key} that is no text or cannot be a path"
+                raise InputError(f"{path}: {why}; correct it")
     return data, records
 
 

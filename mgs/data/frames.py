@@ -120,10 +120,8 @@ class Frame:
             )
         (width, height), camera = image_size(path), self.camera
         if (width, height) != (camera.width, camera.height):
-            raise InputError(
-                f"{path}: is {width}x{height}, but transforms.json says "
-                f"{camera.width}x{camera.height}; correct either"
-            )
+            why = f"is {width}x{height}, but transforms.json says {camera.width}x{camera.height}"
+            raise InputError(f"{path}: {why}; correct either")
         return path
 
 

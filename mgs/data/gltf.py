@@ -123,10 +123,8 @@ class Gltf:
             if "mesh" in node:
                 mesh = meshes[node["mesh"]]
                 if "skin" in node or any(node.get("weights", mesh.get("weights", ()))):
-                    raise InputError(
-                        f"{self.path}: a skin or morph targets change its shape; apply them and "
-                        "export it again"
-                    )
+                    why = "a skin or morph targets change its shape"
+                    raise InputError(f"{self.path}: {why}; apply them and export it again")
                 for instance in self._instances(node):
                     yield node["mesh"], here @ instance
             waiting += [(child, here, depth + 1) for child in reversed(node.get("children", []))]

@@ -93,10 +93,8 @@ def undistorter(camera: Camera, lens: Lens | None) -> tuple[Camera, Undo]:
     K = _inner(lens, *size)
     pixels = _distorted(lens, K, *(np.linspace(0.5, side - 0.5, 65) for side in size))
     if not _is_sound(pixels, lens, K, size):
-        raise InputError(
-            "import: the distortion leaves no valid pixel or folds the image over itself; check "
-            "the focal length and k1 k2 p1 p2"
-        )
+        why = "the distortion leaves no valid pixel or folds the image over itself"
+        raise InputError(f"import: {why}; check the focal length and k1 k2 p1 p2")
 
     def undo(pixels: np.ndarray, smooth: bool) -> np.ndarray:
         method = cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST
@@ -200,10 +198,8 @@ def read_fitting(
     size, real = (camera.width, camera.height), image_size(path)
     orientation = exif_orientation(path) if turned or real == size[::-1] != size else 1
     if size != (real[::-1] if orientation >= 5 else real):
-        raise InputError(
-            f"{path}: is {real[0]}x{real[1]}, but its camera is {camera.width}x{camera.height}; "
-            "resize it or correct w and h"
-        )
+        why = f"is {real[0]}x{real[1]}, but its camera is {camera.width}x{camera.height}"
+        raise InputError(f"{path}: {why}; resize it or correct w and h")
     pixels = read(path)
     flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}.get(orientation, ())
     if orientation >= 5:

@@ -101,9 +101,8 @@ def _check(path: object, vertices: np.ndarray, faces: np.ndarray) -> None:
         what = f"vertex {faces[face, corner]} of {len(vertices)}"
         raise InputError(f"{path}: face {face} names {what}; repair the mesh")
     if np.abs(vertices).max() > FURTHEST:
-        raise InputError(
-            f"{path}: has vertices further than {FURTHEST:g} m from the origin; scale the mesh"
-        )
+        why = f"has vertices further than {FURTHEST:g} m from the origin"
+        raise InputError(f"{path}: {why}; scale the mesh")
     if not face_crosses(np.asarray(vertices, np.float64), faces).any():
         raise InputError(f"{path}: none of its faces has an area; repair the mesh")
 

@@ -28,9 +28,8 @@ def rows(path: Path, least: int) -> list[list[str]]:
     lines = read_text(path).splitlines()
     table = [line.split() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if short := [words for words in table if len(words) < least]:
-        raise InputError(
-            f"{path}: {' '.join(short[0])[:60]!r} has fewer than {least} columns; correct the line"
-        )
+        why = f"{' '.join(short[0])[:60]!r} has fewer than {least} columns"
+        raise InputError(f"{path}: {why}; correct the line")
     return table
 
 
@@ -135,10 +134,8 @@ def read_open3d(folder: Path, spacing: Spacing) -> Source:
     )
     for name, files in (("color", images), ("depth", depths)):
         if len(files) != len(matrices) and (files or name == "color"):
-            raise InputError(
-                f"{path}: has {len(matrices)} poses for {len(files)} images in {name}; "
-                "make them equal"
-            )
+            why = f"has {len(matrices)} poses for {len(files)} images in {name}"
+            raise InputError(f"{path}: {why}; make them equal")
     if unnumbered := [path for path in images if not re.search(r"\d", path.name)]:
         cure = "rename it"
         raise InputError(f"{unnumbered[0]}: its name has no number, which gives its pose; {cure}")

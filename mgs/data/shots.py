@@ -134,10 +134,8 @@ class Source:
         apart = [shot for shot in self.shots if shot.name in names]
         others = [shot for shot in self.shots if shot.name not in names]
         if not others:
-            raise InputError(
-                f"import: {len(apart)} test views of {len(self.shots)} images leave none to choose "
-                "from; correct test_every, or test_filenames"
-            )
+            why = f"{len(apart)} test views of {len(self.shots)} images leave none to choose from"
+            raise InputError(f"import: {why}; correct test_every, or test_filenames")
         if not apart:
             return self, None
         return replace(self, shots=others), replace(self, shots=apart, sparse=None)
@@ -186,11 +184,8 @@ def checked(path: Path, source: Source) -> Source:
     there = [shot for shot in source.shots if shot.image.is_file()]
     left_out = source.left_out + Counter({"whose file is missing": len(source.shots) - len(there)})
     if not there:
-        raise InputError(
-            f"{path}: none of the {source.left_out.total() + len(source.shots)} images it lists "
-            "exists; "
-            "restore them or give images"
-        )
+        why = f"none of the {source.left_out.total() + len(source.shots)} images it lists exists"
+        raise InputError(f"{path}: {why}; restore them or give images")
     for name, count in Counter(shot.name for shot in there).items():
         if count > 1:
             raise InputError(f"{path}: lists {name} more than once; remove the duplicate frames")

@@ -97,9 +97,8 @@ def read_source(
             note = "its test split is left out; --test-split test makes it the test views"
             result = replace(result, notes=(*result.notes, note))
     except OSError as error:
-        raise InputError(
-            f"{source}: a file of it cannot be read ({error.strerror or error}); correct its name"
-        ) from None
+        why = f"a file of it cannot be read ({error.strerror or error})"
+        raise InputError(f"{source}: {why}; correct its name") from None
     if result.kind != PHOTOGRAPHS:
         result = result.without(exclude)
     return turned_by_exif(result).near_origin()

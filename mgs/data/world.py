@@ -77,9 +77,8 @@ def up_of_cameras(cameras: Sequence[Camera]) -> Vector:
     values, axes = np.linalg.svd(right)[1:]
     common = axes[2] if len(cameras) > 2 and values[1] > LEVEL * np.sqrt(len(cameras)) else upward
     if np.linalg.norm(common) < 1e-6 or abs(common @ upward) < 1e-6:
-        raise InputError(
-            "up: the cameras are held every way round, and have no up in common; give `up` as X,Y,Z"
-        )
+        why = "the cameras are held every way round, and have no up in common"
+        raise InputError(f"up: {why}; give `up` as X,Y,Z")
     return unit_up(common * np.sign(common @ upward) / np.linalg.norm(common))
 
 

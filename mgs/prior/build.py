@@ -271,10 +271,8 @@ def prior_from_mesh(
     if dataset:
         mesh = mesh_in_sight(mesh, cameras, dataset.world, where)
     if settings.density is not None:
-        raise InputError(
-            f"{where}: a density is relative to the voxels of a cloud, and a mesh has none; "
-            "give a number or a spacing"
-        )
+        why = "a density is relative to the voxels of a cloud, and a mesh has none"
+        raise InputError(f"{where}: {why}; give a number or a spacing")
     points, normals, spacing, sampled = _samples(mesh, settings, cameras)
     values = {key: getattr(settings, key) for key in ("gaussians", "spacing", "seed", "backing")}
     numbers = {
@@ -364,10 +362,8 @@ def load_prior(folder: str | Path) -> Prior:
         cure = "make it again with `mgs prior`"
         raise InputError(f"{path}: has NaN values, or fewer than two points; {cure}")
     if not (0 < spacing < np.inf and 0 < tolerance < np.inf):
-        raise InputError(
-            f"{folder / 'prior.json'}: spacing and depth_tolerance must be positive metres; "
-            "make the prior again"
-        )
+        why = "spacing and depth_tolerance must be positive metres"
+        raise InputError(f"{folder / 'prior.json'}: {why}; make the prior again")
     if not 0 <= backed <= len(columns):
         cure = "make the prior again"
         raise InputError(f"{folder / 'prior.json'}: backed must be a number of the points; {cure}")

@@ -53,9 +53,8 @@ def resolution(
         pixel = np.where(inside & facing & (size < pixel), size, pixel)
     in_view = np.isfinite(pixel) & (areas > 0)
     if not in_view.any():
-        raise InputError(
-            "prior: no frame shows the mesh, so nothing says how many Gaussians; give `gaussians`"
-        )
+        why = "no frame shows the mesh, so nothing says how many Gaussians"
+        raise InputError(f"prior: {why}; give `gaussians`")
     area = float(areas[in_view].sum())
     typical = float(np.sqrt(area / (areas[in_view] / pixel[in_view] ** 2).sum()))
     return Resolution(typical, pixels * typical, area)

@@ -85,10 +85,8 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
     model, inliers = ransac(sample, Plane, 3, tolerance, max_trials=300, rng=rng)
     share = 0.0 if inliers is None else float(np.mean(inliers))
     if share < PLANE_MIN_SHARE:
-        raise InputError(
-            f"cloud: no ground plane (the best holds {share:.0%} of the cloud); "
-            "photograph more ground, or give `mesh`"
-        )
+        why = f"no ground plane (the best holds {share:.0%} of the cloud)"
+        raise InputError(f"cloud: {why}; photograph more ground, or give `mesh`")
     away = np.linalg.norm(cloud.points - target.point, axis=1)
     around = cloud.points[away < PLANE_REACH * target.distance]
     for _ in range(3):
@@ -132,18 +130,14 @@ def rock_cluster(
         cell = max(1.25 * cell, sparse)
         thin = voxel_means(points, cell)[0]
     if len(thin) <= CLUSTER_NEIGHBOURS:
-        raise InputError(
-            f"{name}: no rock in the cloud ({len(points)} points above the ground plane); "
-            "aim the cameras at one"
-        )
+        why = f"no rock in the cloud ({len(points)} points above the ground plane)"
+        raise InputError(f"{name}: {why}; aim the cameras at one")
     eps = 2 * float(np.median(cKDTree(thin).query(thin, CLUSTER_NEIGHBOURS + 1)[0][:, -1]))
     labels = DBSCAN(eps=eps, min_samples=CLUSTER_NEIGHBOURS).fit_predict(thin)
     count = int(labels.max()) + 1
     if count == 0:
-        raise InputError(
-            f"{name}: no rock in the cloud (only scattered points above the ground plane); "
-            "aim the cameras at one"
-        )
+        why = "no rock in the cloud (only scattered points above the ground plane)"
+        raise InputError(f"{name}: {why}; aim the cameras at one")
     sizes = np.bincount(labels[labels >= 0], weight(thin)[labels >= 0])
     large = np.flatnonzero(sizes >= EQUAL_SIZE * sizes.max())
     away = np.array([np.linalg.norm(thin[labels == k].mean(0) - target) for k in large])

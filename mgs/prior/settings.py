@@ -57,9 +57,8 @@ class PriorSettings:
         if self.density is not None and not 0 < self.density < np.inf:
             raise InputError(f"prior: density {self.density} must be positive; correct it")
         if self.poisson_depth is not None and not 3 <= self.poisson_depth <= 12:
-            raise InputError(
-                f"prior: `poisson_depth` {self.poisson_depth} is not within 3 to 12; correct it"
-            )
+            why = f"`poisson_depth` {self.poisson_depth} is not within 3 to 12"
+            raise InputError(f"prior: {why}; correct it")
         if not 0 <= self.backing <= 1:
             cure = "correct `backing`"
             raise InputError(f"prior: {self.backing} Gaussians per sample are not 0 to 1; {cure}")

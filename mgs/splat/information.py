@@ -113,10 +113,8 @@ def fisher(
     n = len(gaussians)
     if MEANS[means] or alpha_weight or weights is not None or chosen is not None:
         if estimator not in EXACT:
-            raise InputError(
-                f"fisher: the estimator {estimator!r} has no means, alpha_weight, weights or "
-                f"chosen; use {' or '.join(EXACT)}"
-            )
+            why = f"the estimator {estimator!r} has no means, alpha_weight, weights or chosen"
+            raise InputError(f"fisher: {why}; use {' or '.join(EXACT)}")
         options = {"means": means, "alpha_weight": alpha_weight}
         options["weights"] = _weights(weights, camera, alpha_weight)
         options["chosen"] = rows = _rows(chosen, len(gaussians))

@@ -57,18 +57,15 @@ def _checked_tangent(gaussians: Gaussians, name: str, tangent: Any) -> Any:
         with np.errstate(over="ignore"):
             values = np.asarray(dr.detach(tangent), np.float32)
     except (TypeError, ValueError):
-        raise InputError(
-            f"tangents: {name} must be numbers of the parameter's shape, {shape}"
-        ) from None
+        why = f"{name} must be numbers of the parameter's shape, {shape}"
+        raise InputError(f"tangents: {why}") from None
     if values.shape != shape:
-        raise InputError(
-            f"tangents: {name} has shape {values.shape}, expected {shape}, that of the parameter"
-        )
+        why = f"{name} has shape {values.shape}, expected {shape}, that of the parameter"
+        raise InputError(f"tangents: {why}")
     if not np.isfinite(values).all():
         first = np.argwhere(~np.isfinite(values))[0][0]
-        raise InputError(
-            f"tangents: {name} is NaN or infinite, first at Gaussian {first}; remove or repair it"
-        )
+        why = f"{name} is NaN or infinite, first at Gaussian {first}"
+        raise InputError(f"tangents: {why}; remove or repair it")
     return mi.TensorXf(padded(values))
 
 

@@ -22,9 +22,8 @@ def camera_from_sensor(sensor: Any) -> Camera:
     and for a pose that is not rigid."""
     params = mi.traverse(sensor)
     if "x_fov" not in params or sensor.needs_aperture_sample():
-        raise InputError(
-            f"sensor: {sensor.class_name()} has no pinhole; splatting needs a `perspective` sensor"
-        )
+        cure = "splatting needs a `perspective` sensor"
+        raise InputError(f"sensor: {sensor.class_name()} has no pinhole; {cure}")
     width, height = params["film.size"]
     left, top = params["film.crop_offset"]
     names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
@@ -36,10 +35,8 @@ def camera_from_sensor(sensor: Any) -> Camera:
     cy = (0.5 - _number(params["principal_point_offset_y"])) * height
     to_world = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
     if np.linalg.det(to_world[:3, :3]) < 0:
-        raise InputError(
-            "sensor: to_world mirrors the image; "
-            "take the negative scale out and flip the picture afterwards"
-        )
+        cure = "take the negative scale out and flip the picture afterwards"
+        raise InputError(f"sensor: to_world mirrors the image; {cure}")
     try:
         world_to_camera = np.asarray(np.linalg.inv(to_world @ _MITSUBA_FROM_OPENCV), np.float64)
     except np.linalg.LinAlgError:

@@ -55,9 +55,8 @@ class Information:
 
     def __post_init__(self) -> None:
         if self.weights is not None and len(self.weights) != len(self.cameras):
-            raise InputError(
-                f"information: weights must be {len(self.cameras)} arrays, one a camera"
-            )
+            why = f"weights must be {len(self.cameras)} arrays, one a camera"
+            raise InputError(f"information: {why}")
 
     @cached_property
     def blocks(self) -> Floats:
@@ -112,10 +111,8 @@ class Information:
             x, r = x + step * p, r - step * image
             square, before = float((r * r).sum()), square
             p = r + square / before * p
-        raise InputError(
-            f"information: {MOST_STEPS} steps do not reach a residual of {tolerance:g}; "
-            "raise the tolerance, or lam"
-        )
+        why = f"{MOST_STEPS} steps do not reach a residual of {tolerance:g}"
+        raise InputError(f"information: {why}; raise the tolerance, or lam")
 
     def log_det(
         self, lam: ArrayLike, probes: int = 8, steps: int = STEPS, seed: int = 0
@@ -128,9 +125,8 @@ class Information:
         is that of the mean. Half of z^T A z, whose mean is known, is subtracted, which leaves about
         two thirds of the error. Raises InputError for fewer than two probes or steps."""
         if probes < 2 or steps < 2:
-            raise InputError(
-                f"information: probes {probes}, steps {steps}: give at least 2 of each"
-            )
+            why = f"probes {probes}, steps {steps}: give at least 2 of each"
+            raise InputError(f"information: {why}")
         whiten, lam = self._whitening(lam)
         rng, traces = np.random.default_rng(seed), []
         for _ in range(probes):

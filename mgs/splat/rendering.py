@@ -135,18 +135,15 @@ def as_colour(background: Any) -> Any:
     except (TypeError, ValueError):
         values = np.full(3, np.nan)
     if not (np.abs(values) <= SH_MAX).all():
-        raise InputError(
-            f"background {background}: must be one or three numbers, linear RGB, "
-            f"up to {SH_MAX:,.0f}"
-        )
+        why = f"must be one or three numbers, linear RGB, up to {SH_MAX:,.0f}"
+        raise InputError(f"background {background}: {why}")
     return mi.Color3f(*(dr.opaque(mi.Float, float(value)) for value in values))
 
 
 def _raise_unless_finite(finite: Any) -> None:
     if not finite:
-        raise InputError(
-            f"gaussians: a parameter is NaN or infinite, or a colour beyond {SH_MAX:,.0f}"
-        )
+        why = f"a parameter is NaN or infinite, or a colour beyond {SH_MAX:,.0f}"
+        raise InputError(f"gaussians: {why}")
 
 
 def as_drjit(gaussians: Gaussians) -> Gaussians:

@@ -57,10 +57,8 @@ def registration_cloud(frame: Frame, depth: np.ndarray, grid: float) -> tuple[An
     own = Camera(frame.camera.K, frame.camera.width, frame.camera.height, np.eye(4))
     points = own.unproject(z)[z > 0]
     if len(points) < 100:
-        raise InputError(
-            f"survey: frame {frame.name} has only {len(points)} depth returns, so it cannot be "
-            "registered; remove it"
-        )
+        why = f"frame {frame.name} has only {len(points)} depth returns, so it cannot be registered"
+        raise InputError(f"survey: {why}; remove it")
     return small_gicp.preprocess_points(
         points, downsampling_resolution=grid, num_neighbors=NEIGHBOURS, num_threads=1
     )

@@ -40,10 +40,8 @@ def capture_of(dataset: Dataset) -> Callable[[Frame], Frame]:
             change = np.abs(own.camera.world_to_camera - frame.camera.world_to_camera).max()
         if own is None or (exact and change >= POSE_TOLERANCE):
             where = f"{dataset.root / 'transforms.json'}: frame {frame.name}"
-            raise InputError(
-                f"{where} is not one of the scene's orbit, so it cannot be rendered; "
-                "restore or remove it"
-            )
+            what = f"{where} is not one of the scene's orbit, so it cannot be rendered"
+            raise InputError(f"{what}; restore or remove it")
         photographer.take(own)
         return frame
 
@@ -63,14 +61,11 @@ def photographer_of(root: Path) -> tuple[Photographer, dict[str, Frame], bool]:
         exposure, spp = float(config["exposure"]), int(config["samples_per_pixel"])
         exact, made_of = config["pose_noise"] is None, config["mesh"]
     except (KeyError, TypeError, ValueError, ValidationError):
-        raise InputError(
-            f"{path}: is not of `mgs synth-orbit --on-demand`, or damaged; make the dataset again"
-        ) from None
+        why = "is not of `mgs synth-orbit --on-demand`, or damaged"
+        raise InputError(f"{path}: {why}; make the dataset again") from None
     if denoise and importlib.util.find_spec("pyoidn") is None:
-        raise InputError(
-            f"{path}: its images are denoised by pyoidn, which is not installed; "
-            '`pip install "mgs[denoise]"`'
-        )
+        why = "its images are denoised by pyoidn, which is not installed"
+        raise InputError(f'{path}: {why}; `pip install "mgs[denoise]"`')
     if mesh is not None:
         with reading(Path(mesh), f"mesh, of which {root} is made"):
             if made_of != fingerprint(mesh) | {"up": made_of["up"]}:

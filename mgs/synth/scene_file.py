@@ -129,9 +129,8 @@ def load_scene_file(scene: str | Path, **orbit: Any) -> SceneFile:
         if first["type"] == "extra_forbidden":
             keys = ", ".join(_keys_beside(first["loc"]))
             raise InputError(f"{path}: unknown key {key!r}; choose one of {keys}") from None
-        raise InputError(
-            f"{path}: {key}: {first['msg']} (is {repr(first['input'])[:80]}); correct it"
-        ) from None
+        why = f"{key}: {first['msg']} (is {repr(first['input'])[:80]})"
+        raise InputError(f"{path}: {why}; correct it") from None
 
 
 def _keys_beside(where: tuple[int | str, ...]) -> list[str]:
