@@ -32,7 +32,7 @@ from .reports.diagnostics import view_maps as view_maps
 from .reports.evaluation import evaluate as evaluate
 from .reports.evaluation import evaluate_run as evaluate_run
 from .reports.page import write_page as write_page
-from .reports.writing import report as report
+from .reports.tables import report as report
 from .run.choosing import choose as choose
 from .run.folder import Checkpoint as Checkpoint
 from .run.folder import Run as Run

@@ -20,7 +20,7 @@ from program import command, output
 from refusals import fails, listing, refused
 
 from mgs import InputError, files, load_dataset, write_ply
-from mgs.cli.printing import step_lines
+from mgs.cli.terminal import step_lines
 from mgs.files import atomic_folder, atomic_path, below, folder_locked, locked, scratch_folder
 from mgs.images import image_size
 from mgs.reports.page_plots import curve_plot

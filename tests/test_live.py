@@ -23,7 +23,7 @@ from mgs.camera import look_at, opengl_from_opencv
 from mgs.data.world import unit_up
 from mgs.errors import InputError, Notice
 from mgs.images import read_exr, read_rgba, write_png
-from mgs.run import live, transports
+from mgs.run import live
 from mgs.run.ending import why_ended
 from mgs.run.live import check_photograph
 
@@ -100,7 +100,7 @@ def test_the_run_of_a_command_is_that_on_the_complete_dataset(flight, pristine, 
     script = tmp_path / "drone.sh"
     script.write_text(SCRIPT)
     text = f"sh '{script}' '{pristine}' {{pose}} {{out}}"
-    (said,) = flight.fly(transports.command(text, 600))
+    (said,) = flight.fly(live.command(text, 600))
     assert said.startswith("kf_0004, try 1 of 3: ")
     assert "exit code 7: no link" in said
     assert flight.steps == timeless(steps(whole))
@@ -162,7 +162,7 @@ def test_what_goes_wrong_is_one_line_and_is_tried_again(flight, pristine, whole)
 
 
 def test_a_command_that_hangs_is_ended_with_its_children(tmp_path):
-    deliver = transports.command("sh -c 'sleep 60 & wait' {pose} {out}", 0.3)
+    deliver = live.command("sh -c 'sleep 60 & wait' {pose} {out}", 0.3)
     fails(r"within 0\.3 s", deliver, tmp_path / "a.pose.json", tmp_path / "a.png")
 
 
@@ -280,9 +280,9 @@ def test_depth_and_images_that_exist_are_kept(dataset, pristine, prior, tmp_path
 
 def test_a_watched_folder(flight, other, pristine, whole, tmp_path, monkeypatch):
     """Somebody puts pictures there, in two halves, while the clock jumps by days."""
-    monkeypatch.setattr(transports, "POLL", 0.02)
+    monkeypatch.setattr(live, "POLL", 0.02)
     days = itertools.cycle([0.0, 9e5, -9e5])
-    monkeypatch.setattr(transports.time, "time", lambda: next(days))
+    monkeypatch.setattr(live.time, "time", lambda: next(days))
     folder, end = tmp_path / "sync", threading.Event()
     folder.mkdir()
 
@@ -301,7 +301,7 @@ def test_a_watched_folder(flight, other, pristine, whole, tmp_path, monkeypatch)
     thread = threading.Thread(target=somebody)
     thread.start()
     try:
-        said = flight.fly(transports.watched(60), folder=folder)
+        said = flight.fly(live.watched(60), folder=folder)
     finally:
         end.set()
         thread.join()
@@ -311,19 +311,19 @@ def test_a_watched_folder(flight, other, pristine, whole, tmp_path, monkeypatch)
     assert flight.steps == timeless(steps(whole))
     before = {path: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(InputError, match=r"gave no|no picture"):  # these are of the first run
-        other.fly(transports.watched(0.01), folder=folder)
+        other.fly(live.watched(0.01), folder=folder)
     assert {path: path.read_bytes() for path in before} == before
 
 
 @pytest.mark.parametrize("end", [".png", ".jpg", ".JPG", ".JPEG"])
 def test_a_picture_as_cameras_name_it(tmp_path, end):
     (tmp_path / f"a{end}").touch()
-    assert transports.picture(tmp_path / "a.png") == tmp_path / f"a{end}"
+    assert live.picture(tmp_path / "a.png") == tmp_path / f"a{end}"
 
 
 def test_nobody_comes(flight, tmp_path, monkeypatch):
-    monkeypatch.setattr(transports, "POLL", 0.01)
-    fails(r"within 0\.05 s", flight.fly, transports.watched(0.05), folder=tmp_path, **ONCE)
+    monkeypatch.setattr(live, "POLL", 0.01)
+    fails(r"within 0\.05 s", flight.fly, live.watched(0.05), folder=tmp_path, **ONCE)
 
 
 LIGHT = {

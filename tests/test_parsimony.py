@@ -12,7 +12,7 @@ from refusals import fails
 from mgs import PriorSettings
 from mgs.data.meshes import Mesh
 from mgs.prior.build import _samples, build_prior, prior_from_mesh
-from mgs.prior.resolution import PIXELS_OF_PHOTOGRAPHS, PIXELS_PER_SAMPLE, resolution
+from mgs.prior.surface import PIXELS_OF_PHOTOGRAPHS, PIXELS_PER_SAMPLE, resolution
 from studies import parsimony
 from studies.frame.output import read_rows
 from studies.setups import SetupSize

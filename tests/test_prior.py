@@ -15,8 +15,7 @@ from mgs.data.raycast import mesh_depth
 from mgs.data.visibility import visible
 from mgs.prior.build import build_prior, load_prior, outline_error, prior_and_cloud, save_prior
 from mgs.prior.segmentation import Plane, ground_plane, rock_cluster
-from mgs.prior.surface import poisson_mesh, sample_surface
-from mgs.prior.truth import error_to_truth
+from mgs.prior.surface import error_to_truth, poisson_mesh, sample_surface
 from mgs.survey.fusion import Cloud, focus
 
 X, Y, Z = np.eye(3)

@@ -14,12 +14,12 @@ from program import change_settings, change_steps, command, table_numbers
 from refusals import fails
 
 from mgs import load_dataset, open_run, plotting
-from mgs.cli import printing
+from mgs.cli import terminal
 from mgs.cli.terminal import Terminal
 from mgs.colour import srgb_from_linear
 from mgs.evaluation import render_view
 from mgs.files import read_json, write_json
-from mgs.reports import figures, tables, writing
+from mgs.reports import figures, tables
 from mgs.reports.figures import POLICY_STYLE
 from mgs.reports.page_plots import SYMBOLS
 from mgs.reports.tables import compare_runs
@@ -83,7 +83,7 @@ def images(figure):
 
 def test_report_writes_every_figure(runs, tmp_path, drawn):
     out = tmp_path / "report"
-    written = writing.report(runs, out)
+    written = tables.report(runs, out)
     names = [*(f"{name}.png" for name in FIGURES), "table.md", "table.json"]
     assert [path.name for path in written] == names
     assert {path.name for path in out.iterdir()} == set(names)
@@ -188,7 +188,7 @@ def test_a_run_that_was_not_measured_on_the_test_views_is_compared_on_the_others
     run = shutil.copytree(runs[1], tmp_path / "random")
     change_steps(run, no_line_has("test"))
     write_json(run / "metrics.json", without("test", read_json(run / "metrics.json")))
-    writing.report([runs[0], run], tmp_path / "report")
+    tables.report([runs[0], run], tmp_path / "report")
     read = [open_run(folder) for folder in (runs[0], run)]
     axis = drawn["psnr.png"].axes[0]
     assert axis.get_ylabel() == "PSNR, all views (dB)"
@@ -244,7 +244,7 @@ UNFIT = {
 def test_runs_that_cannot_be_reported(runs, tmp_path, change, named):
     run = shutil.copytree(runs[1], tmp_path / "run")
     change(run)
-    fails(re.escape(named), writing.report, [runs[0], run], tmp_path / "report")
+    fails(re.escape(named), tables.report, [runs[0], run], tmp_path / "report")
     assert not (tmp_path / "report").exists()
 
 
@@ -322,10 +322,10 @@ def test_values_in_masks_stand_only_where_there_are_masks(inside, shown):
 def test_a_long_name_cuts_no_number_and_is_not_cut(tested):
     name = "random (a [second] run in a folder with a long name" + "x" * 80 + ")"
     console = Terminal(width=80, record=True, file=io.StringIO())
-    shown = enumerate(printing.SHOWN[tested])
+    shown = enumerate(terminal.SHOWN[tested])
     row = {key: i / 8 if "ssim" in key else 30.125 + i for i, key in shown} | {"coverage": 100.0}
     rows = [{"policy": policy, "images": 12} | row for policy in (name, "random")]
-    printing.print_quality(console, rows)
+    terminal.print_quality(console, rows)
     text = console.export_text()
     assert all(text.count(tables.table_cell(key, value)) == 2 for key, value in row.items())
     assert "…" not in text

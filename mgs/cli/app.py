@@ -65,8 +65,7 @@ class _Command(TyperCommand):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         super().format_help(ctx, formatter)
         if self.keys:
-            from mgs.cli.printing import settings_table
-            from mgs.cli.terminal import Terminal
+            from mgs.cli.terminal import Terminal, settings_table
 
             Terminal().print(settings_table(self.keys))
 

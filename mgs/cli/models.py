@@ -7,8 +7,7 @@ import typer
 
 from mgs import runtime
 from mgs.cli.options import not_none
-from mgs.cli.printing import print_quality
-from mgs.cli.terminal import Terminal, echo, progress_bar
+from mgs.cli.terminal import Terminal, echo, print_quality, progress_bar
 from mgs.errors import InputError
 from mgs.files import below, check_new_file, folder_locked, working_in
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
@@ -211,9 +210,8 @@ def report(
 
 
 def _write_figures(runs: list[Path], out: Path, kind: str, force: bool) -> None:
-    from mgs.reports.tables import compare_runs, comparison_rows
-    from mgs.reports.writing import report as compared_in
-    from mgs.reports.writing import report_files
+    from mgs.reports.tables import compare_runs, comparison_rows, report_files
+    from mgs.reports.tables import report as compared_in
     from mgs.run.ending import why_ended
 
     for name in report_files(kind):

@@ -114,17 +114,16 @@ PASSES_BETWEEN = 5  # passes of a fit to all images between two pictures of a te
 def live_capture(command: str | None, folder: Path | None, values: dict[str, Any]) -> Live | None:
     """`Live` of the options of a live capture, None without one. Raises InputError as `command`,
     and where options are wrong or do not go together."""
-    from mgs.run import transports
-    from mgs.run.live import Live
+    from mgs.run import live
 
     rest = validated(Capture, values, within="capture").model_dump()
     timeout = rest.pop("timeout")
     if command is not None and folder is not None:
         raise InputError("nbv: give either --capture-command or --capture-folder")
     if command is not None:
-        return Live(transports.command(command, timeout), **rest)
+        return live.Live(live.command(command, timeout), **rest)
     if folder is not None:
-        return Live(transports.watched(timeout), check_writable(folder), **rest)
+        return live.Live(live.watched(timeout), check_writable(folder), **rest)
     return None
 
 
@@ -151,7 +150,7 @@ def start_and_print(
 def resume_and_print(run: Path | Run, console: Terminal, **options: Any) -> None:
     """Run or resume the loop of a run with a line for each step, evaluate, print the quality.
     options: `policy`, `live` and `like` of `mgs.run.nbv.resume_nbv`."""
-    from mgs.cli.printing import print_run, step_lines
+    from mgs.cli.terminal import print_run, step_lines
     from mgs.reports.evaluation import drawn_test_view, evaluate_run
     from mgs.run.folder import open_run
     from mgs.run.nbv import resume_nbv

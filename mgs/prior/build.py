@@ -25,16 +25,19 @@ from mgs.notebook import cloud, html
 from mgs.prior.hull import MOST_PIXELS
 from mgs.prior.photographs import check_masks, check_photographs, choose_source, surface_of
 from mgs.prior.points import scattered
-from mgs.prior.resolution import (
+from mgs.prior.segmentation import SegmentedCloud, segment_dataset
+from mgs.prior.settings import PriorSettings
+from mgs.prior.surface import (
     MOST_GAUSSIANS,
     PIXELS_OF_PHOTOGRAPHS,
     PIXELS_PER_SAMPLE,
+    Surface,
+    error_to_truth,
+    poisson_mesh,
     resolution,
+    sample_surface,
+    spread_first,
 )
-from mgs.prior.segmentation import SegmentedCloud, segment_dataset
-from mgs.prior.settings import PriorSettings
-from mgs.prior.surface import Surface, poisson_mesh, sample_surface, spread_first
-from mgs.prior.truth import error_to_truth
 from mgs.progress import report
 from mgs.seeds import derive_seed
 

@@ -19,9 +19,9 @@ from mgs.data.meshes import Mesh
 from mgs.data.structure import CLOUD
 from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError
-from mgs.prior.resolution import MOST_GAUSSIANS
 from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud, estimate_normals, ground_plane
 from mgs.prior.settings import PriorSettings
+from mgs.prior.surface import MOST_GAUSSIANS
 from mgs.progress import report
 from mgs.seeds import derive_seed, generator
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD

@@ -1,16 +1,24 @@
-"""The surface: watertight mesh of the rock's points (Poisson) and even samples (blue noise)."""
+"""The surface: watertight mesh of the rock's points (Poisson), the sample spacing that images can
+resolve, even samples (blue noise), and their distance from the true rock. A detail of a period
+under two pixels is in no image (Nyquist); samples closer than pixels differ by noise only."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mgs.data.meshes import Mesh
+from mgs.camera import Camera
+from mgs.data.dataset import Dataset
+from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
+from mgs.data.visibility import in_image, visible
 from mgs.errors import InputError
 from mgs.prior.segmentation import Plane, SegmentedCloud
+from mgs.seeds import derive_seed
 
 # Edge of the cube of the Poisson reconstruction, over the extent of the points. Below the open
 # underside the surface bulges out; with pymeshlab's default, 1.1, it leaves the cube and is not
@@ -238,3 +246,108 @@ def _independent(pairs: np.ndarray, n: int) -> np.ndarray:
         active = undecided[low] & undecided[high]
         low, high = low[active], high[active]
     return np.flatnonzero(members)
+
+
+# Spacing of the samples over the size of the closest pixel. Closer samples gain little, and much
+# closer ones lose: the model then has more parameters than the images have values
+# (docs/parsimony.md).
+PIXELS_PER_SAMPLE = 0.9
+PIXELS_OF_PHOTOGRAPHS = 1.15  # for photographs: more Gaussians need more passes (docs/fit.md)
+MOST_GAUSSIANS = 200_000  # most that cameras decide: close-ups ask for millions. A chosen constant
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """Resolution of the closest camera on the surface."""
+
+    pixel: float  # on the surface, metres, rms over the area
+    spacing: float  # of the samples, metres
+    area: float  # square metres
+
+    @property
+    def samples(self) -> int:
+        """Number of samples, area / spacing^2."""
+        return round(self.area / self.spacing**2)
+
+
+def resolution(
+    mesh: Mesh, cameras: Sequence[Camera], pixels: float = PIXELS_PER_SAMPLE
+) -> Resolution:
+    """Spacing of samples that these cameras can tell apart, for the seen part of the mesh.
+
+    pixels: spacing of the samples over the size of the closest pixel. The pixel on a face is
+    z-depth / focal length, whatever the slant; the smallest counts among the cameras that have the
+    face in their image and in front, occluded or not. N is the sum over faces of area / (pixels
+    pixel)^2; faces in no image do not count. Raises InputError if none is."""
+    middles = mesh.vertices[mesh.faces[mesh.seen]].mean(1)
+    crosses, areas = mesh.crosses[mesh.seen], mesh.areas[mesh.seen]
+    pixel = np.full(len(areas), np.inf)
+    for camera in cameras:
+        at, z = camera.project(middles)
+        inside = in_image(camera, at, z)
+        facing = np.einsum("fk,fk->f", crosses, camera.position - middles) > 0
+        size = z / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
+        pixel = np.where(inside & facing & (size < pixel), size, pixel)
+    in_view = np.isfinite(pixel) & (areas > 0)
+    if not in_view.any():
+        why = "no frame shows the mesh, so nothing says how many Gaussians"
+        raise InputError(f"prior: {why}; give `gaussians`")
+    area = float(areas[in_view].sum())
+    typical = float(np.sqrt(area / (areas[in_view] / pixel[in_view] ** 2).sum()))
+    return Resolution(typical, pixels * typical, area)
+
+
+TRUTH_SAMPLES = 50_000  # random points on the true rock whose distance to the prior is measured
+
+
+def error_to_truth(
+    points: np.ndarray,
+    spacing: float,
+    mesh: Mesh,
+    truth: Path,
+    dataset: Dataset,
+    segmented: SegmentedCloud,
+    seed: int,
+) -> dict[str, float]:
+    """Distances between a prior and the true rock, metres.
+
+    points: [N,3] samples, `spacing` metres apart; truth: file of the rock; dataset: with depth;
+    segmented: the cloud of the mesh; seed: root of the random points. Returns:
+
+    - accuracy, completeness (Knapitsch et al. 2017): mean distance from the samples to the true
+      surface, and from the seen true surface to the mesh;
+    - chamfer: the mean of the two; hausdorff: the largest distance in either direction;
+    - visible_within_2_spacing: share of the seen true surface within two spacings of the mesh;
+    - visible_share: share of the true surface above the ground that some frame sees.
+
+    Raises InputError if the rock's file or a depth image cannot be read, or no frame sees the rock.
+    """
+    import trimesh
+
+    rock = read_mesh(truth)
+    vertices = dataset.world.enter(rock.vertices)
+    true = trimesh.Trimesh(vertices, rock.faces, process=False)
+    sample_seed = derive_seed(seed, "prior/truth")
+    surface, face = trimesh.sample.sample_surface(true, TRUTH_SAMPLES, seed=sample_seed)
+    surface, normals = np.asarray(surface), true.face_normals[face]
+    if segmented.plane is not None:
+        exposed = segmented.plane.height(surface) > 0
+        surface, normals = surface[exposed], normals[exposed]
+    tolerance = max(spacing / 2, 2 * segmented.cloud.noise)
+    seen = np.zeros(len(surface), bool)
+    for frame in dataset.frames:
+        # Faces of a scanned rock may be wound either way.
+        seen |= visible(surface, normals, frame.camera, frame.depth(), tolerance, two_sided=True)
+    if not seen.any():
+        cure = "it is of another dataset or in other coordinates, so remove or replace it"
+        raise InputError(f"{truth}: no frame sees the true rock; {cure}")
+    there = distances_to_mesh(points, true.vertices, true.faces)
+    back = distances_to_mesh(surface[seen], mesh.vertices, mesh.faces)
+    return {
+        "accuracy": float(there.mean()),
+        "completeness": float(back.mean()),
+        "chamfer": float((there.mean() + back.mean()) / 2),
+        "hausdorff": float(max(there.max(), back.max())),
+        "visible_within_2_spacing": float((back < 2 * spacing).mean()),
+        "visible_share": float(seen.mean()),
+    }

@@ -37,8 +37,7 @@ from mgs.reports.page_plots import (
     timing_plot,
     views_plot,
 )
-from mgs.reports.tables import compare_runs, least_trained, step_curves
-from mgs.reports.writing import shown_view
+from mgs.reports.tables import compare_runs, least_trained, shown_view, step_curves
 from mgs.run.folder import Run
 
 PIXELS = 40e6  # most pixels of all pictures of a page: 4 to 8 MB of WebP

@@ -41,7 +41,7 @@ from mgs.run.folder import (
     start,
     up_of_prior,
 )
-from mgs.run.live import Live, begin, live_capture
+from mgs.run.live import Live, Transport, begin, live_capture
 from mgs.run.loop import first_views
 from mgs.run.policies import POLICIES, Policy
 from mgs.run.policy_file import code_of, in_file, is_function, label, name_of, policy_of
@@ -53,7 +53,6 @@ from mgs.run.settings import (
     validated,
     with_defaults,
 )
-from mgs.run.transports import Transport
 from mgs.run.worth import enough_views
 from mgs.scene import Scene, State
 from mgs.splat.constants import NEAR
