@@ -34,10 +34,10 @@ CURES = {
 
 COMMANDS = {
     "doctor": ("doctor.doctor", "Check this machine and what is installed."),
-    "synth-orbit": ("synth_orbit.synth_orbit", "Render a dataset: an orbit around a rock."),
-    "dataset": ("dataset.dataset", "Check a dataset, or make its masks."),
+    "synth-orbit": ("datasets.synth_orbit", "Render a dataset: an orbit around a rock."),
+    "dataset": ("datasets.dataset", "Check a dataset, or make its masks."),
     "import": ("import_data.import_data", "Make a dataset of your own images and cameras."),
-    "survey": ("survey.survey", "Simulate a survey flight with a noisy depth camera."),
+    "survey": ("datasets.survey", "Simulate a survey flight with a noisy depth camera."),
     "prior": ("prior.prior", "Build the prior: a mesh of the object, and samples of it."),
     "nbv": ("nbv.nbv", "Choose the next best views."),
     "fit": ("nbv.fit", "Fit a model to all images of a dataset."),
