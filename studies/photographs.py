@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import mgs
-from mgs.data.visibility import has_masks
+from mgs.data.frames import has_masks
 from mgs.files import read_csv
 from mgs.run.nbv import start_fit
 from studies.chart import check_dataset

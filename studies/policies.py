@@ -6,7 +6,7 @@ import numpy as np
 
 import mgs
 from mgs.colour import SH_C0
-from mgs.data.visibility import in_image
+from mgs.data.frames import in_image
 from mgs.gaussians import sh_from_rgb
 from mgs.policy import criteria
 from mgs.policy.criteria import Array, observed

@@ -10,9 +10,9 @@ from refusals import fails
 from scipy.spatial import cKDTree
 
 from mgs import Camera, Dataset, InputError, PriorSettings, look_at
+from mgs.data.frames import visible
 from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.raycast import mesh_depth
-from mgs.data.visibility import visible
 from mgs.prior.build import build_prior, load_prior, outline_error, prior_and_cloud, save_prior
 from mgs.prior.segmentation import Plane, ground_plane, rock_cluster
 from mgs.prior.surface import error_to_truth, poisson_mesh, sample_surface

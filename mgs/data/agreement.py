@@ -8,9 +8,8 @@ from functools import partial
 import numpy as np
 
 from mgs.camera import Camera
-from mgs.data.frames import Frame
+from mgs.data.frames import Frame, in_image, nearest_point
 from mgs.data.structure import Matcher
-from mgs.data.visibility import in_image, nearest_point
 
 PAIRS = 12  # most pairs of neighbours that are compared
 # Matches of a pair that agree with one epipolar geometry, their share of all matches, and number of

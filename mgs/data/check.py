@@ -7,8 +7,7 @@ import numpy as np
 from scipy.ndimage import binary_erosion, minimum_filter
 
 from mgs.data.dataset import Dataset
-from mgs.data.frames import Frame
-from mgs.data.visibility import has_masks, in_image
+from mgs.data.frames import Frame, has_masks, in_image
 from mgs.errors import InputError
 from mgs.progress import report
 

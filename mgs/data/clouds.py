@@ -8,7 +8,7 @@ import numpy as np
 from plyfile import PlyData
 
 from mgs.camera import Camera
-from mgs.data.visibility import in_image
+from mgs.data.frames import in_image
 from mgs.data.world import World
 from mgs.errors import InputError
 from mgs.files import parsing, reading, write_columns

@@ -8,8 +8,8 @@ from scipy.ndimage import binary_dilation
 
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import Dataset, write_transforms
+from mgs.data.frames import has_masks
 from mgs.data.meshes import Mesh
-from mgs.data.visibility import has_masks
 from mgs.errors import InputError
 from mgs.images import write_png
 from mgs.progress import report

@@ -13,11 +13,10 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud, write_cloud
 from mgs.data.dataset import Dataset, load_dataset
-from mgs.data.frames import Frame
+from mgs.data.frames import Frame, in_mask, visible
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh, distances_to_mesh, mesh_of, read_mesh
 from mgs.data.structure import CLOUD
-from mgs.data.visibility import in_mask, visible
 from mgs.data.world import UPRIGHT, World, unit_up
 from mgs.errors import InputError
 from mgs.files import atomic_path, check_new_folder, parsing, read_json, write_json

@@ -10,10 +10,9 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, label
 
 from mgs.camera import Camera
-from mgs.data.frames import Frame
+from mgs.data.frames import Frame, in_image, nearest_point
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh
-from mgs.data.visibility import in_image, nearest_point
 from mgs.errors import InputError, Notice
 from mgs.prior.surface import Surface
 from mgs.progress import report

@@ -13,8 +13,7 @@ from scipy.special import logit
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
-from mgs.data.frames import Frame
-from mgs.data.visibility import in_image, in_mask, visible
+from mgs.data.frames import Frame, in_image, in_mask, visible
 from mgs.gaussians import ARRAYS, Gaussians, sh_from_rgb
 from mgs.prior.build import Prior
 from mgs.rotation import quat_from_normals

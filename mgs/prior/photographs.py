@@ -8,10 +8,9 @@ from scipy.spatial import cKDTree
 
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import Dataset
-from mgs.data.frames import Frame
+from mgs.data.frames import Frame, has_masks, in_image
 from mgs.data.meshes import Mesh
 from mgs.data.structure import CLOUD
-from mgs.data.visibility import has_masks, in_image
 from mgs.errors import InputError
 from mgs.prior.hull import visual_hull
 from mgs.prior.points import segment_points, spacing_of

@@ -14,10 +14,9 @@ from scipy.spatial import cKDTree
 
 from mgs.data.clouds import SparseCloud, read_cloud, views_of
 from mgs.data.dataset import Dataset
-from mgs.data.frames import Frame
+from mgs.data.frames import Frame, has_masks, mask_share
 from mgs.data.meshes import Mesh
 from mgs.data.structure import CLOUD
-from mgs.data.visibility import has_masks, mask_share
 from mgs.errors import InputError
 from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud, estimate_normals, ground_plane
 from mgs.prior.settings import PriorSettings

@@ -7,8 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mgs.data.dataset import Dataset
-from mgs.data.frames import Frame
-from mgs.data.visibility import has_masks, mask_share
+from mgs.data.frames import Frame, has_masks, mask_share
 from mgs.errors import InputError
 from mgs.prior.settings import PriorSettings
 from mgs.progress import report

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset
+from mgs.data.frames import in_image, visible
 from mgs.data.meshes import Mesh, distances_to_mesh, read_mesh
-from mgs.data.visibility import in_image, visible
 from mgs.errors import InputError
 from mgs.prior.segmentation import Plane, SegmentedCloud
 from mgs.seeds import derive_seed

@@ -13,9 +13,8 @@ from scipy.spatial import cKDTree
 from mgs.camera import Camera, look_at
 from mgs.data.clouds import towards
 from mgs.data.dataset import finite_number, load_cameras
-from mgs.data.frames import Frame
+from mgs.data.frames import Frame, in_image
 from mgs.data.meshes import Mesh, distances_to_mesh
-from mgs.data.visibility import in_image
 from mgs.data.world import UPRIGHT, Thing, World
 from mgs.errors import InputError
 from mgs.files import read_csv

@@ -12,9 +12,8 @@ from mgs import runtime
 from mgs.camera import extent_of
 from mgs.data.dataset import FILES as PATHS
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, write_transforms
-from mgs.data.frames import Frame, moves
+from mgs.data.frames import Frame, has_masks, moves
 from mgs.data.structure import CLOUD
-from mgs.data.visibility import has_masks
 from mgs.errors import InputError
 from mgs.files import THERE, Ours, atomic_folder, copy_file, reading, write_json
 from mgs.fit.density import GROWTH, split_times

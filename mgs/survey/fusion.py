@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from mgs.data.frames import Frame
-from mgs.data.visibility import nearest_point
+from mgs.data.frames import Frame, nearest_point
 from mgs.errors import InputError
 from mgs.survey.depth_sensor import depth_noise, filter_depth
 
