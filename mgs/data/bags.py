@@ -12,8 +12,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.lens import Lens
-from mgs.data.shots import Shot, Source, poses_agree
-from mgs.data.tracks import Spacing, Track, posed, rigid
+from mgs.data.shots import Shot, Source, Spacing, Track, posed, poses_agree, rigid
 from mgs.errors import InputError
 from mgs.files import atomic_path, parsing, read_bytes, reading
 from mgs.images import read_values, write_exr, write_png

@@ -18,8 +18,16 @@ from mgs.data.clouds import SparseCloud
 from mgs.data.colmap import models_in
 from mgs.data.dataset import FRAME_INTERVAL
 from mgs.data.lens import Lens
-from mgs.data.shots import PHOTOGRAPH, PICTURE_SUFFIXES, Shot, Source, find_image, frame_name
-from mgs.data.tracks import ROUNDED, orthonormal
+from mgs.data.shots import (
+    PHOTOGRAPH,
+    PICTURE_SUFFIXES,
+    ROUNDED,
+    Shot,
+    Source,
+    find_image,
+    frame_name,
+    orthonormal,
+)
 from mgs.data.world import PLUS_Z
 from mgs.errors import InputError
 from mgs.files import parsing, read_bytes, read_json, read_text, read_xml

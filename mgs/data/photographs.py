@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from mgs.data.colmap import source_of
-from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, frame_name, natural
+from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, Spacing, frame_name, natural
 from mgs.data.structure import Matcher
-from mgs.data.tracks import Spacing
 from mgs.data.world import PLUS_Z
 from mgs.errors import InputError, Notice
 from mgs.files import read_json, write_json

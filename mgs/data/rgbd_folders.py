@@ -11,8 +11,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.lens import Lens
-from mgs.data.shots import Shot, Source, natural
-from mgs.data.tracks import ROUNDED, Spacing, Track, orthonormal, posed, rigid
+from mgs.data.shots import ROUNDED, Shot, Source, Spacing, Track, natural, orthonormal, posed, rigid
 from mgs.errors import InputError
 from mgs.files import read_json, read_text
 from mgs.images import image_size

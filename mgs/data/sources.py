@@ -28,14 +28,16 @@ from mgs.data.photographs import (
 from mgs.data.rgbd_folders import is_open3d, is_rtabmap, is_tum, read_open3d, read_rtabmap, read_tum
 from mgs.data.shots import (
     PICTURE_SUFFIXES,
+    ROUNDED,
     Shot,
     Source,
+    Spacing,
     checked,
     find_image,
     frame_name,
+    orthonormal,
     turned_by_exif,
 )
-from mgs.data.tracks import ROUNDED, Spacing, orthonormal
 from mgs.data.world import unit_up
 from mgs.errors import InputError
 from mgs.images import image_size

@@ -14,6 +14,7 @@ from PIL import Image
 
 from mgs import runtime
 from mgs.camera import Camera, opengl_from_opencv
+from mgs.data.check import write_sheet
 from mgs.data.dataset import (
     FRAME_INTERVAL,
     SURVEY_FOLDER,
@@ -24,7 +25,6 @@ from mgs.data.dataset import (
     write_transforms,
 )
 from mgs.data.frames import Frame, write_rock_image
-from mgs.data.masks import write_sheet
 from mgs.data.meshes import to_glb
 from mgs.errors import InputError, row_named
 from mgs.files import atomic_path, copy_file, fingerprint, folder_locked, reading, write_json
