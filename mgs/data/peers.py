@@ -21,7 +21,6 @@ from mgs.data.lens import Lens
 from mgs.data.shots import (
     PHOTOGRAPH,
     PICTURE_SUFFIXES,
-    ROUNDED,
     Shot,
     Source,
     find_image,
@@ -281,23 +280,19 @@ def read_peer(kind: str, source: Path, images: Path | None, *_: Any) -> Source:
     folders = [images] if images is not None else near
     with parsing(path, f"file of {kind}", "export it again"):
         contents = PEERS[kind][1](path, folders)
-        shots, left_out, rounded = list[Shot](), Counter[str](), 0
-        left_out.update(contents.left_out)
+        shots, left_out = list[Shot](), Counter(contents.left_out)
         for view in contents.views:
             at = _image(view.name, folders)
             if at is None:
                 left_out["whose file is missing"] += 1
                 continue
-            shot, mended = _shot(f"{path}: {view.name}", view, *at, FRAME_INTERVAL * len(shots))
-            shots.append(shot)
-            rounded += mended
+            shots.append(_shot(f"{path}: {view.name}", view, *at, FRAME_INTERVAL * len(shots)))
         points = np.array(contents.points, np.float64).reshape(-1, 3)
         track = None if contents.track is None else np.array(contents.track, np.float64)
         if not np.isfinite(points).all():
             raise ValueError("points that are not finite")
-    notes = (*contents.notes, *([f"{rounded} {ROUNDED}"] if rounded else []))
     sparse = SparseCloud(points, track=track) if len(points) > 1 else None
-    return Source(kind, shots, left_out, notes, sparse, **contents.world)
+    return Source(kind, shots, left_out, contents.notes, sparse, **contents.world)
 
 
 def _image(name: str, folders: list[Path]) -> tuple[Path, str] | None:
@@ -309,9 +304,8 @@ def _image(name: str, folders: list[Path]) -> tuple[Path, str] | None:
     return None
 
 
-def _shot(where: str, view: View, image: Path, name: str, time: float) -> tuple[Shot, bool]:
-    """Frame of a view, and whether its rotation was mended. An image of another size than the
-    view's, and of the same shape, scales the camera."""
+def _shot(where: str, view: View, image: Path, name: str, time: float) -> Shot:
+    """Frame of a view. An image of another size, and of the same shape, scales its camera."""
     own = image_size(image)
     width, height = view.size or own
     cx, cy = view.centre or (width / 2, height / 2)
@@ -324,4 +318,4 @@ def _shot(where: str, view: View, image: Path, name: str, time: float) -> tuple[
         camera = Camera(K, width, height, pose)  # type: ignore[arg-type]
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    return Shot(frame_name(name), camera, lens, time, image), mended
+    return Shot(frame_name(name), camera, lens, time, image, mended=mended)

@@ -4,6 +4,7 @@ each reader returns keyframes, in metres."""
 import re
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.lens import Lens
-from mgs.data.shots import ROUNDED, Shot, Source, Spacing, Track, natural, orthonormal, posed, rigid
+from mgs.data.shots import Shot, Source, Spacing, Track, natural, orthonormal, posed, rigid
 from mgs.errors import InputError
 from mgs.files import read_json, read_text
 from mgs.images import image_size
@@ -143,9 +144,9 @@ def read_open3d(folder: Path, spacing: Spacing) -> Source:
     shots: list[Shot] = []
     for k in spacing.choose(list(zip(times.tolist(), matrices, strict=True))):
         depth = depths[k] if depths else None
-        shots.append(_shot(images[k].stem, K, lens, matrices[k], times[k], images[k], depth))
-    notes = (f"{sum(mended)} {ROUNDED}",) if any(mended) else ()
-    return Source("Open3D", shots, notes=notes, unit="m")
+        shot = _shot(images[k].stem, K, lens, matrices[k], times[k], images[k], depth)
+        shots.append(replace(shot, mended=mended[k]))
+    return Source("Open3D", shots, unit="m")
 
 
 def is_rtabmap(folder: Path) -> bool:

@@ -49,6 +49,7 @@ class Shot:
     rock: Path | None = None
     float_unit: float = 1.0  # metres in one of floating-point numbers
     turned: bool = False  # its files are turned by their EXIF orientation
+    mended: bool = False  # its rotation was NEARLY_RIGID
 
 
 @dataclass(frozen=True)

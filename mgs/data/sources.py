@@ -101,6 +101,8 @@ def read_source(
     except OSError as error:
         why = f"a file of it cannot be read ({error.strerror or error})"
         raise InputError(f"{source}: {why}; correct its name") from None
+    if count := sum(shot.mended for shot in result.shots):
+        result = replace(result, notes=(f"{count} {ROUNDED}", *result.notes))
     if result.kind != PHOTOGRAPHS:
         result = result.without(exclude)
     return turned_by_exif(result).near_origin()
@@ -175,7 +177,7 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
     scale = finite_number(str(path), key, data.get(key, 1e-3))
     of_floats = scale if key in data else 1.0
     tests, without = _splits(path, data, records)
-    left_out, shots, rounded, smaller = Counter[str](), [], 0, 0
+    left_out, shots, smaller = Counter[str](), [], 0
     for index, record in enumerate(records):
         image = _named(path.parent, images, record["file_path"])
         if record["file_path"] in without:
@@ -192,14 +194,11 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
         where = f"{path}: frame {index}"
         about = {**data, **record}
         camera, lens, mended = record_camera(where, about, image)
-        rounded += mended
         smaller += camera.width != float(about.get("w") or camera.width)
         time, name = timestamp_of(where, index, record), frame_name(record["file_path"])
         files = image, depth, scale, mask, rock
-        shots.append(Shot(name, camera, lens, time, *files, float_unit=of_floats))
+        shots.append(Shot(name, camera, lens, time, *files, of_floats, mended=mended))
     notes = []
-    if rounded:
-        notes.append(f"{rounded} {ROUNDED}")
     if smaller:
         notes.append(f"{smaller} images are smaller than w and h say; their cameras are scaled")
     listed = {frame_name(record["file_path"]) for record in records}
