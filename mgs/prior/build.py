@@ -19,7 +19,7 @@ from mgs.data.meshes import Mesh, distances_to_mesh, mesh_of, read_mesh
 from mgs.data.structure import CLOUD
 from mgs.data.world import UPRIGHT, World, unit_up
 from mgs.errors import InputError
-from mgs.files import atomic_path, check_new_folder, parsing, read_json, write_json
+from mgs.files import atomic_path, check_new_folder, parsing, read_json, reading, write_json
 from mgs.notebook import cloud, html
 from mgs.prior.hull import MOST_PIXELS
 from mgs.prior.photographs import check_masks, check_photographs, choose_source, surface_of
@@ -351,24 +351,19 @@ def load_prior(folder: str | Path) -> Prior:
         cure = f"make one with `mgs prior DATASET --out {folder}`"
         raise InputError(f"{folder}: no such prior; {cure}")
     numbers = read_json(folder / "prior.json")
-    path = folder / "points.ply"
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; make the prior again with `mgs prior`")
-    with parsing(folder, "prior", "make it again with `mgs prior`"):
+    path, again = folder / "points.ply", "make it again with `mgs prior`"
+    with reading(path, f"file; {again}"), parsing(folder, "prior", again):
         data = PlyData.read(str(path))["vertex"].data
         names = ("x", "y", "z", "nx", "ny", "nz")
         columns = np.stack([np.asarray(data[name], np.float64) for name in names], 1)
         spacing, tolerance = float(numbers["spacing"]), float(numbers["depth_tolerance"])
         backed, world = int(numbers["backed"]), World(unit_up(numbers["up"]))
-    if not np.isfinite(columns).all() or len(columns) < 2:
-        cure = "make it again with `mgs prior`"
-        raise InputError(f"{path}: has NaN values, or fewer than two points; {cure}")
-    if not (0 < spacing < np.inf and 0 < tolerance < np.inf):
-        why = "spacing and depth_tolerance must be positive metres"
-        raise InputError(f"{folder / 'prior.json'}: {why}; make the prior again")
-    if not 0 <= backed <= len(columns):
-        cure = "make the prior again"
-        raise InputError(f"{folder / 'prior.json'}: backed must be a number of the points; {cure}")
+        if not np.isfinite(columns).all() or len(columns) < 2:
+            raise ValueError("points.ply has NaN values, or fewer than two points")
+        if not (0 < spacing < np.inf and 0 < tolerance < np.inf):
+            raise ValueError("spacing and depth_tolerance must be positive metres")
+        if not 0 <= backed <= len(columns):
+            raise ValueError("backed must be a number of the points")
     mesh = read_mesh(folder / "mesh.ply")
     points, normals = columns[:, :3], columns[:, 3:]
     prior = Prior(mesh, points, normals, spacing, tolerance, numbers, backed)

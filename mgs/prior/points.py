@@ -127,11 +127,8 @@ def segment_points(
     if inside.sum() >= LEAST_POINTS:
         inside[inside] = on_surface(points[inside])
     if inside.sum() < LEAST_POINTS:
-        raise NoSurface(
-            f"{dataset.root}: only {inside.sum()} of {len(sparse.points)} points lie {where}",
-            points,
-            inside,
-        )
+        few = f"only {inside.sum()} of {len(sparse.points)} points lie {where}"
+        raise NoSurface(f"{dataset.root}: {few}", points, inside)
     rock = points[inside]
     normals = estimate_normals(rock, views[inside])
     return SegmentedCloud(cloud, plane, ground, rock, normals, 0.0, clusters)

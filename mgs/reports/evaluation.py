@@ -57,13 +57,8 @@ def evaluate_run(
         metrics = {"policy": run.label, "of": subject, "pictures": pictures}
         metrics |= {"informed": _informed(run)}
         metrics |= {"poses_moved": run.poses_moved} if run.poses_moved else {}
-        metrics |= evaluate_model(
-            as_drjit(run.gaussians),
-            frames,
-            trained,
-            test_frames=test_frames,
-            pictures=folder if pictures else None,
-        )
+        model, shown = as_drjit(run.gaussians), folder if pictures else None
+        metrics |= evaluate_model(model, frames, trained, test_frames=test_frames, pictures=shown)
         write_json(file, metrics)
         run.metrics = metrics
         say(f"wrote {file}" + (f" and {folder}" if pictures else ""))

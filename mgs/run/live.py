@@ -9,7 +9,6 @@ import secrets
 import shlex
 import shutil
 import signal
-import subprocess
 import time
 import warnings
 from collections.abc import Callable
@@ -17,6 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from subprocess import DEVNULL, STDOUT, Popen, TimeoutExpired
 from typing import Any, Literal
 
 import numpy as np
@@ -82,16 +82,12 @@ def command(text: str, timeout: float) -> Transport:
         log = out.with_suffix(".log")
         log.unlink(missing_ok=True)  # it may be a link
         with open(log, "wb") as file:
-            process = subprocess.Popen(
-                arguments,
-                stdin=subprocess.DEVNULL,
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
+            process = Popen(
+                arguments, stdin=DEVNULL, stdout=file, stderr=STDOUT, start_new_session=True
             )
             try:
                 code = process.wait(timeout)
-            except subprocess.TimeoutExpired:
+            except TimeoutExpired:
                 raise InputError(f"the command did not end within {timeout:g} s") from None
             finally:
                 if process.poll() is None:

@@ -147,13 +147,8 @@ def synth_orbit(
         _render_frames(photographer, views)
         if views:
             write_contact_sheet(out / "contact_sheet.png", tests if on_demand else orbit)
-        record = {
-            "mesh_scale": scale,
-            "exposure": exposure,
-            "samples_per_pixel": spp,
-            "versions": versions(),
-        }
-        write_json(out / "config.json", resolved | record)
+        resolved |= {"mesh_scale": scale, "exposure": exposure, "samples_per_pixel": spp}
+        write_json(out / "config.json", resolved | {"versions": versions()})
         if tests:
             write_transforms(out / TEST_FOLDER, tests)
         published = orbit if pose_noise is None else _with_noise(out, orbit, pose_noise, seed)
