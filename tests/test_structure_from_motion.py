@@ -22,8 +22,8 @@ from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.importers import import_source
 from mgs.data.photographs import sharpest_frames
+from mgs.data.shots import Spacing
 from mgs.data.sources import read_source
-from mgs.data.tracks import Spacing
 from mgs.errors import Notice
 from mgs.files import read_json
 from mgs.fit.poses import displaced, motion_between
