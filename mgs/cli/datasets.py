@@ -77,9 +77,21 @@ def synth_orbit(
     if force:
         clear_folder(out, Ours(RENDERED, [path for path in (mesh, Path(scene)) if path]))
     with progress_bar("rendering", console):
-        how: dict[str, Any] = {"say": console.print, "mesh_up": mesh_up, "test_views": test_views}
-        how |= {"on_demand": on_demand, "frames": frames, "size": _parse_size(size), "spp": spp}
-        dataset = rendered(out, settings, preset, seed, mesh, noise, **how)
+        dataset = rendered(
+            out,
+            settings,
+            preset,
+            seed,
+            mesh,
+            noise,
+            say=console.print,
+            mesh_up=mesh_up,
+            test_views=test_views,
+            on_demand=on_demand,
+            frames=frames,
+            size=_parse_size(size),
+            spp=spp,
+        )
     camera, none = dataset.frames[0].camera, ", none rendered" if on_demand else ""
     look = "" if on_demand and not test_views else f"; look at {out / 'contact_sheet.png'}"
     console.print(

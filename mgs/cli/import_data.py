@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -96,9 +96,15 @@ def import_data(
         scratch_folder(unpacked, resumable=not is_bag(source)) as scratch,
         progress_bar("reading", console),
     ):
-        how: dict[str, Any] = {"keyframes": keyframes, "unpack": unpacked, "pose": pose}
-        how |= {"exclude": exclude or [], "test_split": test_split}
-        shots = read_source(source, images, **how)
+        shots = read_source(
+            source,
+            images,
+            keyframes=keyframes,
+            unpack=unpacked,
+            pose=pose,
+            exclude=exclude or [],
+            test_split=test_split,
+        )
         shots = shots if unit is None else shots.in_metres(unit)
         shots = shots if distance is None else shots.with_distance(distance)
         axis = parse_up(up)

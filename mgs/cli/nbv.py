@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -128,7 +129,11 @@ def live_capture(command: str | None, folder: Path | None, values: dict[str, Any
 
 
 def start_and_print(
-    dataset: Path, out: Path, console: Terminal, start: Any = None, **settings: Any
+    dataset: Path,
+    out: Path,
+    console: Terminal,
+    start: Callable[..., Run] | None = None,
+    **settings: Any,
 ) -> Run:
     """`mgs.run.nbv.start_run`, or another start, with its progress; print which prior was found in
     the dataset."""

@@ -42,15 +42,19 @@ class Origin:
         ellipsoid's radii of curvature at the origin: exact to a centimetre within 500 m."""
         x, y, z = (float(value) for value in position)
         turn, lat = math.radians(self.bearing), math.radians(self.latitude)
-        east = x * math.cos(turn) + y * math.sin(turn)
-        north = y * math.cos(turn) - x * math.sin(turn)
+        east, north = (
+            x * math.cos(turn) + y * math.sin(turn),
+            y * math.cos(turn) - x * math.sin(turn),
+        )
         eccentricity = FLATTENING * (2 - FLATTENING)
         root = 1 - eccentricity * math.sin(lat) ** 2
         across = EQUATOR / math.sqrt(root)
         along = EQUATOR * (1 - eccentricity) / root**1.5
-        up = math.degrees(north / (along + self.altitude))
-        right = math.degrees(east / ((across + self.altitude) * math.cos(lat)))
-        return self.latitude + up, self.longitude + right, self.altitude + z
+        return (
+            self.latitude + math.degrees(north / (along + self.altitude)),
+            self.longitude + math.degrees(east / ((across + self.altitude) * math.cos(lat))),
+            self.altitude + z,
+        )
 
 
 def parse_origin(text: str) -> Origin:
@@ -127,15 +131,26 @@ def _items(stops: Sequence[Stop], origin: Origin, hover: float, speed: float) ->
 def _write_plan(
     path: Path, stops: Sequence[Stop], origin: Origin, hover: float, speed: float
 ) -> None:
-    items = []
-    for number, (command, frame, *params) in enumerate(_items(stops, origin, hover, speed), 1):
-        item = {"type": "SimpleItem", "autoContinue": True, "doJumpId": number}
-        items.append(item | {"command": command, "frame": frame, "params": params})
-    # PX4, with the commands that ArduPilot shares; a multicopter
-    mission: dict[str, Any] = {"version": 2, "firmwareType": 12, "vehicleType": 2}
-    mission |= {"cruiseSpeed": speed, "hoverSpeed": speed}
-    mission["plannedHomePosition"] = list(origin.geodetic(stops[0].position))
-    mission["items"] = items
+    items = [
+        {
+            "type": "SimpleItem",
+            "autoContinue": True,
+            "doJumpId": number,
+            "command": command,
+            "frame": frame,
+            "params": params,
+        }
+        for number, (command, frame, *params) in enumerate(_items(stops, origin, hover, speed), 1)
+    ]
+    mission = {
+        "version": 2,
+        "firmwareType": 12,  # PX4; commands are those that ArduPilot shares
+        "vehicleType": 2,  # multicopter
+        "cruiseSpeed": speed,
+        "hoverSpeed": speed,
+        "plannedHomePosition": list(origin.geodetic(stops[0].position)),
+        "items": items,
+    }
     none = {"version": 2, "circles": [], "polygons": []}
     plan = {"fileType": "Plan", "version": 1, "groundStation": "QGroundControl"}
     rally = {"version": 2, "points": []}

@@ -63,10 +63,14 @@ def import_source(
 
         cameras, world = [shot.camera for shot in shots], World(origin=source.origin)
         silhouette = silhouette_of(mesh_in_sight(read_mesh(mesh), cameras, world, mesh))
-    record: dict[str, Any] = {"kind": source.kind, "frames": len(shots)}
-    record["sha256_of_frames"] = _digest(shots)
-    record["mesh"] = fingerprint(mesh) if mesh is not None and masks is None else None
-    record |= {"downscale": downscale, "test_views": tests and len(tests.shots)}
+    record = {
+        "kind": source.kind,
+        "frames": len(shots),
+        "sha256_of_frames": _digest(shots),
+        "mesh": fingerprint(mesh) if mesh is not None and masks is None else None,
+        "downscale": downscale,
+        "test_views": None if tests is None else len(tests.shots),
+    }
     with folder_locked(out):
         if resumes(out, RECORD, record) and (out / "transforms.json").is_file():
             return load_dataset(out)

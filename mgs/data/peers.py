@@ -138,14 +138,17 @@ def _opensfm(path: Path, folders: list[Path]) -> Contents:
         side, focal = max(width, height), float(lens.get("focal_x", lens.get("focal", 0)))
         fy = float(lens.get("focal_y", focal))
         cx, cy = float(lens.get("c_x", 0)), float(lens.get("c_y", 0))
-        turn = Rotation.from_rotvec(shot["rotation"]).as_matrix()
-        pose, centre = (
-            _matrix(turn, shot["translation"]),
-            (width / 2 + side * cx, height / 2 + side * cy),
+        views.append(
+            View(
+                name,
+                _matrix(Rotation.from_rotvec(shot["rotation"]).as_matrix(), shot["translation"]),
+                (focal * side, fy * side),
+                (width, height),
+                (width / 2 + side * cx, height / 2 + side * cy),
+                OPENSFM[kind],
+                {key: float(lens[key]) for key in COEFFICIENTS if key in lens},
+            )
         )
-        values = {key: float(lens[key]) for key in COEFFICIENTS if key in lens}
-        about = (width, height), centre, OPENSFM[kind], values
-        views.append(View(name, pose, (focal * side, fy * side), *about))
     place = part.get("reference_lla") or {}
     metric = any(float(place.get(key, 0)) for key in ("latitude", "longitude"))
     others = [len(one["shots"]) for one in parts if one is not part]
@@ -203,9 +206,12 @@ def _mvsnet(path: Path, folders: list[Path]) -> Contents:
     views = []
     for file in sorted(path.glob("*_cam.txt")):
         words = read_text(file).split()
-        places = (words.index("extrinsic") + 1, 4), (words.index("intrinsic") + 1, 3)
         pose, K = (
-            np.array(words[k : k + side**2], float).reshape(side, side) for k, side in places
+            np.array(words[first : first + side**2], float).reshape(side, side)
+            for first, side in (
+                (words.index("extrinsic") + 1, 4),
+                (words.index("intrinsic") + 1, 3),
+            )
         )
         if K[0, 1]:
             raise InputError(f"{file}: has skew, {K[0, 1]:g}; resample the images without it")
@@ -221,7 +227,8 @@ def _splatting(path: Path, folders: list[Path]) -> Contents:
     for one in read_json(path):
         pose = np.linalg.inv(_matrix(one["rotation"], one["position"]))
         focal, size = (
-            (float(one[x]), float(one[y])) for x, y in (("fx", "fy"), ("width", "height"))
+            (float(one["fx"]), float(one["fy"])),
+            (float(one["width"]), float(one["height"])),
         )
         views.append(View(str(one["img_name"]), pose, focal, size))
     return Contents(views)

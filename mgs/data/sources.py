@@ -206,13 +206,17 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
         notes.append(f"{len(unknown)} test views are no frame, as {min(unknown)}")
     cloud = path.parent / str(data["ply_file_path"]) if data.get("ply_file_path") else None
     no_cloud = cloud if cloud is not None and not cloud.is_file() else None
-    more: dict[str, Any] = {"tests": frozenset(frame_name(name) for name in tests)}
-    more["sparse"] = read_cloud(cloud) if cloud is not None and no_cloud is None else None
-    more["unit"] = unit_of(path, data) or ("m" if any(shot.depth for shot in shots) else None)
-    more |= {"up": unit_up(data["up"]) if data.get("up") else None, "no_cloud": no_cloud}
-    synthetic = "camera_angle_x" in data and "fl_x" not in data
-    kind = "NeRF-synthetic" if synthetic else "nerfstudio"
-    return Source(kind, shots, left_out, tuple(notes), **more)
+    return Source(
+        "NeRF-synthetic" if "camera_angle_x" in data and "fl_x" not in data else "nerfstudio",
+        shots,
+        left_out,
+        tuple(notes),
+        sparse=read_cloud(cloud) if cloud is not None and no_cloud is None else None,
+        up=unit_up(data["up"]) if data.get("up") else None,
+        unit=unit_of(path, data) or ("m" if any(shot.depth for shot in shots) else None),
+        no_cloud=no_cloud,
+        tests=frozenset(frame_name(name) for name in tests),
+    )
 
 
 def _splits(

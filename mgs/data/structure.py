@@ -170,10 +170,14 @@ class Matcher:
                 numbers = [mark.point3D_id for mark in image.points2D if mark.has_point3D()]
                 seen = np.stack([result.points3D[k].xyz for k in numbers])
                 std = POSITION_STD * float(np.median(cameras[place].project(seen)[1]))
-                given = {"position": cameras[place].position, "corr_data_id": image.data_id}
-                given |= {"coordinate_system": pycolmap.PosePriorCoordinateSystem.CARTESIAN}
-                covariance = std**2 * np.eye(3)
-                priors.append(pycolmap.PosePrior(position_covariance=covariance, **given))
+                priors.append(
+                    pycolmap.PosePrior(
+                        corr_data_id=image.data_id,
+                        position=cameras[place].position,
+                        position_covariance=std**2 * np.eye(3),
+                        coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+                    )
+                )
             options = pycolmap.BundleAdjustmentOptions(print_summary=False)
             options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
             how = options, pycolmap.PosePriorBundleAdjustmentOptions(), config, priors, result

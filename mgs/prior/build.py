@@ -152,9 +152,12 @@ def prior_and_cloud(
     samples, normals, spacing, sampled = _samples(mesh, settings, cameras, pixel, closest)
     numbers = {"from": kind, "frames": len(dataset.frames), **surface.numbers}
     if segmented is not None and plane is not None:
-        numbers |= {"plane_inliers": int(segmented.ground.sum()), "plane_sigma": plane.sigma}
-        numbers |= {"plane_tolerance": plane.tolerance}
-        numbers |= {"plane_normal": dataset.world.leave(plane.normal).tolist()}
+        numbers |= {
+            "plane_inliers": int(segmented.ground.sum()),
+            "plane_sigma": plane.sigma,
+            "plane_tolerance": plane.tolerance,
+            "plane_normal": dataset.world.leave(plane.normal).tolist(),
+        }
     numbers |= {"fit_rms": residual, "depth_tolerance": tolerance, **sampled}
     numbers |= _place(dataset) | {"settings": asdict(settings)}
     truth = dataset.root / "rock.glb"
@@ -195,9 +198,16 @@ def _depth_surface(dataset: Dataset, settings: PriorSettings) -> Surface:
     report("Poisson mesh")
     points, normals = segmented.rock_points, segmented.rock_normals
     mesh, depth = poisson_mesh(points, normals, cloud.voxel, plane, settings.poisson_depth)
-    numbers = {"pixels": cloud.pixels, "points": len(cloud.points), "voxel": cloud.voxel}
-    numbers |= {"depth_noise": cloud.noise, "eps": segmented.eps, "clusters": segmented.clusters}
-    numbers |= {"cluster_size": len(points), "poisson_depth": depth}
+    numbers = {
+        "pixels": cloud.pixels,
+        "points": len(cloud.points),
+        "voxel": cloud.voxel,
+        "depth_noise": cloud.noise,
+        "eps": segmented.eps,
+        "clusters": segmented.clusters,
+        "cluster_size": len(points),
+        "poisson_depth": depth,
+    }
     return Surface(mesh, cloud.voxel, numbers, segmented)
 
 
@@ -231,10 +241,15 @@ def _samples(
     backed = round(share * len(points)) if total is None else total - len(points)
     order = spread_first(points, backed, spacing)
     points = points[order]
-    numbers: dict[str, Any] = {"mesh_faces": len(mesh.faces), "mesh_area": float(mesh.areas.sum())}
-    numbers["sampled_area"] = float(mesh.areas[mesh.seen].sum())
-    numbers |= {"n": len(points), "backed": backed, "spacing": spacing}
-    numbers |= {} if resolved is None else {"resolution": asdict(resolved)}
+    numbers = {
+        "mesh_faces": len(mesh.faces),
+        "mesh_area": float(mesh.areas.sum()),
+        "sampled_area": float(mesh.areas[mesh.seen].sum()),
+        "n": len(points),
+        "backed": backed,
+        "spacing": spacing,
+        **({} if resolved is None else {"resolution": asdict(resolved)}),
+    }
     return points, normals[order], spacing, numbers
 
 
@@ -262,8 +277,14 @@ def prior_from_mesh(
         raise InputError(f"{where}: {why}; give a number or a spacing")
     points, normals, spacing, sampled = _samples(mesh, settings, cameras)
     values = {key: getattr(settings, key) for key in ("gaussians", "spacing", "seed", "backing")}
-    numbers = {"from": "mesh", "mesh": where, "depth_tolerance": spacing, **sampled}
-    numbers |= _place(dataset or Dataset(Path(), ())) | {"settings": values}
+    numbers = {
+        "from": "mesh",
+        "mesh": where,
+        "depth_tolerance": spacing,
+        **sampled,
+        **_place(dataset or Dataset(Path(), ())),
+        "settings": values,
+    }
     prior = Prior(mesh, points, normals, spacing, spacing, numbers, sampled["backed"])
     return prior.moved(_as_in_files)
 

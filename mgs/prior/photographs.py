@@ -111,9 +111,14 @@ def surface_of(
         cloud_points = segmented.cloud.points
         inside = cKDTree(segmented.rock_points).query(cloud_points)[0] == 0
         raise NoSurface(str(error), cloud_points, inside) from None
-    numbers = {"points": len(cloud.points), "points_kept": len(segmented.cloud.points)}
-    numbers |= {"clusters": segmented.clusters, "cluster_size": len(segmented.rock_points)}
-    numbers |= {"cloud_spacing": spacing, "poisson_depth": depth}  # type: ignore[dict-item]
+    numbers = {
+        "points": len(cloud.points),
+        "points_kept": len(segmented.cloud.points),
+        "clusters": segmented.clusters,
+        "cluster_size": len(segmented.rock_points),
+        "cloud_spacing": spacing,
+        "poisson_depth": depth,
+    }
     numbers |= {} if hull is None else hull.numbers
     return Surface(mesh, spacing, numbers, segmented)
 

@@ -141,13 +141,18 @@ def curve_plot(label: str, certificate: Mapping[str, Any]) -> dict[str, Any]:
     """Share of the gain of all candidates against the number of views, after the seeds. The
     marker of the number that is planned is large."""
     numbers = [row["views"] for row in certificate["curve"]]
-    sizes, traces = [13 if k == certificate["views"] else 6 for k in numbers], []
-    for key, (name, colour) in CURVES.items():
-        shares = [100 * row[key] for row in certificate["curve"]]
-        trace: dict[str, Any] = {"name": name, "x": numbers, "y": shares, "mode": "lines+markers"}
-        trace["line"] = {"color": colour, "dash": "dash" if key == "bound" else "solid"}
-        trace["marker"] = {"color": colour, "size": sizes if key == "plan" else 6}
-        traces.append(trace)
+    sizes = [13 if k == certificate["views"] else 6 for k in numbers]
+    traces = [
+        {
+            "name": name,
+            "x": numbers,
+            "y": [100 * row[key] for row in certificate["curve"]],
+            "mode": "lines+markers",
+            "line": {"color": colour, "dash": "dash" if key == "bound" else "solid"},
+            "marker": {"color": colour, "size": sizes if key == "plan" else 6},
+        }
+        for key, (name, colour) in CURVES.items()
+    ]
     title = f"Gain that a number of views can have, {label}"
     alt = f"{title}: the upper bound of all sets, the plan, evenly spaced and random views."
     axes = {"xaxis": _axis("views after the seeds"), "yaxis": _axis("gain of all candidates (%)")}

@@ -241,11 +241,19 @@ def ask(
     heading, pitch = heading_and_pitch(frame.camera)
     camera = dataset.world.leave(frame.camera)
     name = f"{frame.name}-{token}" if token else frame.name
-    request: dict[str, Any] = {"name": frame.name, "picture": f"{name}.png"}
-    request |= {"convention": CONVENTION, "unit": dataset.unit, "up": list(dataset.world.up)}
-    request["transform_matrix"] = opengl_from_opencv(camera.world_to_camera).tolist()
-    request |= {"position": camera.position.tolist(), "heading": heading, "pitch": pitch}
-    request |= {"camera_model": "OPENCV", **intrinsics(camera)}
+    request = {
+        "name": frame.name,
+        "picture": f"{name}.png",
+        "convention": CONVENTION,
+        "unit": dataset.unit,
+        "up": list(dataset.world.up),
+        "transform_matrix": opengl_from_opencv(camera.world_to_camera).tolist(),
+        "position": camera.position.tolist(),
+        "heading": heading,
+        "pitch": pitch,
+        "camera_model": "OPENCV",
+        **intrinsics(camera),
+    }
     pose, out = folder / f"{name}.pose.json", folder / f"{name}.png"
     old: Any = read_json(pose) if pose.is_file() else {}
     same = isinstance(old, dict) and old == request | {"attempt": old.get("attempt")}

@@ -208,9 +208,12 @@ class Recorder:
         lines, steps = self.lines(state), before.steps if before else []
         new = state.taken[len(before.taken) if before else 0 :]
         fit, line = state.fit, lines[-1]
-        line |= {"uncertainty": mean_uncertainty(self.scene, state)}
-        line |= {"iterations": int(fit.iterations), "loss": float(fit.loss)}
-        line |= {"stop_reason": str(fit.stop_reason)}
+        line |= {
+            "uncertainty": mean_uncertainty(self.scene, state),
+            "iterations": int(fit.iterations),
+            "loss": float(fit.loss),
+            "stop_reason": str(fit.stop_reason),
+        }
         if not state.choices:
             line |= self.certificate(state)
         if state.exposure is not None:
@@ -253,13 +256,20 @@ class Recorder:
             return [line | {"images": seeds, "coverage": coverage, "seconds": {}}]
         first = state.step - len(state.choices) + 1
         laps = self.stopwatch.laps[-len(state.choices) :]  # without choices that were given up
-        self.stopwatch.laps, lines = [], []
-        for k, (choice, seconds) in enumerate(zip(state.choices, laps, strict=True), first):
-            line = {"step": k, "frame": choice.view, "name": state.frames[choice.view].name}
-            line |= {"score": choice.score, "information_gain": choice.information_gain}
-            line |= {"images": seeds + k, "coverage": choice.coverage, "seconds": seconds}
-            lines.append(line)
-        return lines
+        self.stopwatch.laps = []
+        return [
+            {
+                "step": first + k,
+                "frame": choice.view,
+                "name": state.frames[choice.view].name,
+                "score": choice.score,
+                "information_gain": choice.information_gain,
+                "images": seeds + first + k,
+                "coverage": choice.coverage,
+                "seconds": seconds,
+            }
+            for k, (choice, seconds) in enumerate(zip(state.choices, laps, strict=True))
+        ]
 
     def marked(
         self, state: State, checkpoint: Checkpoint, refused: Choice | None = None

@@ -340,6 +340,11 @@ def coarse_prior(prior: Prior, most: int = COARSE) -> tuple[Prior, NDArray[np.in
         _, y_size, z_size = cells.max(axis=0) + 1
         rows = np.sort(np.unique((x * y_size + y) * z_size + z, return_index=True)[1])
         low, high = (cell, high) if len(rows) > most else (low, cell)
-    spacing = prior.spacing * float(np.sqrt(count / len(rows)))
-    points, normals = prior.points[rows], prior.normals[rows]
-    return replace(prior, points=points, normals=normals, spacing=spacing, backed=0), rows
+    thinned = replace(
+        prior,
+        points=prior.points[rows],
+        normals=prior.normals[rows],
+        spacing=prior.spacing * float(np.sqrt(count / len(rows))),
+        backed=0,
+    )
+    return thinned, rows

@@ -74,8 +74,15 @@ def register(
 
     (target, tree), (source, _) = clouds[i], clouds[j]
     for reach in reaches:
-        how = {"max_correspondence_distance": reach * MATCH * grid, "max_iterations": 60}
-        result = small_gicp.align(target, source, tree, guess, num_threads=1, **how)
+        result = small_gicp.align(
+            target,
+            source,
+            tree,
+            guess,
+            max_correspondence_distance=reach * MATCH * grid,
+            num_threads=1,
+            max_iterations=60,
+        )
         guess = result.T_target_source
     points = source.points()[:, :3] @ guess[:3, :3].T + guess[:3, 3]
     distance = cKDTree(target.points()[:, :3]).query(points)[0]

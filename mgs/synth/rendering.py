@@ -107,12 +107,16 @@ def synth_orbit(
         with reading(Path(mesh), "mesh; give a GLB, OBJ or PLY file"):
             made_of = fingerprint(mesh) | {"up": mesh_up or up_axis(mesh)}
     # All that decides what the dataset holds; an interrupted run continues only if it is the same.
-    resolved: dict[str, Any] = {"scene": settings.model_dump(mode="json")}
-    resolved |= {"preset": asdict(preset), "seed": seed, "mesh": made_of, "denoise": denoise}
-    resolved["pose_noise"] = None if pose_noise is None else asdict(pose_noise)
-    resolved["test_views"] = test_views
-    kept = {"mesh": mesh and str(Path(mesh).resolve())}
-    resolved["on_demand"] = kept if on_demand else None
+    resolved: dict[str, Any] = {
+        "scene": settings.model_dump(mode="json"),
+        "preset": asdict(preset),
+        "seed": seed,
+        "mesh": made_of,
+        "denoise": denoise,
+        "pose_noise": None if pose_noise is None else asdict(pose_noise),
+        "test_views": test_views,
+        "on_demand": {"mesh": mesh and str(Path(mesh).resolve())} if on_demand else None,
+    }
     with folder_locked(out):
         if resumes(out, "config.json", resolved) and (out / "transforms.json").is_file():
             say(f"{out}: is finished already; nothing is rendered")

@@ -215,8 +215,13 @@ def _sunsky(sky: Sky) -> dict[str, Any]:
     elevation, azimuth = np.radians([sky.sun_elevation, sky.sun_azimuth])
     flat = np.cos(elevation)
     sun = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)]
-    scales = {"turbidity": sky.turbidity, "sun_scale": sky.sun_scale, "sky_scale": sky.sky_scale}
-    return {"type": "sunsky", "sun_direction": [float(x) for x in sun], **scales}
+    return {
+        "type": "sunsky",
+        "sun_direction": [float(x) for x in sun],
+        "turbidity": sky.turbidity,
+        "sun_scale": sky.sun_scale,
+        "sky_scale": sky.sky_scale,
+    }
 
 
 def _bitmap(linear: np.ndarray) -> dict[str, Any]:
@@ -236,16 +241,26 @@ def _rock_bsdf(rock: trimesh.Trimesh, settings: Rock) -> dict[str, Any]:
         colour = {"type": "mesh_attribute", "name": "vertex_color"}
     else:
         colour = {"type": "rgb", "value": list(settings.colours[0])}
-    gloss = {"roughness": settings.roughness, "specular": settings.specular}
-    return {"type": "principled", "base_color": colour, **gloss}
+    return {
+        "type": "principled",
+        "base_color": colour,
+        "roughness": settings.roughness,
+        "specular": settings.specular,
+    }
 
 
 def _mesh(name: str, mesh: trimesh.Trimesh, bsdf: dict[str, Any]) -> Any:
     uv = getattr(mesh.visual, "uv", None)
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict({"type": "twosided", "material": bsdf})
-    has = {"has_vertex_normals": True, "has_vertex_texcoords": uv is not None}
-    shape = mi.Mesh(name, len(mesh.vertices), len(mesh.faces), props=properties, **has)
+    shape = mi.Mesh(
+        name,
+        len(mesh.vertices),
+        len(mesh.faces),
+        has_vertex_normals=True,
+        has_vertex_texcoords=uv is not None,
+        props=properties,
+    )
     for attribute, values in mesh.vertex_attributes.items():
         flat: Any = np.ravel(values)
         shape.add_attribute(f"vertex_{attribute}", np.shape(values)[1], flat)
