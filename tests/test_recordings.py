@@ -15,11 +15,11 @@ from refusals import fails, refused
 from scipy.spatial.transform import Rotation
 
 from mgs import Camera, load_dataset
-from mgs.data import tracks
+from mgs.data import shots
 from mgs.data.peers import is_peer
 from mgs.data.sources import read_source
 
-MOUNT = tracks.rigid((0.1, -0.2, 0.3), (0.5, -0.5, 0.5, -0.5))
+MOUNT = shots.rigid((0.1, -0.2, 0.3), (0.5, -0.5, 0.5, -0.5))
 """Camera to body of the robot."""
 OPTICAL = "camera_color_optical_frame"
 
@@ -144,7 +144,7 @@ class Bag:
 
 def slipped(pose: np.ndarray, k: int) -> np.ndarray:
     """A pose of wheels that slip."""
-    return tracks.rigid((0.3 * k, 0, 0), (0, 0, np.sin(0.1 * k), np.cos(0.1 * k))) @ pose
+    return shots.rigid((0.3 * k, 0, 0), (0, 0, np.sin(0.1 * k), np.cos(0.1 * k))) @ pose
 
 
 POSES = {
@@ -466,15 +466,15 @@ def test_keyframes_by_distance(dataset, tmp_path):
 
 
 def test_poses_are_interpolated():
-    start, end = np.eye(4), tracks.rigid((2, 0, 0), (0, 0, 1, 1))
-    track = tracks.Track.of([(3.0, end), (1.0, start)])
+    start, end = np.eye(4), shots.rigid((2, 0, 0), (0, 0, 1, 1))
+    track = shots.Track.of([(3.0, end), (1.0, start)])
     middle = track.at(2.0)
     assert np.allclose(middle[:3, 3], [1, 0, 0])
     assert np.allclose(Rotation.from_matrix(middle[:3, :3]).as_rotvec(degrees=True), [0, 0, 45])
     assert track.at(0.9) is None
     assert track.at(3.1) is None
-    assert tracks.Track.of([(1.0, end)]).at(9.0)[0, 3] == 2
-    lost = tracks.Track.of([(t, start) for t in (0.0, 0.1, 0.2, 0.3, 2.0)] + [(4.0, end)])
+    assert shots.Track.of([(1.0, end)]).at(9.0)[0, 3] == 2
+    lost = shots.Track.of([(t, start) for t in (0.0, 0.1, 0.2, 0.3, 2.0)] + [(4.0, end)])
     assert lost.at(1.0) is not None, "it did not move"
     assert lost.at(3.0) is None
     assert np.allclose(lost.at(4.0), end)
@@ -482,7 +482,7 @@ def test_poses_are_interpolated():
 
 @pytest.mark.parametrize("text", ["", "0.5", "-1s", "1 km"])
 def test_bad_spacings(text):
-    fails("expected seconds or metres", tracks.Spacing.parse, text)
+    fails("expected seconds or metres", shots.Spacing.parse, text)
 
 
 LEFT_OUT = {
