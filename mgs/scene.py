@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, TypeVar
 
@@ -17,7 +17,7 @@ from mgs.fit.settings import ALPHA_WEIGHT, ModelSettings, TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, KEPT_BYTES, Deferred, kept_within, release
 from mgs.policy import poses
-from mgs.policy.visibility import Visibility
+from mgs.policy.visibility import Visibility, one_in
 from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of, without_gain
 from mgs.prior.initial import colours_of, initial_gaussians, pixel_on
@@ -285,9 +285,23 @@ class Scene:
         key = "surface", state.taken[: state.seeds], state.moved
         return self.once(key, lambda: self._visibility(state))
 
-    def _visibility(self, state: State) -> Visibility:
-        start = self.untrained(state)
+    def plan_surface(self, state: State) -> Visibility:
+        """The same for directional gains. Where there are many pairs of a pose and a Gaussian, one
+        in k Gaussians, of k times the area, in images of 1/k of the pixels."""
+        k = one_in(len(self.prior.points), len(state.frames))
+        if k == 1:
+            return self.surface(state)
+        key = "plan", state.taken[: state.seeds], state.moved
+        return self.once(key, lambda: self._visibility(state, k))
+
+    def _visibility(self, state: State, k: int = 1) -> Visibility:
+        start, cameras = self.untrained(state), state.cameras
         count, columns = len(self.prior.points), len(self.surface_lam)
+        if k > 1:
+            some = np.r_[0:count:k, count : len(start) : k]
+            larger = start.log_scales[some] + np.float32(np.log(k) / 2)
+            start, count = replace(start[some], log_scales=larger), len(range(0, count, k))
+            cameras = [c.resized(max(1, round(c.width / np.sqrt(k)))) for c in cameras]
 
         def exact(camera: Camera) -> np.ndarray:
             return self.fisher(start, camera, "exact")[:count, :columns]
@@ -296,7 +310,7 @@ class Scene:
             return self.fisher_of_colours(start, camera)[:count]
 
         points, lam = start.means[:count], float(self.surface_lam[0])
-        return Visibility(state.cameras, exact, colour, points, self.centre, lam)
+        return Visibility(cameras, exact, colour, points, self.centre, lam)
 
     def positions(self, frames: Sequence[Frame]) -> np.ndarray:
         """Camera centres [V,3], metres."""

@@ -6,14 +6,15 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+import synthetic
 import tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from program import steps
 
-from mgs import choose, learn
+from mgs import Scene, choose, learn, load_prior
 from mgs.colour import SH_C0
-from mgs.policy import criteria, directional, pool_gains, relaxation, visibility
+from mgs.policy import criteria, directional, relaxation, visibility
 from mgs.policy.directional import Views
 from mgs.policy.pool_gains import PoolGains
 from mgs.policy.visibility import Visibility, planned_path, planned_views
@@ -175,11 +176,22 @@ def test_degrees_and_criteria_are_kept_apart():
         assert found(*asked) == pytest.approx(anew(*rock, *asked), rel=1e-6)
 
 
-def test_what_does_not_fit_into_memory_is_computed_from_scratch(monkeypatch):
-    rock, asked = scene(3), ([0, 1], [3, 4], 3, 0.1, True)
-    monkeypatch.setattr(pool_gains, "IMAGE_BYTES", 1000)
-    monkeypatch.setattr(pool_gains, "PoolGains", None)
-    assert np.array_equal(updated(*rock)(*asked), anew(*rock, *asked))
+def test_where_there_are_many_pairs_few_large_gaussians_choose_as_well(tmp_path, monkeypatch):
+    cameras = synthetic.orbit_cameras(24, 96, 72)
+    data = synthetic.write_rock(tmp_path / "dataset", cameras, 3000)
+    rock = Scene(data, load_prior(data.root / "prior"))
+    model, views = (2, 0.2, True), list(range(4, 24))
+    state = learn(rock, rock.seeds(4))
+    fine = rock.plan_surface(state)
+    assert fine is rock.surface(state)
+    count = len(fine.points)
+    monkeypatch.setattr(visibility, "MOST_PAIRS", 42 * count - 1)
+    monkeypatch.setattr(visibility, "COARSE_PAIRS", 42 * count // 4)
+    coarse = rock.plan_surface(state)
+    assert len(coarse.points) == -(-count // 4)
+    assert coarse.cameras[0].width == 48
+    gains = [surface.gains(state.taken, views, model) for surface in (fine, coarse)]
+    assert np.corrcoef(gains)[0, 1] > 0.95
 
 
 @pytest.mark.parametrize("points", [0, 3])

@@ -20,19 +20,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mgs.memory import IMAGE_BYTES, padded
+from mgs.memory import padded
 from mgs.policy.criteria import Array
 from mgs.policy.directional import Views, information, precision
 from mgs.splat.recording import one_at_a_time
-
-BYTES_OF_ENTRY, BYTES_OF_PAIR = 16, 40  # of both matrices; of a pair of pose and Gaussian
-
-
-def fits(points: Array, pool: Views, degree: int) -> bool:
-    """Whether `PoolGains` takes at most IMAGE_BYTES, and some view sees something."""
-    pairs = int(np.count_nonzero(pool.seen))
-    entries = len(points) * len(_upper((degree + 1) ** 2))
-    return pairs > 0 and BYTES_OF_ENTRY * entries + BYTES_OF_PAIR * pairs <= IMAGE_BYTES
 
 
 class PoolGains:

@@ -18,6 +18,10 @@ Model = tuple[int, float, bool]
 """SH degree, tau, and whether gains are those of I-optimality over the dome, else D-optimality."""
 
 FEW = 500  # about the number of Gaussians by which a flight is planned; chosen
+# Pairs of a pose and a Gaussian: most for which gains of all Gaussians are computed, and
+# about how many otherwise. Chosen constants (docs/speed-accuracy.md).
+MOST_PAIRS, COARSE_PAIRS = 1 << 24, 1 << 21
+MATRICES = 18  # memory of the matrices of a Gaussian (`PoolGains`), as a number of pairs
 BETTER = 1 + 1e-6  # least ratio of gains for an exchange: above rounding errors; chosen
 WIDTH = 16  # paths that `planned_path` keeps at each step; chosen
 
@@ -63,15 +67,12 @@ class Visibility:
 
     def gains(self, taken: Sequence[int], candidates: Sequence[int], model: Model) -> Array:
         """Directional gain of each candidate after the views taken [C]. It is fast if the views
-        taken begin with those of the call before. Where gains do not fit into the memory, they are
-        computed from scratch."""
+        taken begin with those of the call before."""
         state = self.states.get(model)
         if state is None or state.taken != list(taken[: len(state.taken)]):
             state = self.plan_gains(model)
-            if state is None and not self.pool.seen.any():
-                return np.zeros(len(candidates))
             if state is None:
-                return self.relaxation(taken, candidates, model).added(())
+                return np.zeros(len(candidates))
             self.states[model] = state
         state.take(taken[len(state.taken) :])
         return state.of_poses(candidates)
@@ -114,13 +115,13 @@ class Visibility:
 
     def plan_gains(self, model: Model, most: int | None = None) -> PoolGains | None:
         """Gains of all cameras for about `most` of the Gaussians, by default all, before any view
-        is taken; None where no camera sees any, or they do not fit into the memory."""
-        from mgs.policy.pool_gains import PoolGains, fits  # here because it loads Dr.Jit
+        is taken; None where no camera sees any."""
+        from mgs.policy.pool_gains import PoolGains  # here because it loads Dr.Jit
 
         degree, tau, over_dome = model
         some = slice(None, None, max(len(self.points) // most, 1) if most else None)
         pool = of_points(self.pool, some)
-        if not fits(self.points[some], pool, degree):
+        if not pool.seen.any():
             return None
         dome = of_points(self.dome, some) if over_dome else None
         return PoolGains(self.points[some], pool, self.lam, degree, tau, dome)
@@ -138,6 +139,12 @@ class Visibility:
         cameras = dome_cameras(self.cameras[0], self.positions, self.centre)
         seen = np.stack([squared_weights(self.colour(camera)) for camera in cameras])
         return Views(np.array([camera.position for camera in cameras]), seen)
+
+
+def one_in(points: int, views: int) -> int:
+    """Which part of the Gaussians on a surface is enough to plan by: one in so many."""
+    pairs = points * (views + MATRICES)
+    return 1 if pairs <= MOST_PAIRS else -(-pairs // COARSE_PAIRS)
 
 
 def planned_views(gains: PoolGains, candidates: Sequence[int], count: int) -> list[int]:

@@ -75,7 +75,7 @@ class Checks:
         views: all views taken, under the model. new_views: the new ones, under the model before."""
 
         def mean_gain(before: Sequence[int], poses: Sequence[int]) -> float:
-            gains = self.scene.surface(state).gains(before, poses, DIRECTIONAL_D.model)
+            gains = self.scene.plan_surface(state).gains(before, poses, DIRECTIONAL_D.model)
             return float(gains.mean())
 
         entry = {"fitted": float(np.mean([view.srgb_error for view in views]))}

@@ -230,14 +230,14 @@ class Directional:
         return self.degree, self.tau, self.over_dome
 
     def __call__(self, scene: Scene, state: State, views: list[int]) -> np.ndarray:
-        return scene.surface(state).gains(state.taken, views, self.model)
+        return scene.plan_surface(state).gains(state.taken, views, self.model)
 
     def plan(
         self, scene: Scene, state: State, views: list[int], count: int, nearest: int | None
     ) -> Sequence[int]:
         """Rest of the plan made after the seeds. If a view outside it was taken, a new plan is made
         after all views taken."""
-        surface = scene.surface(state)
+        surface = scene.plan_surface(state)
         for first in (state.seeds, len(state.taken)):
             start, past = state.taken[:first], list(state.taken[first:])
             task = start, tuple(sorted({*views, *past})), count + len(past)
@@ -253,10 +253,10 @@ class Directional:
 
     def tour_gains(self, scene: Scene, state: State) -> PoolGains | None:
         """Gains by which a flight is planned, for some of the Gaussians."""
-        return scene.surface(state).plan_gains(self.tour, FEW)
+        return scene.plan_surface(state).plan_gains(self.tour, FEW)
 
     def relaxation(self, scene: Scene, state: State, views: Sequence[int]) -> Relaxation:
-        surface = scene.surface(state)
+        surface = scene.plan_surface(state)
         relaxed.checked(surface.pool.of(views).seen)
         return surface.relaxation(state.taken, views, self.model)
 
