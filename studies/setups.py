@@ -36,7 +36,7 @@ from studies.frame.output import (
     write_csv,
     write_table,
 )
-from studies.frame.program import WORKERS, Options, Study, Work, study_of
+from studies.frame.program import WORKERS, Options, Study, Work, at_least, study_of
 from studies.frame.statistics import Row, holm, interval, permutation_p
 from studies.frame.sweep import Cell, results_so_far
 
@@ -140,17 +140,21 @@ class SetupSize:
 
 SIZES = {"quick": SetupSize(), "paper": SetupSize(320, 240, 24, 16)}
 
-POLICY: Options = {
+CHOICES: Options = {
     "--policy": {
         "action": "append",
         "default": [],
         "help": "A further policy: a name or FILE.py:NAME; repeatable.",
     },
+    "--images": {
+        "type": at_least(1 + max(setup.seeds for setup in SETUPS.values())),
+        "help": f"Images that a run takes, seeds among them. Default: {SetupSize.images}.",
+    },
 }
 
 
 def sized(size: SetupSize, options: Namespace) -> SetupSize:
-    """Size with the options --rocks, --mesh and --policy.
+    """Size with the options --rocks, --mesh, --policy and --images.
 
     Raises InputError as `rocks_of`, and if a policy is unknown or already compared, or two have the
     same name.
@@ -165,7 +169,9 @@ def sized(size: SetupSize, options: Namespace) -> SetupSize:
         labels.append(policy_file.label(policy))
         policy_file.policy_of(policy)
     policies = (*size.policies, *map(policy_file.absolute, own))
-    return replace(size, policies=policies, rocks=rocks_of(options, size.count))
+    images = getattr(options, "images", None) or size.images
+    rocks = rocks_of(options, size.count)
+    return replace(size, policies=policies, images=images, rocks=rocks)
 
 
 def case_of(rock: Rock, setup: Setup, size: SetupSize) -> Case:
@@ -471,7 +477,7 @@ STUDY = Study(
     write,
     SIZES,
     lambda work: cells_of(work.size),
-    ROCKS | POLICY | WORKERS,
+    ROCKS | CHOICES | WORKERS,
     sized,
 )
 
