@@ -12,7 +12,6 @@ from importlib import import_module
 from pathlib import Path
 
 import dask
-import numpy as np
 import pytest
 from distributed import LocalCluster
 from refusals import fails
@@ -114,78 +113,24 @@ def die(root, out):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def real_run(root, out, data, killed=False):
-    """A task: `mgs nbv`; if asked for, its first attempt is killed after its first choice."""
-    from mgs.gaussians import ARRAYS
-    from mgs.run.inputs import array_digest
-    from mgs.run.nbv import resume_nbv, run_nbv
-
-    first, run = not (out / "run").exists(), out / "run"
-
-    def on_step(state):
-        if killed and first and len(state.steps) == 2:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    given = {"gaussians": 150, "seeds": 2, "budget": 2}
-    done = run_nbv(data, run, on_step=on_step, **given) if first else resume_nbv(run)
-    state = done.state
-    arrays = [*(getattr(state.gaussians, name) for name in ARRAYS), state.H, state.surface]
-    losses = [step["loss"] for step in state.steps]
-    return {"taken": state.taken, "arrays": array_digest(arrays), "losses": losses}
-
-
-def surface(root, out):
-    """A task: a Poisson surface of a sphere's points."""
-    import pymeshlab
-
-    points = np.random.default_rng(0).normal(size=(500, 3))
-    points /= np.linalg.norm(points, axis=1)[:, None]
-    meshes = pymeshlab.MeshSet()
-    meshes.add_mesh(pymeshlab.Mesh(points, v_normals_matrix=points))
-    meshes.generate_surface_reconstruction_screened_poisson(depth=5)
+def die_once(root, out):
+    """A task that its process does not survive at first."""
+    if not (out / "begun").exists():
+        (out / "begun").touch()
+        die(root, out)
     return {}
 
 
-def mixed(data, killed):
-    """Cells of several kinds; where asked for, one of them kills its process once."""
-    cells = [Cell(str(x), "test_sweep:add_slowly", {"x": x}) for x in range(4)]
-    cells.append(cell("last", ("0", "3"), x=1))
-    cells += [Cell(f"surface/{k}", "test_sweep:surface") for k in range(2)]
-    more = {"killed": True} if killed else {}
-    return [*cells, Cell("run", "test_sweep:real_run", {"data": str(data)} | more)]
-
-
-PROGRAM = """
-import sys
-from pathlib import Path
-from test_sweep import mixed, run_cells
-
-if __name__ == "__main__":
-    with open(sys.argv[2], "w") as told:
-        cells = mixed(sys.argv[3], True)
-        run_cells(Path(sys.argv[1]), cells, lambda name, *_: print(name, file=told), workers=2)
-"""
-
-
 @pytest.mark.slow
-def test_two_workers_of_which_one_is_killed_find_silently_what_a_serial_run_finds(tmp_path):
-    import synthetic
-
-    data = synthetic.write_dataset(tmp_path / "data", synthetic.orbit_cameras(8, 48, 36)).root
-    program, told = tmp_path / "program.py", tmp_path / "told.txt"
-    program.write_text(PROGRAM)
-    paths = os.pathsep.join([os.path.dirname(__file__), os.getcwd()])
-    command = [sys.executable, program, tmp_path / "parallel", told, data]
-    options = {"env": os.environ | {"PYTHONPATH": paths}, "capture_output": True, "text": True}
-    done = subprocess.run(command, timeout=240, **options)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    names = told.read_text().split()
-    assert len(names) == len(set(names)) == 8
-    assert names.index("last") > max(names.index("0"), names.index("3"))
-    serial = run_cells(tmp_path / "serial", mixed(data, False), silent)
-    assert len(serial["run"]["taken"]) == 4
-    for cell in mixed(data, True):
-        assert result_of(tmp_path / "parallel", cell) == serial[cell.name]
+def test_two_workers_of_which_one_is_killed_find_silently_what_a_serial_run_finds(tmp_path, capfd):
+    cells, told = [Cell(str(x), "test_sweep:add_slowly", {"x": x}) for x in range(3)], []
+    killed = [Cell("killed", "test_sweep:die_once"), cell("last", ("killed",), x=1)]
+    report = lambda name, *_: told.append(name)  # noqa: E731
+    found = run_cells(tmp_path / "a", cells + killed, report, workers=2)
+    assert capfd.readouterr() == ("", "")
+    assert sorted(told) == ["0", "1", "2", "killed", "last"]
+    assert told[-1] == "last"
+    assert found == run_cells(tmp_path / "b", cells, silent) | {"killed": {}, "last": {"sum": 1}}
 
 
 @pytest.fixture(scope="module")
