@@ -26,7 +26,7 @@ import tiny  # noqa: E402
 from mgs.data.dataset import load_dataset  # noqa: E402
 
 LONGEST = """
-docs page view photographs structure_from_motion synth capture prior setups end_to_end import loop
+docs page view photographs structure_from_motion synth capture prior setups end_to_end import api
 scene poses agreement suggest chart nbv hostile borders_data sweep refit evaluate world options
 directional survey bad_input compact detectors exposure stress fisher derivatives kernels
 """
@@ -71,6 +71,14 @@ def seeded(pristine, tmp_path_factory):
     """The folder of a run of its seeds alone, which no test changes."""
     root = tmp_path_factory.mktemp("seeded")
     return tiny.write_run(root / "run", pristine, tiny.write_prior(root / "prior"))
+
+
+@pytest.fixture(scope="session")
+def orbit(tmp_path_factory):
+    """Twelve views of an ellipsoid, which no test changes."""
+    import synthetic
+
+    return synthetic.orbit(tmp_path_factory.mktemp("orbit"), 12, 96, 72)
 
 
 @pytest.fixture

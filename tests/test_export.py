@@ -14,8 +14,7 @@ import pytest
 from program import command, output
 from refusals import fails, refused
 from test_meshes import glb, parts_of
-from test_render_command import CAMERAS, gaussians
-from test_splat_ply import assert_close
+from test_render_command import CAMERAS, assert_close, gaussians
 
 import mgs
 from mgs import Gaussians, load_cameras, load_dataset, read_ply, write_ply

@@ -20,25 +20,20 @@ from mgs.run.inputs import prior_digest
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return synthetic.orbit(tmp_path_factory.mktemp("orbit"), 12, 96, 72)
+def prior(orbit: Dataset) -> Prior:
+    return build_prior(orbit, PriorSettings(gaussians=2000, backing=0))
 
 
-@pytest.fixture(scope="module")
-def prior(dataset: Dataset) -> Prior:
-    return build_prior(dataset, PriorSettings(gaussians=2000, backing=0))
-
-
-def test_shapes_scales_and_rotations(prior, dataset):
-    gaussians, seen = initial_gaussians(prior, dataset.frames[::3])
+def test_shapes_scales_and_rotations(prior, orbit):
+    gaussians, seen = initial_gaussians(prior, orbit.frames[::3])
     assert gaussians.check() is gaussians
     for name in ("means", "log_scales", "quats", "sh"):
         assert getattr(gaussians, name).dtype == np.float32
     assert seen.shape == (2000,)
     off = gaussians.means - prior.points
-    pixel = pixel_on(prior, [frame.camera for frame in dataset.frames[::3]])
+    pixel = pixel_on(prior, [frame.camera for frame in orbit.frames[::3]])
     assert np.allclose(off, -initial.INSET[True] * pixel * prior.normals, atol=1e-6)
-    on_it = initial_gaussians(prior, dataset.frames[::3], pixel=0)[0]
+    on_it = initial_gaussians(prior, orbit.frames[::3], pixel=0)[0]
     assert np.allclose(on_it.means, prior.points, atol=1e-6)
     expected = prior.spacing * np.array([IN_PLANE_SCALE, IN_PLANE_SCALE, THICKNESS])
     assert np.allclose(np.exp(gaussians.log_scales), expected, rtol=1e-5)
@@ -47,17 +42,17 @@ def test_shapes_scales_and_rotations(prior, dataset):
     assert np.allclose(gaussians.opacities, initial.INITIAL_OPACITY, atol=1e-6)
 
 
-def test_a_warm_start_gives_new_images_to_what_none_saw_before(prior, dataset):
+def test_a_warm_start_gives_new_images_to_what_none_saw_before(prior, orbit):
     """A newly seen Gaussian takes the new colour plus what was learned; all else stays."""
-    before, seen_before = initial_gaussians(prior, dataset.frames[:1])
-    start, seen = initial_gaussians(prior, dataset.frames[:2])
+    before, seen_before = initial_gaussians(prior, orbit.frames[:1])
+    start, seen = initial_gaussians(prior, orbit.frames[:2])
     new = seen & ~seen_before
     assert new.mean() > 0.05
     learned = np.random.default_rng(0).normal(0, 0.1, before.sh.shape).astype(np.float32)
     model = replace(before, sh=before.sh + learned, log_scales=before.log_scales + 1)
     found = initial.warm_start(model, before, start)
     np.testing.assert_allclose(found.sh[new], start.sh[new] + learned[new], atol=1e-6)
-    seen_now = initial_gaussians(prior, dataset.frames[1:2])[1]
+    seen_now = initial_gaussians(prior, orbit.frames[1:2])[1]
     np.testing.assert_array_equal(found.sh[~seen_now], model.sh[~seen_now])
     assert found.log_scales is model.log_scales
     assert found.sh.dtype == np.float32
@@ -77,14 +72,14 @@ def test_a_pixel_on_the_surface(prior):
 
 
 @pytest.mark.parametrize("antialiased", [True, False])
-def test_outlines_are_where_they_are_in_the_images(dataset, prior, antialiased):
+def test_outlines_are_where_they_are_in_the_images(orbit, prior, antialiased):
     """Drawn from below the surface the rock covers about its masks; from the surface, more."""
 
     def excess(pixel: float | None) -> float:
-        frames = dataset.frames[::3]
+        frames = orbit.frames[::3]
         gaussians = initial_gaussians(prior, frames, pixel, antialiased=antialiased)[0]
         shares = []
-        for frame in dataset.frames:
+        for frame in orbit.frames:
             alpha = np.asarray(render(gaussians, frame.camera).alpha)
             shares.append(alpha.sum() / frame.mask().sum())
         return float(np.mean(shares)) - 1
@@ -92,8 +87,8 @@ def test_outlines_are_where_they_are_in_the_images(dataset, prior, antialiased):
     assert excess(0) > 2 * abs(excess(None))
 
 
-def test_colours_are_those_of_the_seen_surface(prior, dataset):
-    gaussians, seen = initial_gaussians(prior, dataset.frames)
+def test_colours_are_those_of_the_seen_surface(prior, orbit):
+    gaussians, seen = initial_gaussians(prior, orbit.frames)
     # 12 views from above see all but the foot of the rock, where a pixel's mask may miss.
     assert seen[prior.points[:, 2] > 0.1].mean() > 0.99
     error = np.abs(gaussians.rgb - synthetic.albedo(prior.points))[seen]
@@ -101,8 +96,8 @@ def test_colours_are_those_of_the_seen_surface(prior, dataset):
     assert np.quantile(error, 0.99) < 0.1  # a pixel at the rim mixes rock and ground
 
 
-def test_the_far_side_of_one_frame_stays_grey(prior, dataset):
-    frame = dataset.frames[0]
+def test_the_far_side_of_one_frame_stays_grey(prior, orbit):
+    frame = orbit.frames[0]
     gaussians, seen = initial_gaussians(prior, [frame])
     towards = np.einsum("nk,nk->n", prior.normals, frame.camera.position - prior.points)
     towards /= np.linalg.norm(frame.camera.position - prior.points, axis=1)
@@ -111,8 +106,8 @@ def test_the_far_side_of_one_frame_stays_grey(prior, dataset):
     assert np.allclose(gaussians.rgb[~seen], GREY, atol=1e-6)
 
 
-def test_the_mesh_stands_in_for_missing_depth(prior, dataset):
-    frames = dataset.frames[::3]
+def test_the_mesh_stands_in_for_missing_depth(prior, orbit):
+    frames = orbit.frames[::3]
     _, by_depth = initial_gaussians(prior, frames)
     without = [replace(frame, depth_path=None) for frame in frames]
     gaussians, by_mesh = initial_gaussians(prior, without)
@@ -121,8 +116,8 @@ def test_the_mesh_stands_in_for_missing_depth(prior, dataset):
     assert np.quantile(error, 0.95) < 0.08
 
 
-def test_colours_are_averaged_and_the_mask_counts(prior, dataset, tmp_path):
-    frame = dataset.frames[0]
+def test_colours_are_averaged_and_the_mask_counts(prior, orbit, tmp_path):
+    frame = orbit.frames[0]
     shape = (frame.camera.height, frame.camera.width, 3)
     images = []
     for name, value in (("dark", 0.2), ("light", 0.6)):
@@ -139,14 +134,14 @@ def test_colours_are_averaged_and_the_mask_counts(prior, dataset, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def backed(dataset: Dataset) -> Prior:
-    return prior_from_mesh(dataset.root / "rock.glb", PriorSettings(gaussians=1200))
+def backed(orbit: Dataset) -> Prior:
+    return prior_from_mesh(orbit.root / "rock.glb", PriorSettings(gaussians=1200))
 
 
-def test_behind_the_surface_lies_an_opaque_backing(dataset, backed):
+def test_behind_the_surface_lies_an_opaque_backing(orbit, backed):
     """A third of the Gaussians, evenly spread, a spacing inside, opaque, coloured as above them."""
     prior = backed
-    gaussians, seen = initial_gaussians(prior, dataset.frames)
+    gaussians, seen = initial_gaussians(prior, orbit.frames)
     assert (len(gaussians), len(prior.points), len(seen), prior.backed) == (1200, 800, 800, 400)
     surface, backing, over = gaussians[:800], gaussians[800:], slice(0, 400)
     inward = np.einsum("nk,nk->n", surface.means[over] - backing.means, prior.normals[over])
@@ -160,7 +155,7 @@ def test_behind_the_surface_lies_an_opaque_backing(dataset, backed):
     faded = replace(surface, logit_opacities=opacities)
     opacities = np.concatenate([opacities, gaussians.logit_opacities[800:]])
     both = replace(gaussians, logit_opacities=opacities)
-    for frame in dataset.frames[:3]:
+    for frame in orbit.frames[:3]:
         inner = binary_erosion(frame.mask(), iterations=3)
         alpha, hidden = (np.asarray(render(g, frame.camera).alpha)[inner] for g in (faded, both))
         assert alpha.mean() < 0.6
@@ -168,11 +163,11 @@ def test_behind_the_surface_lies_an_opaque_backing(dataset, backed):
 
 
 def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(
-    dataset, backed, tmp_path
+    orbit, backed, tmp_path
 ):
     loaded = load_prior(save_prior(tmp_path / "prior", backed))
     assert loaded.backed == backed.backed == 400
-    assert len(initial_gaussians(loaded, dataset.frames[:2])[0]) == 1200
+    assert len(initial_gaussians(loaded, orbit.frames[:2])[0]) == 1200
     assert prior_digest(replace(loaded, backed=99)) != prior_digest(loaded)
     numbers = json.loads((tmp_path / "prior/prior.json").read_text())
     (tmp_path / "prior/prior.json").write_text(json.dumps(numbers | {"backed": 1000}))

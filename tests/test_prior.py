@@ -22,13 +22,8 @@ X, Y, Z = np.eye(3)
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return synthetic.orbit(tmp_path_factory.mktemp("orbit"), 12, 96, 72)
-
-
-@pytest.fixture(scope="module")
-def built(dataset: Dataset):
-    return prior_and_cloud(dataset, PriorSettings(gaussians=1500, backing=0))
+def built(orbit: Dataset):
+    return prior_and_cloud(orbit, PriorSettings(gaussians=1500, backing=0))
 
 
 def _ball() -> Mesh:
@@ -40,13 +35,13 @@ def as_mesh(mesh: trimesh.Trimesh, offset=0.0) -> Mesh:
     return Mesh(vertices, faces, np.ones(len(faces), bool))
 
 
-def test_the_focus_is_what_all_cameras_look_at(dataset):
-    found = focus(dataset.frames)
+def test_the_focus_is_what_all_cameras_look_at(orbit):
+    found = focus(orbit.frames)
     assert np.allclose(found.point, synthetic.CENTRE, atol=1e-9)
     assert found.distance == pytest.approx(np.hypot(2.6, 1.3), rel=0.05)
 
 
-def test_ground_plane_of_a_tilted_noisy_floor(dataset):
+def test_ground_plane_of_a_tilted_noisy_floor(orbit):
     rng = np.random.default_rng(0)
     normal = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
     xy = rng.uniform(-2, 2, (20_000, 2))
@@ -55,13 +50,13 @@ def test_ground_plane_of_a_tilted_noisy_floor(dataset):
     rock = rng.uniform([-0.3, -0.3, 0.4], [0.3, 0.3, 1.0], (5_000, 3))
     views = np.tile([0, 0, 1.0], (25_000, 1))
     cloud = Cloud(np.concatenate([points, rock]), views, 0.002, 0.0, 25_000)
-    plane = ground_plane(cloud, dataset.frames, seed=2)
+    plane = ground_plane(cloud, orbit.frames, seed=2)
     assert plane.normal @ normal > np.cos(np.radians(0.1))
     assert plane.offset == pytest.approx(0.3, abs=1e-3)
     assert plane.sigma == pytest.approx(0.004, rel=0.1)
     points = rng.standard_normal((4000, 3))  # no plane dominates
     with pytest.raises(InputError, match="no ground plane"):
-        ground_plane(Cloud(points, points, 0.05, 0.0, 4000), dataset.frames, seed=0)
+        ground_plane(Cloud(points, points, 0.05, 0.0, 4000), orbit.frames, seed=0)
 
 
 PARTS = {
@@ -96,7 +91,7 @@ def test_no_part_of_a_rock_is_lost(tmp_path, shape, masked):
         assert np.median(cKDTree(found.points).query(open_sides)[0]) < found.spacing
 
 
-def test_parts_of_an_overhang_are_kept_together(dataset, built):
+def test_parts_of_an_overhang_are_kept_together(orbit, built):
     """A cap, a base under it, and a stone beside them, of which no point joins them."""
     rng = np.random.default_rng(5)
     cap, base = (rng.uniform([-0.5, -0.5, z], [0.5, 0.5, z + 0.3], (3000, 3)) for z in (0.8, 0.1))
@@ -107,7 +102,7 @@ def test_parts_of_an_overhang_are_kept_together(dataset, built):
     assert count == 3
     assert inside[:5000].mean() > 0.99
     assert not inside[5000:].any()
-    mesh, frames = built[0].mesh, dataset.frames
+    mesh, frames = built[0].mesh, orbit.frames
     half = mesh.faces[mesh.vertices[mesh.faces].mean(1)[:, 0] > synthetic.CENTRE[0]]
     assert outline_error(mesh, frames) < 0.02
     assert outline_error(Mesh(mesh.vertices, half, np.ones(len(half), bool)), frames) > 0.1
@@ -272,18 +267,18 @@ def test_prior_is_near_the_truth(built):
     assert np.quantile(cosine, 0.01) > np.cos(np.radians(10))
 
 
-def test_error_to_truth_sees_a_wrong_prior(built, dataset):
+def test_error_to_truth_sees_a_wrong_prior(built, orbit):
     prior, rock = built
     moved = Mesh(prior.mesh.vertices + 0.05 * Z, prior.mesh.faces, prior.mesh.seen)
-    points, truth = prior.points + 0.05 * Z, dataset.root / "rock.glb"
-    error = error_to_truth(points, prior.spacing, moved, truth, dataset, rock, 0)
+    points, truth = prior.points + 0.05 * Z, orbit.root / "rock.glb"
+    error = error_to_truth(points, prior.spacing, moved, truth, orbit, rock, 0)
     assert 0.02 < error["accuracy"] < 0.05
     assert error["hausdorff"] == pytest.approx(0.05, abs=0.02)
 
 
-def test_prior_round_trip_and_determinism(built, dataset, tmp_path):
+def test_prior_round_trip_and_determinism(built, orbit, tmp_path):
     prior = built[0]
-    again = build_prior(dataset, PriorSettings(gaussians=1500, backing=0))
+    again = build_prior(orbit, PriorSettings(gaussians=1500, backing=0))
     assert np.array_equal(prior.points, again.points)
     assert prior.numbers == again.numbers
     loaded = load_prior(save_prior(tmp_path / "prior", prior))
@@ -307,10 +302,10 @@ def test_one_frame_with_depth_gives_what_it_saw(tmp_path):
     assert np.quantile(np.abs(synthetic.level(prior.points)), 0.95) < 0.1
 
 
-def test_error_grows_with_a_coarse_poisson(built, dataset):
+def test_error_grows_with_a_coarse_poisson(built, orbit):
     def error(**options) -> dict[str, float]:
         settings = PriorSettings(gaussians=1500, backing=0, **options)
-        return build_prior(dataset, settings).numbers["truth"]
+        return build_prior(orbit, settings).numbers["truth"]
 
     exact = built[0].numbers["truth"]
     assert exact["chamfer"] < error(poisson_depth=4)["chamfer"]

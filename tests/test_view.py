@@ -1,7 +1,9 @@
-"""The viewer: what it reads and draws, what it refuses, and the whole of it in a real browser."""
+"""The viewer: what it reads and draws, what it refuses, and the whole of it in a real browser.
+Towards strangers: other websites, other machines, hostile names and messages."""
 
 import functools
 import io
+import math
 import re
 import signal
 import socket
@@ -25,9 +27,12 @@ from synthetic import pinhole
 
 from mgs import Camera, Run, evaluate_run, load_dataset, look_at, open_run, render, write_ply
 from mgs.colour import srgb_from_linear
-from mgs.view import layers
+from mgs.view import layers, server
+from mgs.view.access import COOKIE, Access, plain
 from mgs.view.layers import read_subject, scaled
 from mgs.view.server import FILLED, Viewer, window_camera
+
+pytest.importorskip("viser", reason="viser is not installed")
 
 
 def steps(run, budget):
@@ -104,7 +109,6 @@ def test_what_the_kernel_draws(run):
 
 
 def test_a_whole_scene_opens_at_a_camera(run, monkeypatch):
-    pytest.importorskip("viser", reason="viser is not installed")
     monkeypatch.setattr(Run, "of_scene", True)
     with closing(Viewer(run, port=0)) as viewer:
         first, camera = viewer.server.initial_camera, viewer.subject.taken[0].frame.camera
@@ -202,7 +206,6 @@ def viewing(*arguments):
 
 
 def test_a_run_is_followed_from_its_beginning(dataset, prior, tmp_path):
-    pytest.importorskip("viser", reason="viser is not installed")
     tiny.start(tmp_path / "run", load_dataset(dataset), prior=prior, budget=2)
     with closing(Viewer(tmp_path / "run", port=0, follow=True)) as viewer:
         viewer.tick()
@@ -223,7 +226,6 @@ def test_a_run_is_followed_from_its_beginning(dataset, prior, tmp_path):
 
 
 def test_what_a_window_asks_for_during_a_failed_drawing_is_drawn(run, monkeypatch):
-    pytest.importorskip("viser", reason="viser is not installed")
     drawn = []
 
     def draw(client):
@@ -290,7 +292,6 @@ def tick(tab, label, on):
 
 
 def test_the_viewer_in_a_browser(browser, run):
-    pytest.importorskip("viser", reason="viser is not installed")
     subject = read_subject(run)
     camera = start_camera(subject)
     centre = camera.project(subject.gaussians.means)[0].mean(0)
@@ -363,3 +364,105 @@ def test_the_viewer_in_a_browser(browser, run):
         steps(run, 3)
         tab.get_by_text("6 of 7 views").wait_for(timeout=10_000)
         assert wrong == []
+
+
+@pytest.fixture(scope="module")
+def viewer(seeded):
+    with closing(Viewer(seeded, port=0)) as made:
+        yield made
+
+
+def connect(viewer: Viewer, **options):
+    import viser
+    from websockets.sync.client import connect
+
+    versions = [f"viser-v{viser.__version__}"]
+    return connect(f"ws://127.0.0.1:{viewer.port}", subprotocols=versions, **options)
+
+
+def test_no_other_website_gets_a_connection(viewer):
+    from websockets.exceptions import InvalidStatus
+
+    own = f"http://127.0.0.1:{viewer.port}"
+    with connect(viewer, origin=own) as socket:
+        assert socket.recv()
+    for other in ("http://example.org", f"http://127.0.0.1:{viewer.port + 1}", "null"):
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(viewer, origin=other)
+
+
+@pytest.mark.parametrize(
+    ("host", "headers", "answered"),
+    [
+        ("127.0.0.1", {"Host": "localhost:8080"}, True),
+        ("127.0.0.1", {"Host": "[::1]:8080", "Origin": "http://[::1]:8080"}, True),
+        ("127.0.0.1", {"Host": "evil.example:8080"}, False),  # its name now leads to this machine
+        ("127.0.0.1", {}, False),
+        ("0.0.0.0", {"Host": "10.0.0.7:8080"}, False),
+        ("0.0.0.0", {"Host": "10.0.0.7:8080", "Cookie": f"{COOKIE}=guess"}, False),
+    ],
+)
+def test_requests_are_answered_by_host_origin_and_token(host, headers, answered):
+    access = Access(host)
+    assert (access.refusal("/", headers) is None) == answered
+    if access.token:
+        assert access.refusal(f"/?token={access.token}", headers) is None
+        cookie = {**headers, "Cookie": f"{COOKIE}={access.token}"}
+        assert access.refusal("/assets/x.js", cookie) is None
+        assert access.refusal("/", {**cookie, "Origin": "http://example.org"})
+
+
+def test_names_titles_and_errors_are_shown_as_they_are(viewer, monkeypatch):
+    evil = "<iframe srcdoc=x>{1+1}**_`![a](b)"
+    assert not set(plain(evil)) & set("<>{}*_`![]()=+")
+    view = viewer.subject.views[0]
+    monkeypatch.setattr(server, "plain", lambda text: f"PLAIN({text})")
+    viewer.select(view.frame.name)
+    assert f"**PLAIN({view.frame.name})**" in viewer.facts.content
+    viewer._show_views()
+    assert viewer.title.content == f"**PLAIN({viewer.subject.title})**"
+    viewer.select(evil)  # a view that is not there
+    assert view.frame.name in viewer.facts.content
+
+
+BAD = {
+    "fov": (0.0, math.pi, math.nan, -1.0),
+    "image_width": (0, 2**40, -5),
+    "wxyz": (np.zeros(4), np.full(4, np.nan)),
+    "position": (np.full(3, np.inf), np.full(3, 1e300)),
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(k, v) for k, values in BAD.items() for v in values])
+def test_a_camera_that_is_none_is_not_drawn(name, value):
+    good = {"fov": 1.0, "image_width": 32, "image_height": 24}
+    good |= {"wxyz": np.array([1.0, 0, 0, 0]), "position": np.zeros(3)}
+    assert window_camera(SimpleNamespace(**good)) is not None
+    assert window_camera(SimpleNamespace(**good | {name: value})) is None
+
+
+@pytest.mark.parametrize("message", [b"", b"\xff", "text", b"\x81\xa4type\xa4Nope"])
+def test_a_message_of_no_kind_ends_its_connection_alone(viewer, message, capfd):
+    from websockets.exceptions import ConnectionClosed
+
+    own = f"http://127.0.0.1:{viewer.port}"
+    with connect(viewer, origin=own) as socket:
+        socket.send(message)
+        with pytest.raises(ConnectionClosed):
+            list(socket)
+    with connect(viewer, origin=own) as socket:
+        assert socket.recv()
+    assert capfd.readouterr().err == ""
+
+
+def test_no_message_of_a_window_ends_the_server(viewer):
+    class Broken:
+        @property
+        def scene(self):
+            raise RuntimeError("whatever")
+
+    viewer.clients[-1] = server._Client(Broken(), None, 0.0)
+    viewer.layer.value = viewer.layer.options[0]
+    viewer.tick()
+    assert viewer.clients[-1].drawn is not None
+    del viewer.clients[-1]
