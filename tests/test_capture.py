@@ -60,7 +60,6 @@ def root(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def full(root):
-    """The dataset with all its images."""
     return synth_orbit(root / "full", SCENE, TINY, seed=3, test_views=2)
 
 
@@ -78,7 +77,6 @@ def prior(root, full):
 
 @pytest.fixture(scope="module")
 def captured(poses, prior, root):
-    """A run on a copy of the poses."""
     shutil.copytree(poses.root, root / "captured-poses")
     command("nbv", root / "captured-poses", "--prior", prior, "--out", root / "captured", *RUN)
     return root / "captured"

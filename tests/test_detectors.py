@@ -181,7 +181,6 @@ def test_drift_is_in_standard_deviations_of_the_prior():
 
 @pytest.fixture(scope="module")
 def rock(tmp_path_factory):
-    """A dataset of an ellipsoid, with its prior."""
     root = tmp_path_factory.mktemp("rock") / "dataset"
     return synthetic.write_rock(root, synthetic.orbit_cameras(10, 64, 48), 600).root
 
@@ -248,7 +247,6 @@ def test_a_side_that_no_seed_saw_is_no_drift_of_the_exposure(rock, tmp_path):
 
 
 def wrong_pose(frames):
-    """Turn one camera by 3 degrees."""
     camera = frames[2].camera
     pose = camera.world_to_camera.copy()
     pose[:3] = Rotation.from_euler("y", 3, degrees=True).as_matrix() @ pose[:3]
@@ -256,13 +254,11 @@ def wrong_pose(frames):
 
 
 def drifting_exposure(frames):
-    """Make each image 5 % brighter than the one before."""
     for k, frame in enumerate(frames):
         write_png(frame.image_path, frame.rgb() * np.float32(0.6 * 1.05**k))
 
 
 def wide_masks(frames):
-    """Widen all masks far beyond the rock."""
     for frame in frames:
         write_png(frame.mask_path, binary_dilation(frame.mask(), iterations=6))
 

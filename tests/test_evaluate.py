@@ -219,7 +219,6 @@ VIEWS = 5 + 3
 
 @pytest.fixture
 def dataset(tmp_path):
-    """Five frames and three test views."""
     tiny.write_dataset(tmp_path / "dataset/test", 3)
     return tiny.write_dataset(tmp_path / "dataset", 5)
 

@@ -186,7 +186,6 @@ def read_all(path: Path) -> None:
 
 
 def result(path: Path) -> None:
-    """Read the record of a study's cell."""
     result_of(path.parents[2], Cell(path.parent.name, "a:b", {"a": 1}))
 
 

@@ -116,7 +116,6 @@ def test_a_rate_that_is_missing_is_named(cameras, targets):
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory, pristine):
-    """A dataset and a prior on disk."""
     return pristine, tiny.write_prior(tmp_path_factory.mktemp("means") / "prior")
 
 

@@ -49,7 +49,6 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def exact(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    """An orbit with masks and depth."""
     root = tmp_path_factory.mktemp("exact") / "data"
     return synthetic.orbit(root, 24, 96, 72)
 
@@ -109,7 +108,6 @@ def lattice(count: int, radius: float = 3.0) -> list[Camera]:
 
 
 def floating(root: Path, cameras: list[Camera]) -> Dataset:
-    """Images and masks of the rock alone."""
     dataset = synthetic.write_dataset(root, cameras, depth=False)
     for frame in dataset.frames:
         directions = frame.camera.unproject(np.ones((72, 96))) - frame.camera.position

@@ -18,7 +18,6 @@ BACKGROUND = (0.1, 0.2, 0.7)
 
 
 def scene():
-    """(gaussians, camera)."""
     gaussians = make_gaussians(1500, 11, 1, log_scales=(-6.0, -2.5))
     return gaussians, make_camera((200, 150), focal=200.0)
 
