@@ -3,12 +3,11 @@
 import importlib.util
 import json
 import shutil
-import signal
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from program import command, python, steps, stop_at, table_numbers
+from program import command, exit_code, steps, stop_at, table_numbers
 from refusals import fails, listing, refused
 
 from mgs import PriorSettings, build_prior, prior_from_mesh, save_prior
@@ -17,7 +16,7 @@ from mgs.data.dataset import FILES, load_dataset
 from mgs.progress import listening
 from mgs.reports.tables import table_columns
 from mgs.run.inputs import prior_digest
-from mgs.synth import arena, rendering
+from mgs.synth import rendering
 from mgs.synth.capture import capture_of
 from mgs.synth.rendering import PoseNoise, RenderPreset, synth_orbit
 from mgs.synth.scene_file import Arena, Rock, SceneFile
@@ -28,28 +27,6 @@ SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=0))
 TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 0\n"
 RUN = ["--seeds", "3", "--budget", "3", "--set", "train.passes=3", "--set", "evaluate_every=1"]
 RUN += ["--seed", "1"]
-KILLED = """
-import os, signal
-from mgs import runtime
-from mgs.cli.app import main
-
-runtime.start()
-from mgs.synth import arena, rendering
-
-arena.ROWS, arena.TEXELS = {rows}, {texels}
-write, written = rendering.write_png, []
-
-def write_or_die(path, image):
-    written.append(path)
-    if len(written) == 8:
-        os.kill(os.getpid(), signal.SIGKILL)
-    write(path, image)
-
-rendering.write_png = write_or_die
-main()
-"""
-"""The program; it kills itself before it writes the eighth PNG file (mask or image)."""
-
 pytestmark = pytest.mark.usefixtures("coarse_arena", "coarse_priors")
 
 
@@ -200,12 +177,12 @@ def test_a_frame_that_was_never_chosen_has_no_image(captured):
         fails(message, read)
 
 
-def test_killed_while_it_captures_and_resumed(captured, prior, fresh, tmp_path):
-    """In the second PNG file of the first chosen view."""
-    out, program = tmp_path / "run", KILLED.format(rows=arena.ROWS, texels=arena.TEXELS)
-    arguments = ["nbv", fresh.root, "--prior", prior, "--out", out, *RUN]
-    process = python(program, *arguments)
-    assert process.returncode == -signal.SIGKILL, process.stderr
+def test_interrupted_while_it_captures_and_resumed(captured, prior, fresh, tmp_path, monkeypatch):
+    """Before the second PNG file of the first chosen view, which is the eighth."""
+    out, write, struck = tmp_path / "run", rendering.write_png, stop_at(8)
+    with monkeypatch.context() as patched:
+        patched.setattr(rendering, "write_png", lambda *image: (struck(), write(*image)))
+        assert exit_code("nbv", fresh.root, "--prior", prior, "--out", out, *RUN) == 130
     finished = [frame for frame in fresh.frames if rendering.is_done(frame)]
     done = {path: path.stat().st_mtime_ns for frame in finished for path in files(frame)}
     assert len(done) == 4 * 3

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 import synthetic
-from program import command, python, said, steps, timeless
+from program import command, exit_code, said, steps, stop_at, timeless
 
-from mgs import ListCache, initial_gaussians, load_dataset, load_prior, read_ply
+from mgs import ListCache, initial_gaussians, load_dataset, load_prior, read_ply, scene
 from mgs.cli import app, demo, terminal
 from mgs.cli.app import COMMANDS, main
 from mgs.evaluation import psnr_measure
@@ -18,29 +18,6 @@ from mgs.synth.rendering import write_contact_sheet
 pytestmark = pytest.mark.usefixtures("coarse_priors")
 
 VIEWS = ["--seeds", "3", "--budget", "4", "--set", "train.passes=6", "--seed", "1"]
-STRUCK = """
-import os, signal
-from mgs import scene
-from mgs.cli.app import main
-
-fit, fits = scene.fit_gaussians, []
-
-def interrupted(gaussians, cameras, targets, settings, on_pass, *rest):
-    fits.append(len(cameras))
-
-    def interrupt(done, most, model):
-        on_pass(done, most, model)
-        if len(fits) == 3:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    return fit(gaussians, cameras, targets, settings, interrupt, *rest)
-
-scene.fit_gaussians = interrupted
-# A shell lets its background processes ignore this signal.
-signal.signal(signal.SIGINT, signal.default_int_handler)
-main()
-"""
-"""The program; it interrupts itself between two passes of the fit of its third step."""
 
 
 @pytest.fixture(scope="module")
@@ -86,14 +63,22 @@ def test_a_fit_shows_a_view_before_its_end(dataset, run, tmp_path, capsys, monke
     assert "reading: 3 of 10" in said(capsys)[1]
 
 
-def test_interrupted_in_the_middle_of_a_step_then_resumed(dataset, run, tmp_path):
-    out = tmp_path / "run"
-    arguments = ["nbv", dataset, "--out", out, "--prior", run / "prior", *VIEWS]
-    process = python(STRUCK, *arguments, "--set", "evaluate_every=2")
-    assert process.returncode == 130, process.stderr
-    last = process.stderr.splitlines()[-1]
-    assert last == f"mgs: interrupted; continue with: mgs nbv --resume {out}"
-    assert "Traceback" not in process.stderr
+def test_interrupted_in_the_middle_of_a_step_then_resumed(
+    dataset, run, tmp_path, capsys, monkeypatch
+):
+    """Between two passes of the fit of its third step."""
+    out, fit, fits = tmp_path / "run", scene.fit_gaussians, []
+
+    def interrupted(gaussians, cameras, targets, settings, on_pass, *rest):
+        fits.append(len(cameras))
+        on_pass = stop_at(2) if len(fits) == 3 else on_pass
+        return fit(gaussians, cameras, targets, settings, on_pass, *rest)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(scene, "fit_gaussians", interrupted)
+        arguments = ["nbv", dataset, "--out", out, "--prior", run / "prior", *VIEWS]
+        assert exit_code(*arguments, "--set", "evaluate_every=2") == 130
+    assert said(capsys)[1].endswith(f"mgs: interrupted; continue with: mgs nbv --resume {out}")
     assert len(steps(out)) == 2
     command("nbv", "--resume", out)
     assert timeless(steps(out)) == timeless(steps(run))

@@ -16,7 +16,6 @@ import pytest
 from distributed import LocalCluster
 from refusals import fails
 
-from mgs.errors import InputError
 from studies.frame import program, sweep
 from studies.frame.program import names_of
 from studies.frame.sweep import Cell, cell_folder, result_of, run_cells
@@ -187,42 +186,37 @@ def test_a_scheduler_whose_workers_will_not_do_is_one_clear_line(
         fails(fault, run_cells, tmp_path, [cell("a", x=1)], silent, **place)
 
 
-SLEEP = Cell("sleep", "test_sweep:sleep")
-
-
 def sleep(root, out):
     """A task that outlives its scheduler."""
     time.sleep(3)
     return {}
 
 
+HOST = """
+from distributed import LocalCluster
+options = {"processes": False, "host": "127.0.0.1", "protocol": "tcp://"}
+with LocalCluster(1, threads_per_worker=1, dashboard_address="127.0.0.1:0", **options) as cluster:
+    print(cluster.scheduler_address, flush=True)
+    input()
+"""
+
+
 def test_a_lost_scheduler_is_one_line(tmp_path, caplog):
-    place = tmp_path / "scheduler.json"
-    file, here = ["--scheduler-file", place], {"PYTHONPATH": os.pathsep.join(sys.path)}
-    of_scheduler = ["scheduler", *file, "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
-    of_worker = ["worker", *file, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
-    options = {"env": os.environ | here, "stderr": subprocess.DEVNULL}
-    begun = [sys.executable, "-m"]
-    scheduler, worker = (
-        subprocess.Popen([*begun, f"distributed.cli.dask_{name}", *rest], **options)
-        for name, *rest in (of_scheduler, of_worker)
-    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen([sys.executable, "-c", HOST], text=True, env=env, **pipes)
 
     def lose():
         while not (tmp_path / "cells/sleep").exists():
             time.sleep(0.05)
-        scheduler.kill()
+        process.kill()
 
-    thread = threading.Thread(target=lose, daemon=True)
+    threading.Thread(target=lose, daemon=True).start()
+    place = {"scheduler": process.stdout.readline().strip()}
+    cells = [Cell("sleep", "test_sweep:sleep")]
     try:
-        while not place.is_file():
-            time.sleep(0.05)
-        thread.start()
-        address = json.loads(place.read_text())["address"]
-        with pytest.raises(InputError, match="the connection to the Dask scheduler is lost"):
-            run_cells(tmp_path, [SLEEP], silent, scheduler=address)
+        fails("the connection to the Dask .* is lost", run_cells, tmp_path, cells, silent, **place)
     finally:
-        for process in (scheduler, worker):
-            process.kill()
-            process.wait()
+        process.kill()
+        process.communicate()
     assert [one.name for one in caplog.records if one.name == "distributed.client"] == []
