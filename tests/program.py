@@ -89,14 +89,19 @@ def change_settings(run: Path, **values) -> None:
     (run / "config.json").write_text(json.dumps(config))
 
 
+def change_checkpoint(path: Path, record: Callable[[dict], object] = dict, **arrays) -> None:
+    """Change a checkpoint.npz: its text by a function, and arrays; those that are None go."""
+    with np.load(path) as data:
+        known = json.loads(str(data["json"]))
+        record(known)
+        arrays = dict(data) | {"json": np.array(json.dumps(known))} | arrays
+    np.savez(path, **{name: values for name, values in arrays.items() if values is not None})
+
+
 def change_steps(run: Path, change: Callable[[list[dict]], list[dict]], **record) -> None:
     """Change the steps of a run, in its checkpoint and in steps.jsonl. record: other values of the
     checkpoint's text."""
-    with np.load(run / "checkpoint.npz") as data:
-        arrays = dict(data)
-    known = json.loads(str(arrays["json"]))
-    known |= {"steps": change(known["steps"]), **record}
-    arrays["json"] = np.array(json.dumps(known))
-    np.savez(run / "checkpoint.npz", **arrays)
-    lines = [json.dumps(line) + "\n" for line in known["steps"]]
-    (run / "steps.jsonl").write_text("".join(lines))
+    made = change(steps(run))
+    values = {"steps": made, **record}
+    change_checkpoint(run / "checkpoint.npz", lambda known: known.update(values))
+    (run / "steps.jsonl").write_text("".join(json.dumps(line) + "\n" for line in made))

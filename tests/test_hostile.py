@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import synthetic
 import tiny
-from program import command, output
+from program import change_checkpoint, command, output
 from refusals import fails, listing, refused
 
 from mgs import InputError, files, load_dataset, write_ply
@@ -121,24 +121,12 @@ def stranger(seeded, tmp_path):
 
 def members(**changed: object):
     """Damage of a checkpoint: with other arrays, None to leave one out."""
-
-    def damage(path: Path) -> None:
-        with np.load(path) as data:
-            arrays = {name: data[name] for name in data.files} | changed
-        np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
-
-    return damage
+    return lambda path: change_checkpoint(path, **changed)
 
 
 def record(**changed: object):
     """Damage of a checkpoint: with other entries of its JSON."""
-
-    def damage(path: Path) -> None:
-        with np.load(path) as data:
-            known = json.loads(str(data["json"]))
-        members(json=np.array(json.dumps(known | changed)))(path)
-
-    return damage
+    return lambda path: change_checkpoint(path, lambda known: known.update(changed))
 
 
 def zip_bomb(path: Path) -> None:

@@ -4,6 +4,7 @@ import json
 
 import pytest
 import tiny
+from program import change_settings
 from refusals import fails, refused
 
 import mgs
@@ -186,13 +187,10 @@ def test_a_run_folder_runs_no_program_that_was_not_named(dataset, file, tmp_path
     start_run(dataset, out, prior=prior, policy=f"{file}:poses", budget=2, seeds=3)
     evil, proof = tmp_path / "evil.py", tmp_path / "proof"
     evil.write_text(f"open({str(proof)!r}, 'w')\ndef f(candidates): return [1] * len(candidates)\n")
-    config = json.loads((out / "config.json").read_text())
-    config["settings"]["policy"] = f"{evil}:f"
-    (out / "config.json").write_text(json.dumps(config))
+    change_settings(out, policy=f"{evil}:f")
     for options in ([], ["--policy", f"{file}:poses"]):
         said = refused(capsys, ["nbv", "--resume", out, *options], tmp_path)
         assert f"{evil}:f" in said
     assert not proof.exists()
-    config["settings"]["policy"] = f"{file}:poses"
-    (out / "config.json").write_text(json.dumps(config))
+    change_settings(out, policy=f"{file}:poses")
     assert len(mgs.resume_nbv(out, policy=f"{file}:poses").state.taken) == 5

@@ -12,7 +12,7 @@ import tiny
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from plyfile import PlyData
-from program import command
+from program import change_checkpoint, command
 from refusals import fails
 
 import mgs
@@ -115,12 +115,7 @@ def test_a_scene_of_two_worlds_is_refused(runs):
 
 def test_a_tilted_run_of_an_older_version_is_refused(runs, tmp_path):
     folder = shutil.copytree(runs[1], tmp_path / "run")
-    path = folder / "checkpoint.npz"
-    with np.load(path) as data:
-        arrays = dict(data)
-    record = json.loads(str(arrays["json"][()]))
-    del record["upright"]
-    np.savez(path, **arrays | {"json": np.array(json.dumps(record))})
+    change_checkpoint(folder / "checkpoint.npz", lambda record: record.pop("upright"))
     fails("older mgs", getattr, open_run(folder), "state")
 
 
