@@ -1,18 +1,13 @@
-"""Statistics of studies against known answers and brute force; tables; the rows of the pages."""
+"""Statistics of studies, against known answers and brute force; tables and plots."""
 
-from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from studies import all as every
-from studies import fits, setups
-from studies.frame.case import FRESH
-from studies.frame.output import grouped, read_rows, scene_mean, table, tables_of, with_interval
+from studies.frame.output import grouped, scene_mean, table, with_interval
 from studies.frame.statistics import (
     MOST_ROCKS,
     holm,
@@ -20,7 +15,6 @@ from studies.frame.statistics import (
     pareto_front,
     permutation_p,
 )
-from studies.frame.sweep import run_cells
 
 numbers = st.floats(-10, 10, allow_nan=False).map(lambda x: round(x, 3))
 
@@ -84,40 +78,3 @@ def test_means_are_over_scenes():
     assert scene_mean("x", ".1f", ends=False)(group) == "4.0"  # 3 and 5
     assert scene_mean("x", ".1f")(group).startswith("4.0 [-8.7, 16.7")
     assert scene_mean("x", ".1f")({"of": [*rows, {"scene": "c", "x": None}]}) == "–"
-
-
-RESULTS = Path(__file__).parent.parent / "docs/results"
-
-
-def test_tables_of_pages_are_of_their_rows(tmp_path):
-    shown = tables_of(RESULTS / "fits/fits.csv")[1].splitlines()
-    assert shown[0].startswith("| changed | hemisphere, 12 |")
-    gains = [row["test_change"] for row in read_rows(RESULTS / "fits/fits.csv")
-             if row["variant"] == "--sh 1" and row["pool"] == "hemisphere, 4"]  # fmt: skip
-    (line,) = (line for line in shown if line.startswith("| --sh 1 |"))
-    assert f"| {sum(gains) / len(gains):+.2f} [" in line
-    assert every.compared(RESULTS / "fits/fits.csv", RESULTS / "fits/fits.csv") == (408, [0] * 2448)
-
-
-@pytest.mark.slow
-def test_two_rows_of_the_pages_are_those_of_this_commit(tmp_path):
-    """Fits to 12 and to 4 even views of a fresh rock, from its rendering on. A change that moves
-    them moves the pages: `make results`."""
-    size = replace(setups.SIZES["quick"], rocks=FRESH[:1])
-    cells = {cell.name: cell for cell in fits.cells_of(size)}
-    chosen = [
-        cell
-        for cell in cells.values()
-        if cell.about.get("variant") == fits.DEFAULT and "hemisphere" in cell.about["pool"]
-    ]
-    for cell in chosen:
-        chosen += [cells[name] for name in cell.needs if cells[name] not in chosen]
-    results = run_cells(tmp_path, chosen, lambda *what: None)
-    rows = {
-        (row["rock"], row["pool"]): row
-        for row in read_rows(RESULTS / "fits/fits.csv")
-        if row["variant"] == fits.DEFAULT
-    }
-    for cell in (cell for cell in chosen if cell.about):
-        row = rows[cell.about["rock"], cell.about["pool"]]
-        assert results[cell.name]["test"] == pytest.approx(row["test"], abs=0.01)
