@@ -71,30 +71,18 @@ def flat(vector):
     return np.concatenate([np.asarray(v).ravel() for v in vector])
 
 
-def test_the_value_is_half_the_squared_residuals_plus_the_prior(case):
-    goal, model, _, residual, weight, lam, away = case
+def test_value_gradient_and_diagonals_are_those_of_the_reference(case):
+    goal, model, J, residual, weight, lam, away = case
     phi = 0.5 * ((weight * residual) ** 2).sum() + 0.5 * (lam * away**2).sum()
     assert goal.phi(model) == pytest.approx(phi, rel=1e-5)
-
-
-def test_the_gradient_is_that_of_the_oracle(case):
-    goal, model, J, residual, weight, lam, away = case
-    expected = J.T @ (weight * residual) + lam * away
-    assert np.allclose(flat(goal.gradient(model)), expected, atol=1e-4 * np.abs(expected).max())
-
-
-def test_the_diagonal_is_that_of_jtj_plus_lam(case):
-    goal, model, J, _, _, lam, _ = case
-    expected = (J**2).sum(0) + lam
-    assert np.allclose(flat(goal.diagonal(model)), expected, rtol=1e-3, atol=1e-5 * expected.max())
-
-
-def test_the_largest_diagonal_is_that_of_one_image(case):
-    goal, model, J, _, _, lam, _ = case
+    gradient = J.T @ (weight * residual) + lam * away
+    assert np.allclose(flat(goal.gradient(model)), gradient, atol=1e-4 * np.abs(gradient).max())
+    whole = (J**2).sum(0) + lam
     each = (J.reshape(2, -1, J.shape[1]) ** 2).sum(1)  # two images
-    expected = each.max(0) + lam / 2
-    found = flat(goal.largest_diagonal(model))
-    assert np.allclose(found, expected, rtol=1e-3, atol=1e-5 * expected.max())
+    diagonals = (goal.diagonal, whole), (goal.largest_diagonal, each.max(0) + lam / 2)
+    for found, expected in diagonals:
+        close = {"rtol": 1e-3, "atol": 1e-5 * expected.max()}
+        assert np.allclose(flat(found(model)), expected, **close)
 
 
 UNSEEN = np.zeros((20, 24, 4), np.float32)
