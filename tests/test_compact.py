@@ -54,37 +54,6 @@ def change(a, b) -> float:
     return float(sum(np.square(x - y).sum() for x, y in pairs))
 
 
-def by_recursion(codes: list[int], values: np.ndarray, bit: int, cut: int):
-    """Slow transform of one node: coefficients by (level, code of the left child), and the sum that
-    goes on to the parent, with its number of cells (of nodes above the cut)."""
-    if bit == 0:
-        return {}, (values[0], 1)
-    middle = next((k for k, c in enumerate(codes) if c >> (bit - 1) & 1), len(codes))
-    found, sums = {}, []
-    for part in (slice(0, middle), slice(middle, None)):
-        if len(codes[part]):
-            inner, low = by_recursion(codes[part], values[part], bit - 1, cut)
-            found |= inner
-            if bit - 1 == cut:
-                low = low[0] / low[1] ** 0.5, 1
-            sums.append(low)
-    if len(sums) == 1:
-        return found, sums[0]
-    (a, m), (b, n) = sums
-    root = (m + n) ** 0.5
-    found[bit, codes[0]] = (m**0.5 * b - n**0.5 * a) / root
-    return found, ((m**0.5 * a + n**0.5 * b) / root, m + n)
-
-
-def test_the_transform_is_that_of_a_recursion():
-    codes = scattered(60)
-    values = np.random.default_rng(1).normal(size=(60, 2))
-    tree = tree_of(codes, 9, 2)
-    found, (last, _) = by_recursion(codes.tolist(), values, DEPTH, 9)
-    inner = [found[key] for key in sorted(found)]
-    np.testing.assert_allclose(tree.forward(values), [*inner, last], atol=1e-12)
-
-
 def test_the_transform_has_an_inverse_and_an_adjoint():
     tree, rng = tree_of(scattered(500), 9, 3), np.random.default_rng(2)
     x, g = rng.normal(size=(2, 500, 3))
