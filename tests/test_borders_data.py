@@ -11,7 +11,7 @@ import synthetic
 from PIL import Image
 from program import command, said
 from refusals import fails, refused
-from test_recordings import write_bag, write_open3d, write_rtabmap
+from test_recordings import write_bag, write_metashape, write_open3d, write_rtabmap
 
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset, write_transforms
@@ -355,25 +355,21 @@ def test_dark_pictures_of_12_bits_are_noticed(data, capsys):
 
 
 def test_cameras_of_metashape_that_are_disabled_are_left_out(data, tmp_path):
-    camera, rows = data.frames[0].camera, ""
-    for k, frame in enumerate(data.frames):
-        words = " ".join(map(repr, frame.camera.camera_to_world.ravel().tolist()))
-        state = ' enabled="false"' if k in (2, 7) else ""
-        rows += f'<camera id="{k}" sensor_id="0" label="{frame.name}"{state}>'
-        rows += f"<transform>{words}</transform></camera>"
-    rows += '<camera id="9" sensor_id="0" label="../../up"><transform>'
-    rows += f"{' '.join(map(repr, np.eye(4).ravel().tolist()))}</transform></camera>"
-    inner = f'<resolution width="32" height="24"/><f>{camera.K[0, 0]}</f><k1>0.05</k1><p1>.001</p1>'
-    lens = f'<calibration type="fisheye" class="adjusted">{inner}</calibration>'
-    path = data.root / "cameras.xml"
-    path.write_text(
-        f'<document><chunk><sensors><sensor id="0" type="fisheye">{lens}</sensor></sensors>'
-        f"<cameras>{rows}</cameras></chunk></document>"
-    )
+    path, camera = write_metashape(tmp_path / "m", data), data.frames[0].camera
+    still = " ".join(map(repr, np.eye(4).ravel().tolist()))
+    above = f'<camera id="50" sensor_id="0" label="../../up"><transform>{still}</transform>'
+    text = path.read_text().replace("</cameras>", f"{above}</camera></cameras>")
+    for k in (2, 7):
+        text = text.replace(f'<camera id="{k}"', f'<camera id="{k}" enabled="false"')
+    text = text.replace("</f>", "</f><k1>0.05</k1><p1>.001</p1>").replace('"frame"', '"fisheye"')
+    path.write_text(text)
     source = read_source(path)
     assert len(source.shots) == 10
     assert source.left_out["disabled"] == 2
     assert errors(data, source.shots).max() < 1e-9
+    path.write_text(text.replace("<transform><scale>2</scale></transform>", ""))
+    small = read_source(path).shots[0].camera.position
+    assert np.allclose(2 * small, source.shots[0].camera.position), "lengths without a scale"
     assert source.shots[0].lens.model == "THIN_PRISM_FISHEYE"
     point = np.array([[0.3, 0.2, 1.0]])
     theta = np.arctan(np.hypot(0.3, 0.2))
