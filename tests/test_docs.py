@@ -154,6 +154,21 @@ def test_every_command_line_is_one(page):
     assert {line: problem for line, problem in wrong.items() if problem} == {}
 
 
+def test_every_option_that_a_page_names_is_one():
+    """Of code that begins with --, in a sentence: `--dome N`."""
+    parsers = [study_of(path.stem).parser() for path in (ROOT / "studies").glob("[!_]*.py")
+               if "STUDY" in path.read_text()]  # fmt: skip
+    known = {name for parser in parsers for name in parser._option_string_actions}
+    for command in COMMANDS.values():
+        known |= {name for one in command.params for name in (*one.opts, *one.secondary_opts)}
+    named = {
+        (page.stem, name)
+        for page in PAGES
+        for name in re.findall(r"`(--[\w-]+)", page.read_text(encoding="utf-8"))
+    }
+    assert {(page, name) for page, name in named if name not in known} == set()
+
+
 HOWTO = sorted((ROOT / "docs/howto").glob("*.md"))
 
 

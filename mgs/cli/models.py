@@ -13,7 +13,7 @@ from mgs.files import below, check_new_file, folder_locked, working_in
 from mgs.policy.criteria import LEARN_LOSS, PRUNE_NOISE
 
 NOISE = (
-    "Of prune: allowed change of the training images, rms of a pixel, linear RGB. "
+    "Of prune: allowed change of the training images, rms of a pixel value. "
     f"Default: {PRUNE_NOISE}."
 )
 LOSS = f"Of refit: allowed rise of the objective, dB. Default: {LEARN_LOSS}."

@@ -50,8 +50,7 @@ def render(
     - cameras: transforms.json (nerfstudio), or the dataset folder that holds it. Default: the
       run's.
     - width: Width in pixels; the height follows. Default: the cameras' own.
-    - colour_space: Space in which the colours are blended: mgs trains in linear RGB, most other
-      tools in sRGB. auto: what the file says, else srgb.
+    - colour_space: Space in which the colours are blended. auto: what the file says, else srgb.
     - antialiased: Whether Gaussians that are smaller than a pixel are fainter. Default: what the
       file says, else not.
     - background R G B: Colour behind the Gaussians, sRGB, each from 0 to 1. Default: black.
@@ -147,8 +146,8 @@ def export(
       smaller than ply; mgs (default with --bytes or --psnr, which it needs): as few bytes as a link
       allows. nerfstudio, colmap: the run's views, a folder to train on.
     - out: File to write. Default: export.* in the run; for a file, beside it.
-    - colour_space: Colours to write: sRGB, as viewers expect, or linear RGB, as they were fitted.
-      Those of a linear run are fitted once more, blended in sRGB.
+    - colour_space: Colours to write: sRGB, as viewers expect (those of a linear run are fitted once
+      more), or linear RGB, of linear models.
     - sh: Raise the SH degree, for programs that read degree 3 only.
     - views: Views of nerfstudio and colmap: those taken, or all.
     - most N|Nk|NM: Write the best model of a run of at most so many bytes, as in 40k. Formats other

@@ -27,7 +27,7 @@ def removal_cost(
     gaussians: Gaussians, cameras: Sequence[Camera], background: Any = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
     """Squared change of the images when one Gaussian is removed, summed over the cameras: float64
-    [N], (linear RGB)².
+    [N], (pixel value)².
 
     It is sum alpha² |D|² over pixels (docs/notation.md), exact because a pixel is affine in each
     alpha. It ignores thresholds: Gaussians too deep to be drawn (TRANSMITTANCE_MIN) may appear.
@@ -48,7 +48,7 @@ class Pruned:
     """Result of `prune`."""
 
     kept: np.ndarray  # indices of the remaining Gaussians [M]
-    noise: float  # allowed rms change of pixel values, linear RGB
+    noise: float  # allowed rms change of pixel values
     predicted: float  # rms change, by `removal_cost`
     actual: float  # as measured
 
@@ -57,7 +57,7 @@ def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float) -> Prun
     """Remove as many Gaussians as the noise allows, those that change the images least.
 
     noise: allowed rms change of the pixel values that the model covers (each counts by its alpha),
-    linear RGB.
+    in the space in which it is blended.
 
     The predicted change of a set is the sum of `removal_cost`, as if its members did not overlap.
     For this to be nearly true, a round removes no two of NEIGHBOURS. After each round the change
@@ -66,7 +66,7 @@ def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float) -> Prun
     `render`, and if the noise is not positive.
     """
     if not 0 < noise < 1e9:
-        raise InputError(f"prune: noise {noise} must be positive, linear RGB; correct `noise`")
+        raise InputError(f"prune: noise {noise} must be positive; correct `noise`")
     before, covered = _images(gaussians, cameras)
     indices, predicted, actual, budget = np.arange(len(gaussians)), 0.0, 0.0, noise**2 * covered
     for _ in range(ROUNDS):

@@ -109,7 +109,7 @@ class ModelSettings(Frozen):
     lam: Annotated[float, Field(ge=1e-30, le=1e30, allow_inf_nan=False)] | None = None
     """One lambda for all parameters, as in the paper. Default: (pixel noise / prior std)^2."""
     pixel_noise: Scale = PIXEL_NOISE
-    """Standard deviation of a pixel's residual, linear RGB; sets lambda, the regularisation."""
+    """Standard deviation of a pixel value's residual; sets lambda, the regularisation."""
     prior_std: dict[str, Scale] = PRIOR_STD
     """Prior standard deviation by kind of parameter; `mean`, in metres, only if means move."""
     warm_passes: Annotated[int, Field(ge=1)] = WARM_PASSES

@@ -11,8 +11,8 @@ Array = NDArray[np.floating]
 Score = Callable[[Array, Array, Array], float]
 """(F [N,P], H [N,P], lam [P]) -> score of one candidate."""
 
-PIXEL_NOISE = 0.02  # sigma_e, std of a pixel's residual, linear RGB (34 dB); chosen
-PRUNE_NOISE = PIXEL_NOISE / 5  # rms change by `mgs simplify`, linear RGB: about 0.1 dB; chosen
+PIXEL_NOISE = 0.02  # sigma_e, std of a pixel value's residual (34 dB); chosen
+PRUNE_NOISE = PIXEL_NOISE / 5  # rms change by `mgs simplify`: about 0.1 dB; chosen
 DIRECTIONAL_STD = 0.03  # tau of colours of degrees above 0: rocks look alike from all sides
 LEARN_LOSS = 0.5  # rise of the objective, dB, that a refit may cause (docs/parsimony.md)
 
