@@ -2,9 +2,8 @@
 
 Each rock is fitted with several numbers of Gaussians. Every coder writes each model: whole, pruned
 as by `mgs simplify`, and with 1/2 to 1/16 of its Gaussians, fitted once more as by `mgs export
---bytes`. With the mesh mgs writes the whole one alone, without it all but that. A coder is judged
-by the best of its files at each size. What files do not say, as the space of colours, is added when
-they are read back, so only the coding differs.
+--bytes`. A coder is judged by the best of its files at each size. What files do not say, as the
+space of colours, is added when they are read back, so only the coding differs.
 """
 
 import io
@@ -15,6 +14,7 @@ from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from mgs.colour import srgb_from_linear
 from mgs.errors import Notice
 from mgs.evaluation import render_view
 from mgs.plotting import NO_GRID, crop, drawing
-from mgs.reports.compacting import compact_run, encoders
+from mgs.reports.compacting import compact_run, encoding, thinned
 from mgs.run.folder import Run
 from mgs.run.nbv import start_fit
 from mgs.splat_files import FORMATS, load_gaussians, write_gaussians
@@ -39,7 +39,7 @@ from studies.frame.sweep import Cell
 WITH, ALONE, JPEG, SOG = "mgs, mesh at the receiver", "mgs", "JPEG, fitted at home", "SOG"
 OTHERS = {"SPZ": "spz", "compressed PLY": "compressed-ply"}
 
-SCALES = (0.01, 0.03, 0.08, 0.2)
+SCALES = (0.02, 0.05, 0.12, 0.3)
 """Scales of the steps (`mgs.compact.encode.Encoder.file`)."""
 
 QUALITIES = (50,)
@@ -101,16 +101,16 @@ def code(root: Path, out: Path, dataset: str, prior: str, tool: str) -> dict[str
     """Task: fit a model; write it by every coder. Returns the rows of its files."""
     run, data = fitted(root, out, dataset, prior), mgs.load_dataset(root / dataset)
     g, rows = run.gaussians, [_row("whole model", 0, run.gaussians, data)]
-    models = [g]
+    models = [(g, np.arange(len(g))), *thinned(run, whole=False)]
     for name, shared in ((WITH, True), (ALONE, False)):
-        for encoder in encoders(run, shared):
-            models += [] if shared else [encoder.g]
+        encoder = encoding(run, shared)
+        for one in starmap(encoder, models):
             for scale in SCALES:
-                file = encoder.file(scale)
+                file = one.file(scale)
                 rows.append(_row(name, len(file), file.model, data) | {"scale": scale})
     # Not every format says in which space colours are blended, or that splats are antialiased.
     marks = partial(replace, linear=g.linear, antialiased=g.antialiased)
-    for model in models:
+    for model, _ in models:
         paths = {coder: out / f"model{FORMATS[kind]}" for coder, kind in OTHERS.items()}
         for coder, path in paths.items():
             write_gaussians(path, model, OTHERS[coder], np.eye(3))

@@ -7,13 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from mgs.compact.columns import groups
-from mgs.compact.container import FINER, Key
+from mgs.compact.coder import FINER, LARGEST
+from mgs.compact.container import Key
 from mgs.compact.tree import BANDS
 
-# Cost of an error over that of an independent one of its size. A fit moves neighbours together, so
-# what is left out of them adds up. Measured on the demo's boulder.
-COHERENCE = {"colour": 1.75, "directional": 1.75, "scale": 7, "rotation": 14, "opacity": 14}
 ROUND = 0.35  # added before magnitudes are cut to whole steps: below 1/2, since zeros are cheap
 FLOOR = 1e-12  # least share of a column's largest h: steps stay finite where no image shows a thing
 
@@ -33,33 +30,19 @@ def sensitivity(gradients: np.ndarray, band: np.ndarray) -> np.ndarray:
     return np.asarray(np.maximum(h, FLOOR * h.max(0)) + 1e-30)
 
 
-def coherence(coefficients: int) -> np.ndarray:
-    """COHERENCE by column [C], for K colour coefficients."""
-    of = groups(coefficients)
-    return np.concatenate([np.full(of[k].stop - of[k].start, v) for k, v in COHERENCE.items()])
-
-
 def rounded(values: np.ndarray, steps: np.ndarray, layers: int) -> list[np.ndarray]:
-    """Whole numbers of steps [N,C] for each layer, whose steps are FINER times finer than those of
-    the layer before: each codes what the ones before leave. steps: those of the last layer."""
-    parts = []
-    for layer in range(layers):
-        step = steps * FINER ** (layers - 1 - layer)
-        part = np.sign(values) * np.floor(np.abs(values) / step + ROUND)
-        parts.append(part.astype(np.int64))
-        values = values - part * step
-    return parts
+    """Whole numbers of steps [N,C] for each layer: those of the last, without their last digits to
+    base FINER. steps: those of the last layer."""
+    signs, whole = np.sign(values), np.floor(np.abs(values) / steps + ROUND)
+    most = np.minimum(whole, LARGEST).astype(np.int64)
+    parts = [most // FINER ** (layers - 1 - layer) for layer in range(layers)]
+    return [signs.astype(np.int64) * part for part in parts]
 
 
-def gain(
-    values: np.ndarray, parts: list[np.ndarray], steps: np.ndarray, h: np.ndarray
-) -> np.ndarray:
-    """Decrease of the expected error by each layer, [layers,N,C]: sum of h times the squares of
-    what is not coded."""
-    layers, errors = len(parts), [h * np.square(values)]
-    for layer, part in enumerate(parts):
-        values = values - part * steps * FINER ** (layers - 1 - layer)
-        errors.append(h * np.square(values))
+def gain(values: np.ndarray, shown: list[np.ndarray], h: np.ndarray) -> np.ndarray:
+    """Decrease of the expected error by each layer, [layers,N,C]. shown: values [N,C] that a reader
+    of the layers up to each one has. h: squared change of the images by a unit [N,C]."""
+    errors = [h * np.square(values - part) for part in [np.zeros_like(values), *shown]]
     return np.stack([a - b for a, b in pairwise(errors)])
 
 

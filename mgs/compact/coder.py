@@ -11,6 +11,7 @@ from mgs.errors import InputError, missing
 Stream = Callable[[np.ndarray, Any], np.ndarray]
 """(symbols, probability model) -> the symbols: those given, or as many that are read."""
 
+FINER = 4  # steps of a layer over those of the next
 CLASSES = 21  # numbers of bits of a magnitude: 0 to 20
 LARGEST = (1 << (CLASSES - 1)) - 1  # largest magnitude that is coded
 FIRST_BLOCK, LAST_BLOCK = 32, 4096  # symbols coded with the same probabilities, doubled to the last
@@ -64,15 +65,26 @@ def adaptive(stream: Stream, symbols: np.ndarray, counts: np.ndarray) -> np.ndar
     return result
 
 
-def integers(stream: Stream, values: np.ndarray) -> np.ndarray:
-    """Code integers [n,C] of magnitudes up to LARGEST, column by column. The number of bits of a
-    magnitude is coded adaptively, separately for rows in which an earlier column is not 0; then
-    sign and lower bits as they are."""
+def flag(stream: Stream, value: bool) -> bool:
+    """Code one bit."""
+    return bool(stream(np.array([value], np.int64), _library().model.Uniform(2))[0])
+
+
+def integers(stream: Stream, values: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Code integers [n,C] of magnitudes up to LARGEST, column by column, of which before [n,C] are
+    known: the magnitudes without their last digit to base FINER, and signs. Where that is not 0,
+    the digit is coded adaptively. Elsewhere the number of bits of a magnitude is, separately for
+    rows in which an earlier column is not 0; then sign and lower bits as they are."""
     result = np.zeros(values.shape, np.int64)
     uniform = _library().model.Uniform
     for column in range(values.shape[1]):
+        known = before[:, column] != 0
+        least = FINER * np.abs(before[known, column])
+        digits = np.abs(values[known, column]) - least
+        digits = adaptive(stream, digits, 0.5 ** np.arange(FINER))
+        result[known, column] = np.sign(before[known, column]) * (least + digits)
         busy = (result[:, :column] != 0).any(1)
-        for rows in (np.flatnonzero(busy), np.flatnonzero(~busy)):
+        for rows in (np.flatnonzero(~known & busy), np.flatnonzero(~known & ~busy)):
             part = values[rows, column]
             classes = adaptive(stream, np.frexp(np.abs(part))[1], 0.5 ** np.arange(CLASSES))
             for bits in range(1, int(classes.max(initial=0)) + 1):

@@ -20,7 +20,7 @@ from mgs.compact.tree import BANDS, DEPTH
 from mgs.errors import InputError
 from mgs.gaussians import MAX_GAUSSIANS, MAX_SH_DEGREE
 
-MAGIC, MARK, VERSION = b"MGSC", b"\xa7\x5e", 1
+MAGIC, MARK, VERSION = b"MGSC", b"\xa7\x5e", 2
 # Magic, version, flags, SH degree, cut of the tree, layers, number of Gaussians, tiles, packets;
 # corner of the grid [3], up and origin of the world of the data [3], step of the grid, inset, scale
 # of the steps, hash of the prior.
@@ -29,7 +29,6 @@ PACKET = struct.Struct("<HBBI")  # tile, group, layer, and size of the payload
 ANTIALIASED, LINEAR, SHARED = 1, 2, 4  # flags. SHARED: positions follow from the receiver's prior.
 # Content of a packet, by its number.
 GROUPS = ("position", "colour", "directional", "scale", "rotation", "opacity")
-FINER = 4  # steps of a layer over those of the next
 # 2^(k/4): steps are coded as exponents, with no power function that differs by machine.
 QUARTERS = (1.0, 1.189207115002721, 1.4142135623730951, 1.681792830507429)
 ZERO_STEP = 128  # code of a step of 1
@@ -38,7 +37,7 @@ Key = tuple[int, str, int]  # tile, group and layer of a packet
 
 @dataclass(frozen=True)
 class Header:
-    """Data that all packets need. steps: [BANDS,C] codes, uint8; see `Header.step`. The rest as in
+    """Data that all packets need. steps: [BANDS,C] codes, uint8; see `step`. The rest as in
     `HEAD`."""
 
     flags: int
@@ -59,11 +58,11 @@ class Header:
     centres: np.ndarray
     steps: np.ndarray
 
-    def step(self, layer: int) -> np.ndarray:
-        """Steps [BANDS,C] of a layer, from 0."""
+    @property
+    def step(self) -> np.ndarray:
+        """Steps [BANDS,C] of the last layer."""
         code = self.steps.astype(np.int64) - ZERO_STEP
-        fine = np.ldexp(np.array(QUARTERS)[code % 4], code // 4) * self.scale
-        return np.asarray(fine * float(FINER ** (self.layers - 1 - layer)))
+        return np.asarray(np.ldexp(np.array(QUARTERS)[code % 4], code // 4) * self.scale)
 
     def __bytes__(self) -> bytes:
         numbers = self.flags, self.degree, self.cut, self.layers, self.n, self.tiles, self.packets

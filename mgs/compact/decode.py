@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mgs.compact.coder import decoder, integers
+from mgs.compact.coder import FINER, decoder, flag, integers
 from mgs.compact.columns import Start, gaussians_of, groups, start_of
 from mgs.compact.container import ANTIALIASED, LINEAR, SHARED, Header, Key, split
 from mgs.compact.tree import DEPTH, Tree, cells_of, code_descendants, codes_of, tree_of
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 MOST_BYTES = 1 << 28  # most bytes of a file
 CELL_BYTES = 200  # memory of a Gaussian while it is decoded, for each column, bytes
 CELLS_OF_BYTE = 64  # most cells that a byte of a packet places: a file of few bytes never has many
+MIDDLE = 0.4  # place of a value in the interval that the layers so far leave: small ones are many
 IDENTITY = np.array([[1.0, 0, 0, 0]])
 
 
@@ -43,16 +44,17 @@ def read_compact(path: Path, prior: "Prior | None" = None) -> Gaussians:
         if prior is None:
             raise InputError(f"{path}: has no positions; give the prior it was made with, `prior`")
         start = start_of(prior, header.inset)
-        if start.digest != header.digest or len(start.means) != header.n:
+        if start.digest != header.digest or len(start.means) < header.n:
             raise InputError(f"{path}: was made with another prior; give that one")
-    elif (0, "position", 0) not in packets:
+    whole = start is not None and len(start.means) == header.n
+    if not whole and (0, "position", 0) not in packets:
         raise InputError(f"{path}: has lost the packet that places its Gaussians; send it again")
     columns = header.centres.shape[1]
     most = sum(
         _most(header, data) for (_, group, _), data in packets.items() if group == "position"
     )
     check_room(
-        (header.n if start else min(most, header.n)) * columns * CELL_BYTES,
+        (len(start.means) if start else min(most, header.n)) * columns * CELL_BYTES,
         f"{path}: decoding it",
         "give a smaller file",
     )
@@ -75,16 +77,15 @@ def decoded(header: Header, packets: Mapping[Key, bytes], start: Start | None) -
         means, quats = header.low + (cells + 0.5) * header.grid, IDENTITY
         order = np.arange(len(codes))
     else:
-        means, quats, layer, wider = start.means, start.quats, start.layer, None
-        order, codes = codes_of(grid_cells(means, header.low, header.grid), layer)
+        order, among = codes_of(grid_cells(start.means, header.low, header.grid), start.layer)
+        whole = len(among) == header.n
+        codes, wider = (among, np.zeros(1)) if whole else _positions(header, packets, among)
+        order = order[np.searchsorted(among, codes)]
+        means, quats, layer = start.means[order], start.quats[order], start.layer[order]
     tree = tree_of(codes, header.cut, header.tiles)
-    values = tree.inverse(_coefficients(header, packets, tree))
-    columns = np.empty_like(values)
-    columns[order] = values
-    columns += header.centres[layer]
-    if wider is not None:
-        columns[:, groups((header.degree + 1) ** 2)["scale"]] += wider[:, None]
-    g = gaussians_of(columns, means, quats, header.colours)
+    columns = tree.inverse(_coefficients(header, packets, tree)) + header.centres[layer]
+    columns[:, groups((header.degree + 1) ** 2)["scale"]] += wider[:, None]
+    g = gaussians_of(columns, means, quats, header.colours)[np.argsort(order)]
     antialiased, linear = bool(header.flags & ANTIALIASED), bool(header.flags & LINEAR)
     return replace(g, antialiased=antialiased, linear=linear)
 
@@ -94,22 +95,25 @@ def grid_cells(means: np.ndarray, low: np.ndarray, grid: float) -> np.ndarray:
     return np.clip(np.floor((means - low) / grid), 0, (1 << (DEPTH // 3)) - 1).astype(np.int64)
 
 
-def _positions(header: Header, packets: Mapping[Key, bytes]) -> tuple[np.ndarray, np.ndarray]:
+def _positions(
+    header: Header, packets: Mapping[Key, bytes], among: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Codes of the cells [N], and by how much their log-scales grow [N]: where the packet of a tile
-    is missing, one Gaussian stands for all of a node."""
+    is missing, one Gaussian stands for all of a node. among: as in `code_descendants`."""
     cut, tiles = header.cut, header.tiles
     data = packets[0, "position", 0]
     root = np.zeros(1, np.int64)
-    top = code_descendants(decoder(data), root, DEPTH - cut, _most(header, data))
+    above = None if among is None else np.unique(among >> cut)
+    top = code_descendants(decoder(data), root, DEPTH - cut, _most(header, data), among=above)
     tile = 1 + np.arange(len(top)) * tiles // len(top)
     codes, lone = [], []
     for number in range(1, tiles + 1):
         nodes = top[tile == number]
         data = packets.get((number, "position", 0), b"")
         if data:
-            part = code_descendants(decoder(data), nodes, cut, _most(header, data))
+            part = code_descendants(decoder(data), nodes, cut, _most(header, data), among=among)
         else:
-            part = lone_cells(nodes, cut)
+            part = lone_cells(nodes, cut, among)
         codes.append(part)
         lone.append(np.full(len(part), not data))
     # Sizes grow by the fourth root of the cells of a node, n / M, in steps of 1/64. With the root,
@@ -118,26 +122,51 @@ def _positions(header: Header, packets: Mapping[Key, bytes]) -> tuple[np.ndarray
     return np.concatenate(codes), wider * np.concatenate(lone)
 
 
-def lone_cells(nodes: np.ndarray, cut: int) -> np.ndarray:
-    """Codes of the cells in the middle of nodes, where one Gaussian stands for all of a node."""
-    return (nodes << cut) | (7 << (cut - 3))
+def lone_cells(nodes: np.ndarray, cut: int, among: np.ndarray | None = None) -> np.ndarray:
+    """Codes of the cells in the middle of nodes, where one Gaussian stands for all of a node.
+    among: as in `code_descendants`."""
+    if among is None:
+        return (nodes << cut) | (7 << (cut - 3))
+    first, end = np.searchsorted(among, [nodes << cut, (nodes + 1) << cut])
+    return np.asarray(among[(first + end) // 2])
 
 
 def _most(header: Header, data: bytes) -> int:
     """Most cells that a packet of positions can hold."""
-    return min(CELLS_OF_BYTE * (len(data) + 8), header.n)
+    return header.n if header.flags & SHARED else min(CELLS_OF_BYTE * (len(data) + 8), header.n)
 
 
 def _coefficients(header: Header, packets: Mapping[Key, bytes], tree: Tree) -> np.ndarray:
-    """Coefficients [N,C] that the packets give; 0 where there is none."""
+    """Coefficients [N,C] that the packets give; 0 where there is none. A layer whose predecessor is
+    missing gives nothing."""
     table = np.zeros((len(tree.band), header.centres.shape[1]))
     of = groups((header.degree + 1) ** 2)
-    for (tile, group, layer), data in packets.items():
+    whole = dict[tuple[int, str], tuple[int, np.ndarray]]()  # last layer and its numbers
+    for tile, group, layer in sorted(packets):
         rows = rows_of(tree, tile)
-        if group != "position" and len(rows):
-            step = header.step(layer)[tree.band[rows], of[group]]
-            table[rows, of[group]] += step * integers(decoder(data), np.zeros(step.shape, np.int64))
+        if group == "position" or not len(rows):
+            continue
+        zeros = np.zeros(table[rows, of[group]].shape, np.int64)
+        last, before = whole.get((tile, group), (-1, zeros))
+        stream = decoder(packets[tile, group, layer])
+        if flag(stream, False):
+            before = zeros
+        elif last != layer - 1:
+            continue
+        whole[tile, group] = layer, integers(stream, zeros, before)
+    for (tile, group), (layer, numbers) in whole.items():
+        rows = rows_of(tree, tile)
+        step = header.step[tree.band[rows], of[group]]
+        table[rows, of[group]] = step * restored(numbers, header.layers - 1 - layer)
     return table
+
+
+def restored(numbers: np.ndarray, later: int) -> np.ndarray:
+    """Values of whole numbers [n,C] in steps of the last layer. later: number of layers that are
+    yet to come."""
+    scale = float(FINER**later)
+    magnitudes = np.abs(numbers) * scale + MIDDLE * (scale - 1)
+    return np.asarray(np.sign(numbers) * magnitudes)
 
 
 def rows_of(tree: Tree, tile: int) -> np.ndarray:

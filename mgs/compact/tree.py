@@ -10,6 +10,7 @@ from mgs.compact.coder import Stream, adaptive
 
 AXIS_BITS = 20  # bits of a cell's index along an axis
 DEPTH = 3 * AXIS_BITS + 1  # bits of a code: those of three axes, and a leading one for the layer
+MANY = 4  # cells below a node that count as many, in the contexts of `code_descendants`
 BANDS = 12  # kinds of coefficients by the size of their node, each twice as large; then the rest
 
 
@@ -36,22 +37,34 @@ def cells_of(codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def code_descendants(
-    stream: Stream, nodes: np.ndarray, depth: int, most: int, codes: np.ndarray | None = None
+    stream: Stream,
+    nodes: np.ndarray,
+    depth: int,
+    most: int,
+    codes: np.ndarray | None = None,
+    among: np.ndarray | None = None,
 ) -> np.ndarray:
     """Code which descendants nodes [M] have `depth` levels below; returns their codes. codes:
     these, to be written; None: they are read. Each node has a left child, a right one, or both.
-    Raises ValueError if more than `most` are read."""
-    counts = np.ones((3, 2, 3))
+    among: sorted codes of the cells that can be there; None: all. Raises ValueError if more than
+    `most` are read."""
+    counts = np.ones((2 * max(3, MANY**2), 3))
     forked = np.zeros(len(nodes), np.int64)
     for shift in range(depth - 1, -1, -1):
         pairs = np.column_stack([2 * nodes, 2 * nodes + 1])
-        kinds = np.zeros(len(nodes), np.int64)
+        kinds, context = np.zeros(len(nodes), np.int64), forked + 2 * (shift % 3)
+        if among is not None:  # children without a cell need no code
+            ends = np.searchsorted(among, np.column_stack([pairs, pairs[:, 1] + 1]) << shift)
+            left, right = np.minimum(np.diff(ends), MANY).T
+            kinds = np.where(left == 0, 1, 0)
+            context = forked + 2 * (MANY * (left - 1) + right - 1)
+            context[(left == 0) | (right == 0)] = -1
         if codes is not None:
             left, right = np.isin(pairs, codes >> shift).T
             kinds = left + 2 * right - 1
-        for before in (0, 1):
-            rows = np.flatnonzero(forked == before)
-            kinds[rows] = adaptive(stream, kinds[rows], counts[shift % 3, before])
+        for number in np.unique(context[context >= 0]):
+            rows = np.flatnonzero(context == number)
+            kinds[rows] = adaptive(stream, kinds[rows], counts[number])
         there = np.column_stack([kinds != 1, kinds != 0])
         nodes, forked = pairs[there], np.repeat(kinds == 2, 1 + (kinds == 2)).astype(np.int64)
         if len(nodes) > most:

@@ -28,7 +28,7 @@ HALVINGS = 9  # halvings of that range, in its logarithm: steps are found to 1.4
 VIEWS = 16  # most views, evenly spread over those taken, in which errors are weighed
 STEP = 1e-4  # linear RGB, by which the slope of sRGB is measured
 CLOSE = 50  # searches for a PSNR end at numbers of Gaussians that differ by 1/CLOSE
-THINNINGS = 4  # times that half of the Gaussians are removed, if positions are sent
+THINNINGS = 4  # times that half of the Gaussians are removed
 AGAIN = 0.3  # learning rates of a further fit over those of a first one, which leave its optimum
 
 
@@ -52,9 +52,11 @@ def compact_run(
     measured = _measure(run)
     before, best = measured(run.gaussians), list[tuple[float, Compact]]()
     _check_reachable(str(run.folder), psnr, before)
-    for encoder in encoders(run, shared):
+    encoder = encoding(run, shared)
+    enough = None if psnr is None else lambda model: measured(model) >= psnr
+    for some, kept in thinned(run, whole=shared):
         report("choosing steps")
-        file = _fitted(encoder, size, None if psnr is None else lambda m: measured(m) >= psnr)
+        file = _fitted(encoder(some, kept), size, enough)
         if file is None:
             continue
         value = measured(file.model) if size else -len(file)
@@ -150,37 +152,40 @@ def thin_run(run: Run, kind: str, size: int | None = None, psnr: float | None = 
     return Compacted(data, len(rest), (before, after))
 
 
-def encoders(run: Run, shared: bool) -> Iterator[Encoder]:
-    """Encoders of the run's model; where positions are sent, pruned, then with a half to
-    a sixteenth of its Gaussians, fitted once more if the prior's folder exists."""
+def thinned(run: Run, whole: bool) -> Iterator[tuple[Gaussians, np.ndarray]]:
+    """The run's model, whole or pruned, then with a half to a sixteenth of its Gaussians, fitted
+    once more if the prior's folder exists; each with the indices of its Gaussians."""
     from mgs.fit.pruning import fewest, prune
 
+    g, cameras = run.state.gaussians, [frame.camera for frame in run.taken]
+    kept = np.arange(len(g))
+    report("removing Gaussians")
+    rest = kept if whole else prune(g, cameras, PRUNE_NOISE).kept
+    yield g[rest], rest
+    again = refitting(run) if run.settings.prior.is_dir() else None
+    for _ in range(THINNINGS):
+        count = max(1, len(g) // 2)
+        rest = fewest(g, cameras, count)
+        g, kept = g[rest], kept[rest]
+        if again is not None:
+            report(f"fitting {count:,} Gaussians")
+            g = again(g)
+        yield g, kept
+
+
+def encoding(run: Run, shared: bool) -> Callable[[Gaussians, np.ndarray], Encoder]:
+    """A function (model, indices in the run's) -> encoder of models of `thinned`. Raises InputError
+    as `compact_run`."""
     g, place = run.state.gaussians, (run.dataset.world.up, run.dataset.world.origin)
-    start, gradients = None, partial(_gradients, run)
-    fits = run.settings.prior.is_dir()
-    if shared or fits:
-        start = _start(run, g)
+    start = _start(run, g) if shared or run.settings.prior.is_dir() else None
+    gradients = partial(_gradients, run)
     if shared:
         if start is None:
             moved = "its fit moved the Gaussians of its prior or has others"
             raise InputError(f"{run.folder}: {moved}; leave out `shared_prior`")
-        report("weighing errors")
-        yield Encoder(g, gradients, start, None, *place)
-        return
-    cameras = [frame.camera for frame in run.taken]
+        return lambda some, kept: Encoder(some, gradients, start, kept, None, *place)
     layer = start.layer if start else np.zeros(len(g), np.int64)
-    report("removing Gaussians")
-    rest = prune(g, cameras, PRUNE_NOISE).kept
-    yield Encoder(g[rest], gradients, None, layer[rest], *place)
-    again = refitting(run) if fits else None
-    for _ in range(THINNINGS):
-        count = max(1, len(g) // 2)
-        rest = fewest(g, cameras, count)
-        g, layer = g[rest], layer[rest]
-        if again is not None:
-            report(f"fitting {count:,} Gaussians")
-            g = again(g)
-        yield Encoder(g, gradients, None, layer, *place)
+    return lambda some, kept: Encoder(some, gradients, None, None, layer[kept], *place)
 
 
 def _start(run: Run, g: Gaussians) -> Start | None:
