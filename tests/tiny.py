@@ -120,9 +120,8 @@ def fit(gaussians: Gaussians, start: Gaussians, cameras, targets, train, on_pass
 class TinyScene(Scene):
     """A scene with functions of this module in place of the splat core's.
 
-    parts: other functions in place of `initial`, `fit`, `fisher`, `estimate`; `exact`, of views of
-    the Gaussians before training; `exposure`, `render`.
-    """
+    parts: other functions in place of `initial`, `fit`, `fisher`; `exact`, of views of the
+    Gaussians before training."""
 
     parts: dict[str, Callable[..., Any]] = field(default_factory=dict)
     centre = np.zeros(3)
@@ -145,17 +144,10 @@ class TinyScene(Scene):
             return self.parts["exact"](model, camera)
         if estimator == "exact":
             return self.parts.get("fisher", fisher)(model, camera)
-        return self.parts.get("estimate", estimate)(model, camera, estimator)
+        return estimate(model, camera, estimator)
 
     def fisher_of_colours(self, model, camera):
         return self.fisher(model, camera)[:, :3]
-
-    def render(self, model, camera):
-        return self.parts["render"](model, camera)
-
-    @property
-    def measured_exposure(self):
-        return self.parts["exposure"]
 
 
 def prior(up=(0, 0, 1)) -> Prior:
@@ -196,9 +188,8 @@ def resume(out: Path, dataset: Dataset, *, on_step=None, **parts) -> Checkpoint:
 def go(out: Path, settings: NbvSettings, dataset: Dataset, *, on_step=None, **parts) -> Checkpoint:
     """Run or resume in a folder by these settings. parts: as in `scene`, and `measure`."""
     measure = parts.pop("measure", lambda gaussians, taken: {"psnr": float(len(taken))})
-    observed = {"measure": measure, "checked": "render" in parts}
-    made = scene(dataset, settings, **parts)
-    return recording.run(out, settings, made, on_step=on_step or (lambda _: None), **observed)
+    made, on_step = scene(dataset, settings, **parts), on_step or (lambda _: None)
+    return recording.run(out, settings, made, on_step=on_step, measure=measure, checked=False)
 
 
 def write_prior(out: Path) -> Path:
