@@ -39,7 +39,7 @@ def scenes(tmp_path):
     return root.parent
 
 
-def test_every_policy_runs_and_no_candidate_is_read(scenes, tmp_path, capsys, monkeypatch):
+def test_every_policy_runs_and_no_candidate_is_read(scenes, tmp_path, monkeypatch):
     read = []
     monkeypatch.setattr(mgs.Frame, "target", _noted(mgs.Frame.target, read))
     monkeypatch.setattr(mgs.Frame, "mask", _noted(mgs.Frame.mask, read))

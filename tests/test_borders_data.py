@@ -98,7 +98,7 @@ def test_names_with_numbers_are_in_their_order(tmp_path, data):
     assert source.left_out == {"landmark": 1}
 
 
-def test_a_transforms_json_is_read_as_its_authors_mean_it(tmp_path, data):
+def test_a_transforms_json_is_read_as_its_authors_mean_it(data):
     def change(json):
         json["test_filenames"] = [json["frames"][k]["file_path"] for k in (0, 5)]
         json["camera_angle_x"] = 2 * np.arctan(json["w"] / 2 / json.pop("fl_x"))

@@ -303,7 +303,7 @@ def test_an_spz_of_version_1_has_positions_of_float16(tmp_path):
     np.testing.assert_allclose(covariances(read), covariances(model), rtol=0.2, atol=0.01)
 
 
-def test_colours_become_srgb(tmp_path):
+def test_colours_become_srgb():
     flat = gaussians(0)
     shown = in_srgb(flat)
     np.testing.assert_allclose(shown.rgb, srgb_from_linear(flat.rgb), atol=1e-5)

@@ -410,8 +410,7 @@ def test_a_scratch_folder_leaves_nothing(tmp_path):
         (tmp_path / "x/a").touch()
 
 
-@pytest.mark.parametrize("make", [atomic_path, lambda path: locked(path.parent)])
-def test_a_device_is_not_replaced(tmp_path, make):
+def test_a_device_is_not_replaced(tmp_path):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     for path in (pipe, Path("/dev/null"), Path("/dev/stdout")):

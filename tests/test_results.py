@@ -14,7 +14,7 @@ from studies.frame.sweep import run_cells
 RESULTS = Path(__file__).parent.parent / "docs/results"
 
 
-def test_tables_of_pages_are_of_their_rows(tmp_path):
+def test_tables_of_pages_are_of_their_rows():
     shown = tables_of(RESULTS / "fits/fits.csv")[1].splitlines()
     assert shown[0].startswith("| changed | hemisphere, 12 |")
     gains = [row["test_change"] for row in read_rows(RESULTS / "fits/fits.csv")

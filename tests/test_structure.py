@@ -162,7 +162,7 @@ def test_the_core_chooses_measures_and_reports_without_extras(dataset, prior, tm
     assert said.stdout == "4 (12, 16, 3)\n", said.stderr
 
 
-def test_a_missing_package_is_one_line(dataset, tmp_path, capsys, monkeypatch):
+def test_a_missing_package_is_one_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     model = tmp_path / "model/sparse/0"
     model.mkdir(parents=True)

@@ -74,7 +74,7 @@ def test_fit_lowers_the_loss_a_hundredfold_and_reports_it(truth, cameras, target
     assert np.array_equal(found.gaussians.means, truth.means)
 
 
-def test_alpha_as_a_channel_makes_alpha_right(truth, cameras, targets):
+def test_alpha_as_a_channel_makes_alpha_right(truth, cameras):
     """A black model in front of black: alpha alone shows what it covers."""
     black = replace(truth, sh=np.full_like(truth.sh, -2.0))
     start = replace(black, logit_opacities=np.zeros_like(black.logit_opacities))
