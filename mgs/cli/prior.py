@@ -96,7 +96,7 @@ def prior(
 
     From depth images: fuse a cloud, find the ground plane and the rock above it, and reconstruct
     its surface (Poisson). From points that came with the cameras: reconstruct the surface of those
-    inside the masks or above the ground. From a hull: take the largest body inside all masks. Then
+    inside the masks or above the ground. From a hull: take all that lies inside all masks. Then
     spread samples evenly over the faces that some frame sees. Writes mesh.ply, points.ply,
     prior.json and prior.png.
 

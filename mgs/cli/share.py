@@ -99,7 +99,7 @@ def view(
     rests, mgs renders the exact image. Layers: colour, alpha, depth; for a run also information,
     uncertainty and unobserved. A click on a camera shows its image and its numbers. Ctrl-C ends it.
 
-    - subject RUN|SPLATS: Folder that `mgs nbv` wrote, or a PLY, GLB or SPZ.
+    - subject RUN|SPLATS: Folder that `mgs nbv` wrote, or a PLY, GLB, SPZ or MGS.
     - port: Port to serve on; 0: any free one.
     - host: Address to serve on. With any but 127.0.0.1, other machines can reach the page.
     - follow: Show every new step of a run in progress."""
