@@ -17,7 +17,7 @@ from mgs.fit.objective import objective
 from mgs.gaussians import Gaussians, learned
 from mgs.memory import padded
 from mgs.metrics import _similarity
-from mgs.splat import MEANS, as_drjit, reference
+from mgs.splat import MEANS, as_drjit, reference, render
 from studies.bench import surface_camera, surface_gaussians
 
 N = 60
@@ -195,3 +195,12 @@ def test_similarity_is_that_of_scikit_image_inside_the_border(images):
     _, theirs = _similarity(a, b)
     ours = np.array(similarity(as_floats(b), as_floats(a), (WIDTH, HEIGHT, 3))).reshape(a.shape)
     assert np.allclose(ours[5:-5, 5:-5], theirs[5:-5, 5:-5], atol=1e-5)
+
+
+def test_a_fit_has_the_loss_of_its_settings():
+    model, black = surface_gaussians(50), UNSEEN.copy()
+    camera, black[..., 3] = surface_camera(model, 24, 20), 1
+    drawn = np.asarray(render(model, camera).rgb, np.float64)
+    found = fit_gaussians(model, [camera], [black], TrainSettings(passes=1))
+    expected = slow_loss(drawn, 0 * drawn, np.ones_like(drawn)).mean()
+    assert found.losses[0] == pytest.approx(expected, rel=1e-4)
