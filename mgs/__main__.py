@@ -6,7 +6,8 @@ import warnings
 
 
 def main() -> None:
-    """Run `mgs.cli.app.main`. Warnings of libraries are printed with python -W only."""
+    """Run `mgs.cli.app.main`. Raises SystemExit. Warnings of libraries are printed with python -W
+    only."""
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # products are small: threads only wait

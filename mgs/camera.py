@@ -25,9 +25,11 @@ class Camera:
 
     - K: [3,3] float64, intrinsics in pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
     - width, height: of the image, pixels.
-    - world_to_camera: [4,4] float64, rigid transform in metres, to OpenCV axes.
+    - world_to_camera: [4,4] float64, rigid transform in metres, to OpenCV axes (x right, y down,
+      z forward).
     - film, corner: of a crop window, the camera of the whole film, and the window's left and top on
-      it, pixels (`cropped`). Splats are projected as for the film: tiles fit bit for bit.
+      it, pixels (`cropped`). Splats are projected as for the whole film, so that tiles fit together
+      bit for bit.
 
     K and world_to_camera may be Dr.Jit tensors. `mgs.render` then differentiates the image by them;
     `traced` holds both, and the fields their values.
@@ -189,7 +191,8 @@ def look_at(
     """Return world_to_camera [4,4] of a camera at `eye` [3], metres, that looks at `target` [3].
 
     up: direction [3] that points upwards in the image. If the camera looks along it, +Y replaces
-    it, or +Z where the camera looks along +Y. Raises InputError if both are one point."""
+    it, or +Z where the camera looks along +Y. Raises InputError if eye and target are the same
+    point."""
     eye = np.asarray(eye, np.float64)
     forward: NDArray[np.float64] = np.asarray(target, np.float64) - eye
     norm = np.linalg.norm(forward)
@@ -209,7 +212,8 @@ def look_at(
 
 def heading_and_pitch(camera: Camera) -> tuple[float, float]:
     """Direction of view, degrees: heading clockwise from +Y (0 to 360), pitch above the horizon.
-    Looking straight down, the heading is that of the image's top; straight up, of its bottom."""
+    Where the camera looks straight down, the heading is that of the image's top; straight up, that
+    of its bottom."""
     _, (down_x, down_y, _), (x, y, z) = camera.world_to_camera[:3, :3]
     if np.hypot(x, y) < 1e-6:
         x, y = np.sign(z) * down_x, np.sign(z) * down_y

@@ -161,7 +161,8 @@ def evaluate_model(
 
     - images: number of training frames.
     - test (if there are test views), all, held_out: number of views ("count") and the mean of each
-      of METRICS, and of each of SURFACE_METRICS that the data has a truth for; None without a view.
+      of METRICS, and of each of SURFACE_METRICS that the data has a truth for; None if no view has
+      it.
     - views, test_views: for each view its "name", "trained" (bool) and its metrics, None if there
       is no pixel to measure, as in an empty mask.
 
@@ -224,7 +225,8 @@ def write_comparison(
     """Write one PNG with three panels side by side: truth, render, and their absolute difference,
     brightened. A strip above holds their captions.
 
-    truth, rendered: [H,W,3] linear RGB; decibels: the PSNR. Raises InputError as `write_png`."""
+    truth, rendered: [H,W,3] linear RGB; decibels: the PSNR. Raises InputError if the file cannot be
+    written."""
     from PIL import Image, ImageDraw, ImageFont
 
     a, b = srgb_from_linear(truth), srgb_from_linear(rendered)

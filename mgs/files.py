@@ -131,7 +131,8 @@ def reading(path: Path, what: str = "file") -> Iterator[None]:
 
 @contextmanager
 def parsing(path: Path, what: str, cure: str) -> Iterator[None]:
-    """Context manager: turns errors of a damaged file into an InputError; bounds the memory.
+    """Context manager: turns errors of a damaged file into an InputError, and bounds the memory
+    (`mgs.memory.decoding`).
 
     what: kind of file. cure: end of the line. All errors count, since libraries raise many types.
     """
@@ -146,7 +147,8 @@ def parsing(path: Path, what: str, cure: str) -> Iterator[None]:
 
 
 def copy_file(source: Path, path: Path) -> None:
-    """Copy a file; the copy appears complete. Raises InputError as `reading` and `atomic_path`."""
+    """Copy a file; the copy appears complete. Raises InputError if the source cannot be read or the
+    copy cannot be written."""
     with reading(source):
         data = source.read_bytes()
     with atomic_path(path) as temporary:
@@ -236,7 +238,8 @@ def read_csv(path: str | Path) -> list[tuple[int, list[str]]]:
 
 
 def read_xml(path: str | Path) -> Any:
-    """Root element of an XML file without entities. Raises InputError as `read_json`."""
+    """Root element of an XML file without entities. Raises InputError if it is missing, unreadable
+    or not valid XML."""
     from defusedxml.ElementTree import fromstring
 
     return _parsed(path, "XML", fromstring)

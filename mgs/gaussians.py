@@ -31,7 +31,8 @@ KINDS = ("colour", "scale", "rotation", "opacity")  # names of LEARNED in settin
 def learned(means: str = "frozen") -> dict[str, str]:
     """Map each learned parameter to its kind, in the order of the columns.
 
-    means: a name in `mgs.splat.MEANS`. Unless "frozen", means come last, as "mean"."""
+    means: a name in `mgs.splat.MEANS`. Unless it is "frozen", means are learned too and come last,
+    as "mean"."""
     return dict(zip(LEARNED, KINDS, strict=True)) | ({} if means == "frozen" else {"means": "mean"})
 
 
@@ -112,7 +113,8 @@ class Gaussians:
         return linear if self.linear else srgb_from_linear(linear)
 
     def linear_rgb(self, blended: np.ndarray) -> np.ndarray:
-        """Linear RGB of any shape from the space of these Gaussians. sRGB is clipped to [0,1]."""
+        """Linear RGB of any shape from the space in which these Gaussians are blended. sRGB is
+        clipped to [0,1]."""
         return blended if self.linear else linear_from_srgb(np.clip(blended, 0, 1))
 
     @property
@@ -152,7 +154,8 @@ class Gaussians:
         return self
 
     def check_shapes(self, where: object = "gaussians") -> None:
-        """Raise InputError if shapes (NumPy or Dr.Jit) are not those of N up to MAX_GAUSSIANS."""
+        """Raise InputError if the shapes (NumPy or Dr.Jit) are not those of N Gaussians, or N
+        exceeds MAX_GAUSSIANS."""
         n = len(self)
         if n > MAX_GAUSSIANS:
             many = f"{n:,} Gaussians are more than kernels index, {MAX_GAUSSIANS:,}"

@@ -56,7 +56,8 @@ def write_png(path: str | Path, image: np.ndarray, *, linear: bool = True) -> No
 
 def image_size(path: str | Path) -> tuple[int, int]:
     """Width and height of an image or EXR file, pixels, read from its header alone. Raises
-    InputError if it is missing or unreadable, and as `check_pixels`."""
+    InputError if it is missing or unreadable, or has more pixels than MAX_PIXELS or the free memory
+    allows."""
     path = Path(path)
     what = "EXR file" if path.suffix.lower() == ".exr" else "image"
     with reading(path, what), path.open("rb") as file:
@@ -141,7 +142,8 @@ NO_RETURN = 1e6  # metres of depth that stand for none: renderers write 1e10
 
 def read_values(path: str | Path) -> np.ndarray:
     """Numbers of an image of one channel, such as depth, unchanged: [H,W] uint8 or uint16, of a
-    TIFF also int32 or float32. Raises InputError if it is unreadable, or not of one channel."""
+    TIFF also int32 or float32. Raises InputError if it is missing, unreadable, damaged, or does not
+    have one channel."""
     path = Path(path)
     image, _ = _open_image(path)
     if image.mode not in ("L", "I;16", "I", "F"):
@@ -236,7 +238,8 @@ def read_mask(path: str | Path) -> np.ndarray:
 def write_exr(
     path: str | Path, channels: Mapping[str, Any], camera: Camera | None = None, unit: str = ""
 ) -> None:
-    """Write an OpenEXR file with a float32 channel for each array [H,W]; the file appears complete.
+    """Write an OpenEXR file with a float32 channel for each named array [H,W]; the file appears
+    complete.
 
     The header names the program, the unit of lengths, and the camera: `fx`, `fy`, `cx`, `cy`,
     pixels, and `worldToCamera` as OpenEXR defines it (a row vector times the matrix; x right, y up,
@@ -259,7 +262,8 @@ def write_exr(
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
-    """Channels of an OpenEXR file, {name: float32 [H,W]}. Raises InputError as `image_size`."""
+    """Channels of an OpenEXR file, {name: float32 [H,W]}. Raises InputError as `image_size`, and if
+    it is damaged."""
     import OpenEXR
 
     path = Path(path)

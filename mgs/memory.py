@@ -89,7 +89,8 @@ ALIGNMENT = 64  # bytes. Dr.Jit compiles another kernel for arrays that are not 
 
 
 def padded(values: Any, dtype: Any = np.float32) -> np.ndarray:
-    """Copy an array into contiguous memory that begins at a multiple of ALIGNMENT and goes on.
+    """Copy an array into contiguous memory that begins at a multiple of ALIGNMENT and extends
+    beyond its end.
 
     Every array that Dr.Jit takes over from NumPy must be one: it is not copied, and kernels read a
     few numbers beyond the end. The alignment decides which kernel is compiled."""

@@ -109,7 +109,8 @@ def compare_psnr(
     """PSNR of one view, dB: `psnr` over the valid pixels, `psnr_mask` over the rock's.
 
     image: [H,W,3], the truth, sRGB. rendered: [H,W,3] linear RGB. valid, rock: [H,W] bool. With
-    linear, the truth as linear RGB, also `..._corrected` (`colour_corrected`)."""
+    linear, the truth as linear RGB, also `..._corrected` (`colour_corrected`). Raises InputError as
+    `psnr`."""
     masks = {"psnr": None if valid.all() else valid, "psnr_mask": rock}
     picture = srgb_from_linear(rendered)
     values = {name: psnr(image, picture, mask) for name, mask in masks.items()}

@@ -35,7 +35,8 @@ class Choice:
     """A chosen view.
 
     view: its index. score: the policy's own number. information_gain: Eq. 7 of this view by the
-    scene's estimator, whatever the policy. coverage: Eq. 9 with this view, 0 to 1."""
+    scene's estimator, whatever the policy. coverage: Eq. 9 of all views taken with this one, 0 to
+    1."""
 
     view: int
     score: float

@@ -56,8 +56,9 @@ def load_gaussians(path: str | Path, prior: str | Path | None = None) -> Gaussia
 
     Colours are unchanged. Infinite logits of opacity are cut to finite ones, flat Gaussians get the
     least thickness, and quaternions of a length under QUAT_MIN, which would mean the identity, are
-    made longer. Those with a NaN or another infinite number are left out, with a Notice. Raises
-    InputError if the file is missing, damaged or of another format, or a package is missing."""
+    made longer. Those with a NaN or another infinite number are left out, with a Notice.
+    Raises InputError if the file is missing, damaged or of another format, or if a package that it
+    needs is missing."""
     path = Path(path)
     kind = _kind(path)
     if kind == "mgs":

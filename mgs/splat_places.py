@@ -18,7 +18,8 @@ FAR = 1e4  # coordinate beyond which float32 is coarser than 1 mm: it goes to `G
 
 
 def mirrored(g: Gaussians, signs: tuple[int, int, int]) -> Gaussians:
-    """Gaussians in axes that point along `signs` times the old ones, exactly. Its own inverse."""
+    """Gaussians in axes that point along `signs` times the old ones, exactly. A second call
+    returns the first ones."""
     x, y, z = signs
     sign, (ox, oy, oz) = {"x": x, "y": y, "z": z}, g.origin
     odd = [np.prod([sign[name] for name in names]) for names in PARITY[: g.sh.shape[1]]]

@@ -45,7 +45,8 @@ def _ply_names(coefficients: int) -> list[str]:
 def write_ply(
     path: str | Path, gaussians: Gaussians, marks: Mapping[str, np.ndarray] | None = None
 ) -> None:
-    """Write Gaussians (NumPy fields) as a binary PLY in the layout of 3DGS, atomically.
+    """Write Gaussians (NumPy fields) as a binary PLY in the layout of 3DGS; the file appears
+    complete.
 
     It opens in any splat viewer. Viewers that expect sRGB show linear RGB too dark. marks: {name:
     [N] bool}, extra properties of the vertices, bytes of 0 or 1, which `read_ply` and viewers
@@ -69,9 +70,10 @@ def write_ply(
 def read_ply(path: str | Path) -> Gaussians:
     """Read a PLY in the layout of 3DGS (binary or ASCII, SH degree 0 to 3), or a compressed one.
 
-    Properties are found by name, in any order; others are ignored. Only files of mgs say that they
-    are linear. The smoothing filter of Mip-Splatting (`filter_3D`) is applied. Raises InputError if
-    the file is missing, is not a PLY, lacks a property, and as `Gaussians.check`."""
+    Properties are found by name, in any order; others are ignored. Only files of mgs say that
+    they are linear. The smoothing filter of Mip-Splatting (`filter_3D`) is applied. Raises
+    InputError if the file is missing, is not a PLY, lacks a property, or holds values that
+    `Gaussians.check` refuses."""
     return parse_ply(path).check(path)
 
 
@@ -167,7 +169,8 @@ def _decompress(path: Path, ply: PlyData) -> dict[str, np.ndarray]:
     PlayCanvas' splat-transform writes such files (`.compressed.ply`). A splat has four 32-bit words
     (PACKED). Their numbers are fractions between the least and the largest value within a chunk of
     256 splats, given in the element `chunk`. Some files have no range of colours, which is then 0
-    to 1. Raises InputError if an element or a property is missing or of another type or size."""
+    to 1. Raises InputError if an element or a property is missing or of another type, or sizes do
+    not match."""
     vertices, n = ply["vertex"].data, len(ply["vertex"].data)
     chunks = ply["chunk"].data if "chunk" in ply else np.empty(0, [])
     present = chunks.dtype.names or ()

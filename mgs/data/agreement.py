@@ -242,7 +242,8 @@ def _tilt(cameras: Sequence[Camera], convention: Convention) -> float:
 
 
 def _seen(cameras: Sequence[Camera], convention: Convention) -> float:
-    """Share of cameras that see the point nearest to all optical axes; 0 if they are PARALLEL."""
+    """Share of cameras in whose picture the point nearest to all optical axes is; 0 if they are
+    PARALLEL."""
     poses = [convention(camera.world_to_camera) for camera in cameras]
     axes = np.stack([pose[2, :3] for pose in poses])
     mean = axes.mean(0)
@@ -270,7 +271,8 @@ def _depth_error(
     one: Frame, near: np.ndarray, other: Frame, far: np.ndarray, convention: Convention, zoom: float
 ) -> float:
     """Median difference, as pixels at this depth, between the depth `far` of a frame and that of
-    the points that `one` sees at depth `near`, without hidden ones; inf if too few are seen."""
+    the points which `one` sees at depth `near`, less those that are hidden; inf if too few are
+    seen."""
     poses = [convention(frame.camera.world_to_camera) for frame in (one, other)]
     step = max(1, int(np.sqrt(near.size / 20_000)))
     row, column = np.nonzero(near[::step, ::step])

@@ -310,7 +310,8 @@ def _metres(message: Any, scratch: Path) -> np.ndarray | None:
 
 def _unpack_depth(reader: Any, unpack: Path, frame: str, shots: dict[float, Shot]) -> list[str]:
     """Write the depth image nearest in time to each keyframe, and add it to the keyframe; notes for
-    the user. Only images in the frame of the colour images are aligned with them."""
+    the user. Only images in the frame of the colour images count: others are not aligned with
+    them."""
     times, gaps = np.array(list(shots)), dict.fromkeys(shots, SYNCHRONOUS)
     notes = dict[str, None]()
     for topic, message in messages(reader, *KINDS):

@@ -105,7 +105,8 @@ def _test_problems(dataset: Dataset) -> Iterator[str]:
 
 def _mask_problems(frame: Frame, mask: np.ndarray) -> Iterator[str]:
     """Problems of a mask [H,W]: empty, or in contradiction to the rock image. The mask is about
-    pixel centres. So alpha = 0 contradicts a true pixel, alpha = 1 a false one."""
+    pixel centres. So alpha = 0 contradicts a true pixel and alpha = 1 a false one; any value
+    between agrees with both."""
     if not mask.any():
         yield (
             f"frame {frame.name}: the mask is empty; aim the camera at the rock or remove the frame"

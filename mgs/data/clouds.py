@@ -58,7 +58,8 @@ def write_cloud(path: str | Path, cloud: SparseCloud) -> None:
 def read_cloud(path: str | Path) -> SparseCloud:
     """Read the vertices of any PLY file, with nx ny nz, track and error if present. Of points in
     the same place the first is kept, since some programs write a vertex for each corner of each
-    face. Raises InputError if the file is missing, damaged, not finite, or has under two points."""
+    face. Raises InputError if the file is missing, damaged, not finite, or has fewer than two
+    distinct points."""
     path = Path(path)
     with reading(path, "point cloud; give a PLY file"), path.open("rb") as file:
         file.read(1)

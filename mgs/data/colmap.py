@@ -70,7 +70,8 @@ def _parameters(model: int) -> int:
 
 
 def models_in(source: Path) -> list[Path]:
-    """Folders of COLMAP models: those of sparse/N; else sparse, or the folder itself."""
+    """Folders of COLMAP models: those of sparse/0, sparse/1 and so on; else sparse, or the folder
+    itself."""
     parts = sorted(source.glob("sparse/*/"), key=natural)
     folders = [folder for folder in parts if _is_model(folder)]
     return folders or [folder for folder in (source / "sparse", source) if _is_model(folder)][:1]
@@ -85,7 +86,8 @@ def _is_model(folder: Path) -> bool:
 
 def read_colmap(source: Path, models: list[Path], images: Path) -> Source:
     """The largest of the models in a folder: images sorted by name, and points. images: folder of
-    the images. Raises InputError if the model is damaged, or a lens is not supported."""
+    the images. Raises InputError if the model is damaged, its text has lost lines, or a lens is not
+    supported."""
     sizes = {model: _image_count(model) for model in models}
     model = max(models, key=lambda one: sizes[one])
     notes = []
@@ -122,7 +124,8 @@ def source_of(
 
 
 def _observed(image: Any, reconstruction: Any) -> tuple[Camera, np.ndarray, np.ndarray]:
-    """Camera of an image without distortion, and points [N,3] with their pixels [N,2]."""
+    """Camera of an image without distortion, and points [N,3] with the pixels [N,2] of which they
+    were triangulated."""
     marks = [mark for mark in image.points2D if mark.has_point3D()]
     points = [reconstruction.points3D[mark.point3D_id].xyz for mark in marks]
     rays = image.camera.cam_from_img(np.reshape([mark.xy for mark in marks], (-1, 2)))

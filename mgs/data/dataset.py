@@ -76,7 +76,8 @@ class Dataset:
         return tuple(frame for frame in self.frames if not frame.on_demand or frame.name in taken)
 
     def test_views(self) -> "Dataset | None":
-        """Load the test views, if any. Raises InputError as `load_dataset`."""
+        """Load the test views, on which no model is trained, or None. Raises InputError as
+        `load_dataset`."""
         folder = self.root / TEST_FOLDER
         there = (folder / "transforms.json").is_file()
         return load_dataset(folder, up=self.world.up) if there else None
@@ -101,8 +102,9 @@ def load_dataset(
     Checks that image files exist, unless the dataset is on demand. Pixels are read later, by the
     methods of `Frame`. to_capture: frames without an image are on demand, too. up: vector that
     points upwards in the files, by default as transforms.json says, else +Z; cameras are turned so
-    that it is +Z. Raises InputError if the folder, a file or intrinsics are missing, images are
-    distorted, a pose is not finite or singular, or there is no frame or two of one name."""
+    that it is +Z. Raises InputError if the folder or a file is missing, intrinsics are missing,
+    images are distorted, a pose is not finite or singular, there are no frames, or two frames have
+    the same name."""
     root = Path(root)
     path = root / "transforms.json"
     if not root.is_dir():

@@ -32,7 +32,8 @@ def read_rock_image(path: str | Path) -> np.ndarray:
 
 
 def premultiplied(pixels: np.ndarray) -> np.ndarray:
-    """sRGB with straight alpha [H,W,4], uint8 or uint16 -> premultiplied linear RGBA, float32."""
+    """sRGB with straight alpha [H,W,4], uint8 or uint16 -> linear RGB premultiplied by alpha, and
+    alpha, float32."""
     alpha = pixels[..., 3:].astype(np.float32) / np.iinfo(pixels.dtype).max
     colour = linear_from_pixels(pixels[..., :3]) * alpha
     return np.concatenate([colour, alpha], axis=-1, dtype=np.float32)

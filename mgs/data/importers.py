@@ -180,7 +180,8 @@ def _mask_and_rock(
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Undistorted mask, bool [H,W], and rock image, float32 [H,W,4] linear premultiplied, that the
     source gives; None if it gives none. rgba [H,W,4]: pixels of the shot's image. Premultiplied
-    light is resampled, since straight colours mix with those of empty pixels."""
+    light is resampled, since straight colours would mix with those of empty pixels and leave a
+    rim."""
     about = shot.camera, shot.turned
     cutout = None if shot.rock is None else read_fitting(read_rgba, shot.rock, *about)
     layer = rgba if cutout is None else cutout

@@ -176,7 +176,8 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def mesh_of(corners: ArrayLike, triangles: ArrayLike, where: object = "mesh") -> Mesh:
-    """One clean surface of vertices [V,3] and faces [F,3], as `read_mesh`. where: for messages."""
+    """One clean surface of vertices [V,3] and faces [F,3], as `read_mesh`. where: begins a
+    message."""
     try:
         vertices, faces = np.array(corners, np.float64), np.array(triangles, np.int64)
     except (TypeError, ValueError):
@@ -228,7 +229,8 @@ def _numbered(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _wound_against(faces: np.ndarray) -> np.ndarray:
-    """Mask [F] of the faces [F,3] to flip so that neighbours are wound alike, as few as possible.
+    """Mask [F] of the faces [F,3] to flip so that neighbours are wound alike, as few as possible in
+    each connected piece.
 
     Neighbours share an edge with no third face, and are wound alike if they traverse it in opposite
     directions. Method: a graph with nodes f ("keep") and F + f ("flip"), and an edge between nodes

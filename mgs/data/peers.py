@@ -78,7 +78,8 @@ METASHAPE = {"frame": "OPENCV", "fisheye": "THIN_PRISM_FISHEYE"}  # as OPENSFM
 def _metashape(path: Path, folders: list[Path]) -> Contents:
     """Agisoft Metashape (File, Export, Cameras: XML): aligned and enabled cameras. Lengths are
     metres where the chunk has a scale. Position and north of a georeferenced chunk are left out. K
-    has its origin in the middle of the image, p1 and p2 are OpenCV's p2 and p1 (appendix D)."""
+    has its origin in the middle of the image, and p1 and p2 are OpenCV's p2 and p1 (its manual,
+    appendix D)."""
     chunk, views, left_out = read_xml(path).find("chunk"), list[View](), Counter[str]()
     if chunk is None:
         raise ValueError("no chunk")
@@ -273,7 +274,8 @@ def is_peer(kind: str, source: Path) -> bool:
 
 def read_peer(kind: str, source: Path, images: Path | None, *_: Any) -> Source:
     """Cameras and points of a source of this kind of PEERS. images: folder of the images, by
-    default one beside its file. Raises InputError for a damaged file or unsupported lens."""
+    default one beside its file. Raises InputError where the file is damaged, or a lens is not
+    supported."""
     path = _file_of(kind, source)
     assert path is not None
     near = [path.parent / "images", path.parent.parent / "images", path.parent, path.parent.parent]

@@ -159,7 +159,8 @@ class Source:
 
 
 def _as_held(shot: Shot) -> Camera:
-    """Camera of a shot in the axes of its picture as EXIF turns it, also of one taken as stored."""
+    """Camera of a shot in the axes of its picture as EXIF turns it, also where the file is taken as
+    it is stored."""
     turn = HELD.get(1 if shot.turned else exif_orientation(shot.image))
     if turn is None:
         return shot.camera

@@ -274,7 +274,8 @@ def refined(
     dataset: Dataset, folder: Path
 ) -> tuple[Dataset, SparseCloud | None, dict[str, dict[str, float]]]:
     """Adjust the poses of a dataset and its test views to the points that pictures share, and write
-    them; returns the new dataset, its points, and `mgs.data.frames.moves`. folder: for matches."""
+    them; returns the dataset as it is then, its points, and `mgs.data.frames.moves`. folder: for
+    matches."""
     world, tests, count = dataset.world, dataset.test_views(), len(dataset)
     frames = [*dataset.frames, *(tests.frames if tests else ())]
     matcher = Matcher.of_frames(frames, folder)

@@ -44,7 +44,8 @@ def upper_bound(
     criterion: Criterion, k: int, tolerance: float = TOLERANCE, seconds: float = np.inf
 ) -> Bound:
     """Upper bound for the gain of every set of k candidates, by their criterion. It stops at a gap
-    of `tolerance` or after `seconds`. Raises InputError unless there are k > 0 candidates."""
+    of `tolerance` or after `seconds`. Raises InputError for k < 1 and for fewer candidates than
+    k."""
     count = criterion.candidates
     if not 1 <= k <= count:
         raise InputError(f"certificate: {k} of {count} candidates; ask for 1 to {count}")

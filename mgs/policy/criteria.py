@@ -53,7 +53,8 @@ def lam_by_kind(lam: Array, groups: dict[str, slice]) -> dict[str, float | Array
 
 
 def observed(H: Array, lam: Array) -> NDArray[np.bool_]:
-    """Mask [N] of the Gaussians of which the images say more than the prior (Eq. 9, epsilon = lam).
+    """Mask [N] of the Gaussians about which the images say more than the prior (Eq. 9 with epsilon
+    = lam).
 
     Only the colour columns count: colour information is the sum of squared blending weights."""
     return np.asarray((H[:, :3] > lam[:3]).any(axis=1))

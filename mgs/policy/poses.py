@@ -18,7 +18,8 @@ def azimuths(positions: Array, centre: Array) -> NDArray[np.float64]:
 
 def uniform_azimuth(candidates: Array, taken: Array, centre: Array) -> Array:
     """Azimuth gap to the next view taken on the left times that on the right, square radians.
-    Splitting a gap a + b lowers the sum of squared gaps by 2ab, so this spreads greedily."""
+    Splitting a gap a + b lowers the sum of squared gaps by 2ab, so this is greedy for the most even
+    spread."""
     gaps = (azimuths(taken, centre)[None, :] - azimuths(candidates, centre)[:, None]) % (2 * np.pi)
     return _rounded(gaps.min(axis=1) * (2 * np.pi - gaps.max(axis=1)))
 
@@ -58,7 +59,8 @@ def nearest_poses(positions: Array, here: Array, count: int) -> list[int]:
 
 def travel_cost(positions: Array, here: Array, travel: float) -> NDArray[np.float64]:
     """Cost of an image at each position [C,3] for a camera that is at `here` [3], in images. It is
-    1 + distance / travel, along a straight line. travel: metres that cost as much as an image."""
+    1 + distance / travel, with the distance along a straight line. travel: metres that cost as much
+    as an image."""
     return np.asarray(1 + _rounded(np.linalg.norm(positions - here, axis=1)) / travel)
 
 

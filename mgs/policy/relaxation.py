@@ -61,7 +61,8 @@ class Bounded(ABC):
 
     @abstractmethod
     def steps(self, x: Floats, box: tuple[Floats, Floats]) -> Iterator[tuple[float, Bound]]:
-        """Yield the value at weights in the box of 0 and 1 of size sum x, and a bound there."""
+        """Yield the value at weights in the box of 0 and 1 whose size is sum x, and a bound by
+        tangents there."""
 
     def bound(
         self,

@@ -1,4 +1,5 @@
-"""The mesh prior (paper, section III-A): build, save and load it (docs/prior.md)."""
+"""The mesh prior (paper, section III-A): build it from a dataset or a mesh, save and load it
+(docs/prior.md)."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -53,7 +54,8 @@ class Prior:
       same surface, metres. It is three rms distances of the cloud from the mesh, a voxel, or two
       standard deviations of depth noise, whichever is largest; for a given mesh, the spacing.
     - numbers: contents of prior.json, where `up` is the dataset's upward direction in its files.
-    - backed: the first `backed` points, evenly spread, have a second Gaussian behind them."""
+    - backed: the first `backed` points, evenly spread, have a second Gaussian behind the surface
+      (`mgs.prior.initial`)."""
 
     mesh: Mesh
     points: np.ndarray

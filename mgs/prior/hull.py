@@ -52,7 +52,8 @@ def visual_hull(frames: Sequence[Frame]) -> Surface:
 
 
 class _Contradiction(InputError):
-    """Masks that do not fit, with the place of the frame that fits least and its share."""
+    """Masks that do not fit, with the place of the frame that fits least and the share that it
+    alone cuts away."""
 
     def __init__(self, what: str, frames: Sequence[Frame], odd: tuple[int, float, float]) -> None:
         self.place, self.share, usual = odd

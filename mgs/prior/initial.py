@@ -1,5 +1,6 @@
 """Initial Gaussians from the prior and some frames (paper, section III-A): one layer, and for every
-second one a larger, opaque one behind it, so that the far side is hidden (docs/fit.md)."""
+second one a larger, opaque one behind it, so that the far side does not show through
+(docs/fit.md)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -50,7 +51,8 @@ def initial_gaussians(
     antialiased: bool = True,
     linear: bool = True,
 ) -> tuple[Gaussians, np.ndarray]:
-    """Place one flat Gaussian per sample of a prior, in its mean colour; then one per backed one.
+    """Place one flat Gaussian per sample of a prior, in its mean colour, then one behind each
+    backed sample.
 
     pixel: unit of INSET, metres, by default `pixel_on` for the frames' cameras. gains: [V,3]
     exposures that divide the colours (`mgs.prior.exposure`). colours: `colours_of(prior)`, to reuse
@@ -140,7 +142,8 @@ def colours_of(prior: Prior) -> Callable[[Frame], Colours]:
 
 def pixel_on(prior: Prior, cameras: Sequence[Camera]) -> float:
     """Size of a pixel of the closest cameras on the surface, metres: z-depth over focal length,
-    median over samples, then percentile CLOSEST of the cameras with some in front; else 0."""
+    median over samples, then percentile CLOSEST of the cameras that have some in front; 0 if none
+    has."""
     sizes = []
     for camera in cameras:
         z = camera.project(prior.points)[1]
@@ -174,7 +177,8 @@ def seen_colours(
     points: np.ndarray, normals: np.ndarray, frame: Frame, depth: np.ndarray, tolerance: float
 ) -> Colours:
     """Mask [N] of the surface points that a frame sees inside its mask, and their colours, [seen,3]
-    linear RGB. normals, depth [H,W], tolerance: as `visible`. Raises InputError as `Frame.rgb`."""
+    linear RGB. normals, depth [H,W], tolerance: as `visible`. Raises InputError if a file cannot be
+    read."""
     seen = visible(points, normals, frame.camera, depth, tolerance) & in_mask(points, frame)
     pixels, _ = frame.camera.project(points[seen])
     at, rgb = [pixels[:, 1] - 0.5, pixels[:, 0] - 0.5], frame.rgb()

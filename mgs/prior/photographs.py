@@ -33,7 +33,8 @@ ONE_SIDED = 0.5  # least length of the mean normal of points seen from one side
 
 def choose_source(dataset: Dataset, source: str | None = None, points: Path | None = None) -> str:
     """Source of a dataset's prior: the one asked for, else the first of depth, points, hull and
-    random. points: file of a given cloud. Raises InputError if there is no such source."""
+    random. points: file of a given cloud. Raises InputError if there is no source, or not the one
+    asked for."""
     has = {
         "depth": any(frame.depth_path for frame in dataset.frames),
         "points": points is not None or (dataset.root / CLOUD).is_file(),
@@ -94,7 +95,8 @@ def surface_of(
 ) -> Surface:
     """Surface of the source "points" or "hull". points: file of the cloud, by default the dataset's
     own. With masks, the hull bounds the surface of the points and closes it. Raises InputError as
-    `visual_hull`, `read_cloud` and `segment_points`, and NoSurface if it cannot be closed."""
+    `visual_hull`, `read_cloud` and `segment_points`, and NoSurface if the surface cannot be
+    closed."""
     if source == "hull":
         settings.refuse_shaping("a hull is carved from masks")
         return visual_hull(dataset.frames)

@@ -78,7 +78,8 @@ def on_surface(points: np.ndarray) -> np.ndarray:
 def main_cluster(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, int]:
     """Points [N,3] of the cluster of largest total weight [N], bool [N], and the number of
     clusters; all points and 0 if no part is denser. HDBSCAN (Campello et al. 2013, scikit-learn).
-    Points of no cluster, because few are around them, belong to the one next to them."""
+    Points that it gives to no cluster, because few are around them, belong to the one next to
+    them."""
     from sklearn.cluster import HDBSCAN
 
     least = max(CLUSTER_SAMPLES, int(CLUSTER_SHARE * len(points)))

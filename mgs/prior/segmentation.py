@@ -112,7 +112,8 @@ def rock_cluster(
     sparse: float = 0.0,
     belongs: Callable[[np.ndarray, np.ndarray], bool] = lambda part, rock: False,
 ) -> tuple[np.ndarray, float, int]:
-    """Find the rock among points above the ground [N,3] (DBSCAN, Ester et al. 1996).
+    """Find the rock among points above the ground [N,3], by DBSCAN (Ester et al. 1996,
+    scikit-learn).
 
     voxel: distance between neighbours, metres. target: [3] point that the cameras look at, metres.
     name: of the cloud, for messages. weight: points [N,3] -> weights [N]. sparse: distance between

@@ -13,9 +13,11 @@ class PriorSettings:
     """Settings of a prior.
 
     - gaussians: number of Gaussians, on the surface and behind it. "auto", the default if neither
-      spacing nor density is given: as many as the closest camera resolves, up to a limit.
+      spacing nor density is given: as many as the closest camera resolves, up to a limit
+      (`mgs.prior.resolution`).
     - spacing: distance between samples, metres, in place of `gaussians`.
-    - density: samples per square voxel of the cloud, in place of both; a voxel is about a pixel.
+    - density: samples per square voxel of the cloud, in place of both; a voxel is about a pixel on
+      the rock.
     - backing: Gaussians behind the surface per sample (`mgs.prior.initial`), 0 to 1; the paper: 0.
     - poisson_depth: octree depth of the Poisson reconstruction, 3 to 12; by default its finest
       cells are at most 1.5 voxels.

@@ -45,7 +45,8 @@ class Surface:
 def poisson_mesh(
     points: np.ndarray, normals: np.ndarray, voxel: float, plane: Plane, depth: int | None
 ) -> tuple[Mesh, int]:
-    """Watertight screened Poisson surface of the rock, cut flat at the ground; octree depth.
+    """Watertight screened Poisson surface of the rock, cut flat at the ground plane, and octree
+    depth.
 
     points, normals: [M,3], metres and unit vectors; voxel: distance between neighbours, metres;
     depth: of the octree, None for finest cells of at most 1.5 voxels. The reconstruction closes the
@@ -234,7 +235,8 @@ def _blue_noise(points: np.ndarray, count: int, spacing: float) -> np.ndarray:
 
 def _independent(pairs: np.ndarray, n: int) -> np.ndarray:
     """Take 0, 1, ... n-1 in turn, except partners in `pairs` [P,2] of one taken before. Vectorised
-    rounds: one is taken if it has no smaller undecided partner; its partners are dropped."""
+    rounds: a number is taken if it has no smaller undecided partner; partners of taken numbers are
+    dropped."""
     low, high = pairs.min(1), pairs.max(1)
     undecided, members = np.ones(n, bool), np.zeros(n, bool)
     while undecided.any():

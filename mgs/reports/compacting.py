@@ -34,7 +34,8 @@ AGAIN = 0.3  # learning rates of a further fit over those of a first one, which 
 
 @dataclass(frozen=True)
 class Compacted:
-    """A file and its number of Gaussians. psnr: mean of the views taken, dB, before and after."""
+    """A file and its number of Gaussians. psnr: mean of the views taken, dB, of the run's model and
+    of this one."""
 
     data: bytes
     count: int

@@ -117,7 +117,8 @@ PANELS = {
 def write_preview(
     path: str | Path, maps: dict[str, np.ndarray], title: str, unit: str = "m"
 ) -> None:
-    """Write the preview of one view as a PNG: its render and the PANELS, cropped to the model.
+    """Write the preview of one view as a PNG: its render and the PANELS with colour bars, cropped
+    to the model.
 
     maps: `view_maps` of all scalars; title: of the render; unit: name of a length of 1. Raises
     InputError if the file cannot be written."""
@@ -143,7 +144,8 @@ def write_preview(
 def show_map(
     axis: Any, maps: dict[str, np.ndarray], channel: str, window: Any, colours: str, **scale: Any
 ) -> Any:
-    """Draw a channel of `view_maps` into axes, grey where the opacity is below VISIBLE.
+    """Draw a channel of `view_maps` into axes without frame, grey where the opacity is below
+    VISIBLE.
 
     window: rows and columns. colours: of a colour map. scale: `norm`, or `vmin` and `vmax`."""
     import matplotlib
@@ -170,7 +172,8 @@ def _norm(channel: str, data: np.ndarray) -> Any:
 def choose_views(
     frames: Sequence[Frame], trained: Sequence[str], names: Sequence[str] | None
 ) -> list[Frame]:
-    """The frames to draw: those named, or else VIEWS spread evenly over those not trained on.
+    """The frames to draw: those of these names, or else VIEWS frames spread evenly over those
+    not trained on.
 
     trained: names of the training frames; if these are all, the choice is among all frames. Raises
     InputError for a name that no frame has."""
@@ -188,7 +191,8 @@ def choose_views(
 
 def diagnose(run: str | PathLike[str], views: Sequence[str] | None = None) -> list[Path]:
     """Write RUN/diagnostics: information.ply, and NAME.exr and NAME.png of each view. Returns the
-    paths. views: names of frames (`choose_views`). Raises InputError as these and `open_run`."""
+    paths. views: names of frames (`choose_views`). Raises InputError for an unknown view, and as
+    `open_run`."""
     opened = open_run(run)
     gaussians, trained = opened.state.gaussians, [frame.name for frame in opened.taken]
     frames = choose_views(opened.dataset.frames, trained, views)

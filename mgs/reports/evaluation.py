@@ -34,7 +34,8 @@ def evaluate_run(
 
     Metrics and pictures of the same model, dataset and version of mgs are kept, if all are there.
     In an on-demand dataset only frames that the run has taken have an image, so none is held out.
-    Raises InputError as `open_run` and `locked`, and if test views cannot be read."""
+    Raises InputError as `open_run`, if the test views cannot be read, and if another process works
+    on the run."""
     from mgs.splat import as_drjit
 
     run = open_run(run)
@@ -139,7 +140,8 @@ def evaluate(
     - prior: of a file, as in `load_gaussians`.
 
     Raises InputError as `evaluate_run`, `load_gaussians` and `load_dataset`, if a model comes
-    without a dataset, if trained names no frame of it, and if either is given for a run."""
+    without a dataset, if trained names no frame of it, and if dataset or trained are given for a
+    run."""
     if isinstance(subject, Run) or (not isinstance(subject, Gaussians) and Path(subject).is_dir()):
         if dataset is not None or trained:
             own = "is a run, with its own dataset; leave out dataset and trained"

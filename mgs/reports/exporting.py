@@ -79,7 +79,8 @@ def in_srgb(g: Gaussians) -> Gaussians:
 
 def refit_in_srgb(run: Run) -> Gaussians:
     """Fit the colours of a run's linear model, blended in sRGB, to the views taken; the rest is
-    unchanged. Raises InputError if a file of a frame or the prior cannot be read."""
+    unchanged. Raises InputError if a file of a frame or, where exposures differ, of the prior
+    cannot be read."""
     from mgs.fit.fitting import fit_gaussians
 
     frames = run.taken

@@ -90,9 +90,11 @@ def draw_cameras(
     views: Sequence[int],
     newest: int | None = None,
 ) -> None:
-    """Draw cameras from above into axes: all as rings, seeds as discs, chosen ones numbered.
+    """Draw cameras from above into axes: all as rings, seeds as discs, chosen ones as discs with
+    their order.
 
-    newest: index of a camera to draw in NEWEST, with a line. Others: as `orbit_figure`."""
+    newest: index of a camera to draw in NEWEST, with its line to the rock. Others: as
+    `orbit_figure`."""
     xy, rock = positions[:, :2], surface[:: max(1, len(surface) // 6000), :2]
     centre = rock.mean(axis=0)
     axis.scatter(*rock.T, s=0.6, color="#b9b4ab", linewidths=0)
@@ -129,7 +131,8 @@ def curves_figure(
 ) -> None:
     """Draw curves beside each other, a panel for each quantity and a line for each label.
 
-    panels: title of the y axis -> curves. x: title of the x axis. limits: `bottom`, `top` of y."""
+    panels: title of the y axis -> curves. x: title of the x axis. limits: of the y axis, `bottom`
+    or `top`."""
     from matplotlib.ticker import MaxNLocator
 
     with drawing(path, max(4.8, 3.6 * len(panels)), 3.1) as figure:

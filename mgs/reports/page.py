@@ -64,12 +64,14 @@ class Album:
         self.pictures[name] = web_picture(self._small(pixels))
 
     def add_error(self, name: str, truth: np.ndarray, rendered: np.ndarray) -> None:
-        """Add the mean absolute sRGB difference of two images, linear RGB [H,W,3]."""
+        """Add the mean absolute difference of the sRGB channels of two images, linear RGB
+        [H,W,3]."""
         difference = np.abs(srgb_from_linear(truth) - srgb_from_linear(rendered)).mean(axis=2)
         self.errors[name] = self._small(difference).astype(np.float16)
 
     def add_uncertainty(self, name: str, values: np.ndarray, alpha: np.ndarray) -> None:
-        """Add a map of values [H,W] in [0,1], grey where alpha [H,W] is below VISIBLE."""
+        """Add a map of values [H,W] in [0,1], grey where the opacity alpha [H,W] is below
+        VISIBLE."""
         colours = painted(values, UNCERTAINTY_COLOURS)
         colours[alpha < VISIBLE] = GREY
         self.pictures[name] = web_picture(self._small(colours))
@@ -102,7 +104,8 @@ def web_picture(pixels: np.ndarray) -> str:
 
 def new_album(frames: Sequence[Frame], count: int) -> Album:
     """An empty album for `count` pictures of views of these frames, all cropped to what any mask
-    holds, with a margin. Frames of different sizes are not cropped. Raises as `Frame.mask`."""
+    holds, with a margin. Frames of different sizes are not cropped. Raises InputError if a mask
+    cannot be read."""
     sizes = {(frame.camera.height, frame.camera.width) for frame in frames}
     window: tuple[slice, slice] = (slice(None), slice(None))
     if len(sizes) == 1:
@@ -115,7 +118,8 @@ def new_album(frames: Sequence[Frame], count: int) -> Album:
 def draw_taken(album: Album, label: str, run: Run, tick: Callable[[], None]) -> None:
     """Draw the views that a run has taken, in order: `truth/NAME`, `render/NAME/LABEL`,
     `error/NAME/LABEL`, and the uncertainty of the model before and after, `before/...`,
-    `after/...`. tick: called after each view. Raises InputError as `Frame.target`."""
+    `after/...`. tick: called after each view. Raises InputError if a file of a frame cannot be
+    read."""
     from mgs.splat import fisher, groups
 
     gaussians = run.gaussians
@@ -133,7 +137,8 @@ def draw_taken(album: Album, label: str, run: Run, tick: Callable[[], None]) -> 
 
 
 def draw_render(album: Album, name: str, frame: Frame, rendered: np.ndarray) -> None:
-    """Add `render/NAME`, `error/NAME`, and its truth if missing. rendered: linear RGB [H,W,3]."""
+    """Add `render/NAME`, `error/NAME`, and the frame's truth if it is missing. rendered: linear RGB
+    [H,W,3]."""
     truth = frame.masked_rgb()
     if f"truth/{frame.name}" not in album.pictures:
         album.add_colours(f"truth/{frame.name}", truth)

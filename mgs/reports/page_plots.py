@@ -107,7 +107,8 @@ def timing_plot(label: str, steps: Sequence[Mapping[str, Any]]) -> dict[str, Any
 
 
 def views_plot(metric: str, runs: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
-    """A metric of every view, for each run: filled for views trained on, open for others.
+    """A metric of every view, for each run: filled markers for views trained on, open ones for
+    others.
 
     runs: label -> views of metrics.json; views without this metric are left out."""
     traces = []
@@ -311,7 +312,8 @@ def psnr_of(run: Run, view: str) -> str:
 
 
 def setting_rows(runs: Mapping[str, Run]) -> list[tuple[str, list[str], bool]]:
-    """Rows of the table of settings and versions: (key, value of each run, whether they differ)."""
+    """Rows of the table of settings and versions: (key, a value for each run, whether they
+    differ)."""
     columns = []
     for run in runs.values():
         versions = run.config.get("versions", {}).items()
@@ -334,7 +336,8 @@ def _texts(values: Mapping[str, Any], path: str = "") -> dict[str, str]:
 
 
 def links(run: Run, page: Path) -> list[tuple[str, str]]:
-    """(address relative to the page, name) of the files of a run that a reader may open."""
+    """(address relative to the page, name) of the existing files of a run that a reader may
+    open."""
     names = ["gaussians.ply", "metrics.json", "steps.jsonl", "config.json"]
     maps = sorted(run.folder.glob("diagnostics/*.exr"))
     names += ["diagnostics/information.ply", *(f"diagnostics/{file.name}" for file in maps)]

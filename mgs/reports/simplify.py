@@ -27,7 +27,8 @@ LARGEST_LOSS = 10.0  # of `refit_run`, dB: with that next to nothing is learned 
 @dataclass(frozen=True)
 class PrunedRun:
     """Numbers of Gaussians before and after, rms change of the training images, predicted and
-    actual, and PSNR before and after on `views`, "test" or "held-out", dB, if any."""
+    actual, and PSNR before and after on `views`, "test" or "held-out", dB; None if there are
+    none."""
 
     before: int
     after: int
@@ -38,7 +39,8 @@ class PrunedRun:
 
 
 def prune_run(run: str | Path, noise: float = PRUNE_NOISE) -> PrunedRun:
-    """Prune the model of a run by its training views (`mgs.fit.pruning`); write RUN/PRUNED.
+    """Prune the model of a run by its training views (`mgs.fit.pruning.prune`), and write
+    RUN/PRUNED.
 
     Both models are compared on the test views of the dataset, or without them on the held-out
     views. Raises InputError as `open_run` and `prune`."""
@@ -59,7 +61,8 @@ def prune_run(run: str | Path, noise: float = PRUNE_NOISE) -> PrunedRun:
 @dataclass(frozen=True)
 class RefittedRun:
     """Learned parameters of the run, the refitted model, and PSNR on `views`, "test" or "held-out",
-    dB: of the run's own model, of one refitted with all parameters, and of the refitted one."""
+    dB: of the run's own model, of one refitted with all parameters, and of the refitted one, or
+    None."""
 
     before: int
     lean: "LeanModel"
@@ -78,7 +81,8 @@ def refit_run(
     A vertex of the file has a byte for each kind of parameter, `learned_colour` and so on: 1 if it
     was learned; else the file holds the prior's value. The models are compared on the test views,
     or without them on the held-out views. Raises InputError as `open_run` and `lean_fit`, for wrong
-    arguments, for a run whose density is not fixed, and if prior or images have changed."""
+    arguments, for a run whose density is not fixed, and if the prior or the images are not those of
+    the run."""
     from mgs.fit.evidence import lean_fit
     from mgs.learning import images_of
     from mgs.scene import Scene

@@ -32,7 +32,8 @@ def write_suggestion(out: Path, run: Run, suggestion: Suggestion) -> None:
     """Write suggestions.json, transforms.json and suggestions.png into the folder `out`.
 
     transforms.json is a dataset of the planned poses in flying order, in the coordinates of the
-    data that was imported; their pictures belong in images/. Raises InputError as `write_json`."""
+    data that was imported; their pictures belong in images/. Raises InputError if a file cannot be
+    written."""
     write_json(out / "suggestions.json", numbers(run, suggestion))
     world, frames = run.dataset.world, []
     for k, view in enumerate(suggestion.plan):
@@ -72,7 +73,8 @@ def _record(view: View, world: World) -> dict[str, Any]:
 
 def draw_suggestion(path: str | Path, run: Run, suggestion: Suggestion) -> None:
     """Draw the site from above, for the first planned views what the model shows from there and how
-    uncertain it is, and the curve of the certificate. Raises InputError as `drawing`."""
+    uncertain it is, and the curve of the certificate. Raises InputError if the figure cannot be
+    written."""
     views = suggestion.plan[:MOST_PICTURES]
     scalars = {"uncertainty": run_scalars(run)["uncertainty"]}
     curve = suggestion.certificate.curve if suggestion.certificate else []

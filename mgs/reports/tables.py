@@ -167,7 +167,8 @@ def has_held_out(rows: Sequence[Mapping[str, Any]]) -> bool:
 
 def table_cell(key: str, value: Any) -> str:
     """Format a number as a table cell: SSIM with four decimals, PSNR (dB), coverage (%) and path
-    with two, others with five digits; a dash for None. key: as in HEADERS or metrics.json."""
+    with two, others with five digits; a dash for None. key: its name, as in HEADERS or
+    metrics.json."""
     if value is None:
         return "–"
     if not isinstance(value, float):

@@ -97,7 +97,8 @@ def plan_flight(
 
 def planned_flight(scene: Scene, state: State, policy: Policy, mission: Mission) -> Sequence[int]:
     """Rest of the tour that a policy with `tour_gains` plans after the seeds; empty for others. If
-    another view was taken than the next one of the plan, a new one is made after all taken."""
+    another view was taken than the next one of the plan, a new plan is made after all views
+    taken."""
     tour_gains = getattr(policy, "tour_gains", None)
     if tour_gains is None or mission.nearest is not None:
         return []

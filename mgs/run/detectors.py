@@ -181,7 +181,8 @@ def step_indicators(
 
 
 def means_drift(means: np.ndarray, start: np.ndarray, std: float) -> float:
-    """Root mean square distance of means [N,3] from their start, over their prior's std, metres."""
+    """Root mean square distance of means [N,3] from their start, over `std`, the standard deviation
+    of their prior, metres."""
     return float(np.sqrt(np.mean(((means - start) ** 2).sum(axis=1))) / std)
 
 

@@ -14,7 +14,8 @@ from mgs.scene import Scene, State
 
 
 def allowed(scene: Scene, mission: Mission, positions: Array | None = None) -> NDArray[np.bool_]:
-    """Whether the camera may be at each position [V,3], by default of the frames."""
+    """Whether the camera may be at each position [V,3], by default of the frames: outside `no_fly`,
+    above `clearance`."""
     if positions is None:
         positions = scene.positions(scene.frames)
     out = np.linalg.norm(positions[:, :2] - scene.centre[:2], axis=1)
@@ -33,7 +34,8 @@ def free(scene: Scene, state: State, mission: Mission) -> list[int]:
 
 
 def reachable(scene: Scene, state: State, mission: Mission) -> list[int]:
-    """Views of `free` within the limits of the flight; with `nearest`, the nearest to the last."""
+    """Views of `free` within the limits of the flight; with the setting `nearest`, those nearest to
+    the last view."""
     views = free(scene, state, mission)
     if mission.flies:
         views = flight_of(scene, state, mission).in_reach(state.taken, views)

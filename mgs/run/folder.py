@@ -110,8 +110,9 @@ class Run:
     @property
     def shown(self) -> np.ndarray:
         """Mask [N] of the Gaussians to show and to export: in a whole scene those about which the
-        views taken say more than a colour's prior (`mgs.policy.criteria.observed`), and black ones
-        that they see. An object's surface is the prior's where no view saw it; all is shown."""
+        views taken say more than a colour's prior (`mgs.policy.criteria.observed`), and black
+        ones that they see. The surface of an object is the prior's where no view saw it, and all of
+        it is shown."""
         if not self.of_scene:
             return np.ones(len(self.gaussians), bool)
         H = self.state.H
@@ -339,7 +340,8 @@ def read_record(out: Path) -> dict[str, Any] | None:
 
 
 def read_checkpoint(out: Path) -> Checkpoint | None:
-    """Read the state after the last step; None before the first. Raises as `read_record`."""
+    """Read the state after the last finished step; None before the first. Raises InputError as
+    `read_record`."""
     record = read_record(out)
     if record is None:
         return None

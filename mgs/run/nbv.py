@@ -132,7 +132,8 @@ def start_run(
       whose source is kept in the run. Its default from random points is WITHOUT_SURFACE. The
       default of `budget` is 50 views or all candidates; "auto" is the fewest views that have the
       share `enough` of the gain of all candidates by the policy's criterion, at the model before
-      training. `alpha_weight` is by default ALPHA_WEIGHT, or 0 without masks and alpha.
+      training. The default of `alpha_weight` is ALPHA_WEIGHT, or 0 if frames have neither mask nor
+      alpha.
 
     Leaves no folder behind if it fails. Raises InputError if the folder is not empty, a setting is
     invalid, the dataset is too small, an input is missing or damaged, or the cameras are too near
@@ -337,11 +338,13 @@ def resume_nbv(
       taken from the folder. A Run that was started in this process knows its policy.
     - live: as in `start_run`; give it again if pictures are still to be captured. If no pose was
       left, those that were given up are asked for again.
-    - on_pass: called as on_pass(done, most, model) after each pass; the model has Dr.Jit fields.
+    - on_pass: called as on_pass(done, most, model) after each pass of a fit; the model has Dr.Jit
+      fields.
     - like: as in `scene_of`; `on_pass` is then the scene's own.
 
     A finished run is returned as it is. Raises InputError if the folder holds no run, its inputs
-    are missing or changed, another process works on it, a fit diverged, or `policy` is another."""
+    are missing or changed, another process works on it, a fit diverged, or `policy` is not the
+    run's."""
     run = open_run(run)
     policy = policy or run.policy
     check_named(run, policy)

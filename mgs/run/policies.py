@@ -9,7 +9,8 @@ information. It has
 
 and may have
 
-- geometric: true if it ignores how much a view tells; a small gain then says nothing.
+- geometric: true if it ignores how much a view tells; a view of small gain then says nothing of the
+  others.
 - plan(scene, state, views, count, nearest): the views to choose from, those of a plan of at most
   `count` of `views`; with `nearest`, each among so many nearest to the one before.
 - tour_gains(scene, state): gains by which a flight is planned (`PoolGains`), if any.

@@ -71,7 +71,8 @@ def is_function(name: str) -> bool:
 
 
 def code_of(policy: Callable[..., Any]) -> str:
-    """Source text of a function, or of an object and its class; empty where it is unknown."""
+    """Source text of a function, or of an object and its class; empty where Python does not know
+    it."""
     plain = inspect.isroutine(policy) or isinstance(policy, type)
     try:
         source = inspect.getsource(policy if plain else type(policy))

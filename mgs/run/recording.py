@@ -139,7 +139,8 @@ def _go_on(
 
 def check_model(out: Path, scene: Scene, settings: NbvSettings, state: State) -> None:
     """Raises InputError where a state does not belong to a run of these settings and this prior.
-    Its means are those of the prior where frozen, its parameters as many as the run learns."""
+    Its means must be those of the prior where they are frozen, and its parameters as many as the
+    run learns."""
     if state.H.shape[1] != len(scene.lam):
         where = f"{out / 'config.json'}: settings.train.means"
         raise InputError(f"{where} has changed since {out} was started; restore it")

@@ -2,7 +2,8 @@
 z-depth in metres, 0 = no return.
 
 Sources: Nguyen, Izadi and Lovell, 3DIMPVT 2012 (axial and lateral noise); Khoshelham and Elberink,
-Sensors 12(2), 2012 (quantisation). Lost grazing returns have no published curve; ours is linear."""
+Sensors 12(2), 2012 (quantisation). Lost returns on grazing surfaces have no published curve; ours
+is linear."""
 
 import numpy as np
 
@@ -71,7 +72,8 @@ def noisy_depth(
 
 def depth_noise(depth: np.ndarray) -> float:
     """Standard deviation of the noise in a depth image [H,W], metres; 0 if under 100 pixels can be
-    used. Estimated from second differences within rows, where smooth surfaces give little."""
+    used. Estimated from second differences within rows, to which smooth surfaces contribute
+    little."""
     whole = (depth[:, :-2] > 0) & (depth[:, 1:-1] > 0) & (depth[:, 2:] > 0)
     second = (depth[:, :-2] - 2 * depth[:, 1:-1] + depth[:, 2:])[whole]
     if len(second) < 100:

@@ -154,7 +154,8 @@ def save_survey(
     out: Path, dataset: Dataset, survey: Survey, settings: SurveySettings
 ) -> dict[str, Any]:
     """Write a survey into the folder `out`: the dataset of `write_survey`, cloud.ply, survey.json
-    and survey.png. Returns the contents of survey.json. Raises InputError as `fuse_frames`."""
+    and survey.png. Returns the contents of survey.json. Raises InputError as `fuse_frames`, and if
+    a file cannot be written."""
     numbers = survey_numbers(dataset, survey, settings)
     cloud = fuse_frames(write_survey(out, dataset, survey).frames)
     numbers["points"] = len(cloud.points)

@@ -114,7 +114,8 @@ def optimise(
     initial: poses [F,4,4], returned unchanged without loops; the first one is fixed. odometry:
     steps [F-1,4,4], with `step_deviation` for the factor `drift`. edges, loops: with standard
     deviations of a fifth of a cell (`grid`, metres), and the angle that moves a point 50 cells away
-    by as much (measured: 6 mm and 0.08 degrees with cells of 30 mm). Loops have a Huber loss."""
+    by as much (measured: 6 mm and 0.08 degrees with cells of 30 mm). Loops have a Huber loss,
+    against wrong ones."""
     import gtsam
 
     if not loops:

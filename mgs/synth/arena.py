@@ -63,7 +63,8 @@ def make_stones(
     settings: Arena, rock: trimesh.Trimesh, ground: trimesh.Trimesh, rng: np.random.Generator
 ) -> trimesh.Trimesh | None:
     """Small stones scattered over the ground, one mesh with the vertex attribute `color` (linear
-    RGB). None without stones, or without room between clearance and `spread`."""
+    RGB). None if the settings ask for no stones, or leave no room between clearance and
+    `spread`."""
     if not settings.stones:
         return None
     noise = Noise(rng)

@@ -118,7 +118,8 @@ def _aimed(
 def perturb(
     cameras: list[Camera], position: float, rotation: float, rng: np.random.Generator
 ) -> list[Camera]:
-    """Cameras with independent Gaussian pose errors. position, rotation: as of `PoseNoise`."""
+    """Cameras with independent Gaussian pose errors. position, rotation: standard deviations per
+    axis, metres and degrees."""
     from scipy.spatial.transform import Rotation  # here, so that `mgs --help` does not load it
 
     noisy = []

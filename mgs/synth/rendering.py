@@ -80,7 +80,8 @@ def synth_orbit(
     """Render a scene as a dataset into the folder `out` (files: docs/data.md); return the dataset.
 
     - scene: name of a scene of mgs, path of a TOML file, or a loaded scene.
-    - preset: a name of PRESETS, or a `RenderPreset`. frames, size, spp replace its numbers.
+    - preset: a name of PRESETS, or a `RenderPreset`. frames, size (width, height) and spp replace
+      its numbers.
     - seed: of all random draws in rock, ground and rendering.
     - mesh: file of a rock in place of the procedural one. mesh_up: its up axis, "y" or "z"; by
       default `up_axis`.

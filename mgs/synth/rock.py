@@ -1,4 +1,5 @@
-"""Rocks as textured meshes that stand in the ground z = 0: procedural, or from a file."""
+"""Rocks as textured meshes that stand in the ground z = 0: procedural, by band-limited noise, or
+from a mesh file."""
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -117,11 +118,13 @@ def up_axis(path: str | Path) -> str:
 def load_rock(
     path: str | Path, settings: Rock, up: str | None = None
 ) -> tuple[trimesh.Trimesh, float]:
-    """Read a mesh file as the rock, with its texture, scale it to `settings.size`, put it up.
+    """Read a mesh file as the rock, with its texture, scale it to `settings.size` and stand it in
+    the ground.
 
     up: "y" or "z", by default `up_axis`. Returns the mesh, +Z up, and the scale. Faces without area
     and repeated faces are removed: normals of opposite faces cancel, and a vertex without normal
-    has no shading. Raises InputError as `load_mesh`, and if it is a point or flat."""
+    has no shading. Raises InputError as `load_mesh`, and if all vertices are one point or at one
+    height."""
     mesh = load_mesh(path)
     _leave_out_bad_faces(mesh)
     if mesh.extents.max() == 0:

@@ -99,7 +99,8 @@ def _sums(
     scene: Any, sensor: Any, sampler: Any, integrator: Any, spp: int, each: int
 ) -> np.ndarray:
     """Sums of `each` of `spp` samples per pixel, float32 [H,W,C], with `mi.render`'s samples.
-    Unlike its film, whose threads add to a pixel in any order, the sums are always the same."""
+    Unlike its film, whose threads add to a pixel in any order, the sums do not depend on
+    threads."""
     width, height = sensor.film().size()
     pixel = dr.arange(mi.UInt32, width * height * each) // each
     row = pixel // width
@@ -129,7 +130,8 @@ def with_coverage(values: np.ndarray, share: np.ndarray, coverage: np.ndarray) -
 def continued(values: np.ndarray, coverage: np.ndarray) -> np.ndarray:
     """The rock's channels in front of a backdrop that continues them beyond its outline, [H,W,C].
     values [H,W,C]: channels of the rock alone; coverage [H,W]. The backdrop is the mean of the rock
-    nearby (CONTINUATION). In front of black, a denoiser makes mistakes at the edge."""
+    nearby (CONTINUATION). In front of black there would be an edge, at which a denoiser makes
+    mistakes."""
     mean = gaussian_filter(values, (CONTINUATION, CONTINUATION, 0))
     weight = gaussian_filter(coverage, CONTINUATION)[..., None]
     return values + (1 - coverage[..., None]) * mean / np.maximum(weight, WEIGHT_MIN)

@@ -31,7 +31,8 @@ _MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])  # x to the left, y up, z
 
 @dataclass(frozen=True)
 class Rendered:
-    """One frame, linear radiance before exposure. Depth and mask are at pixel centres."""
+    """One frame, linear radiance before exposure. Depth and mask are taken along the rays through
+    the pixel centres."""
 
     rgb: np.ndarray  # [H,W,3], mean over the pixel
     rock: np.ndarray  # [H,W,4], the rock alone, premultiplied by alpha, its share of the pixel
@@ -106,7 +107,8 @@ class MitsubaScene:
         """Path-trace one frame with `spp` samples per pixel; denoise: by Open Image Denoise.
 
         Pixels that the rock covers wholly are the same in the image and in the picture of the rock
-        alone. At the outline the latter is denoised on its own, by its own albedo and normals."""
+        alone. At the outline the latter is denoised on its own, guided by albedo and normals of the
+        rock alone."""
         return self.trace(camera, spp, seed, denoise).developed()
 
     def trace(self, camera: Camera, spp: int, seed: int, denoise: bool) -> Traced:
@@ -184,14 +186,16 @@ def _denoise(rgb: np.ndarray, guides: np.ndarray) -> np.ndarray:
 
 
 def whole_grid(spp: int) -> int:
-    """Round samples per pixel up to a full grid, about square, as Mitsuba's `multijitter` does."""
+    """Round samples per pixel up to a full grid of about as many rows as columns, as Mitsuba's
+    `multijitter` does."""
     columns = isqrt(spp)
     return columns * -(-spp // columns)
 
 
 def sensor_dict(camera: Camera) -> dict[str, Any]:
     """Mitsuba perspective sensor of a camera; a pixel is the mean over its area. Samples are
-    correlated multi-jittered: with 16, frames are 3 dB nearer to the truth (docs/data.md)."""
+    correlated multi-jittered: with 16, frames are 3 dB nearer to the truth than with independent
+    ones (docs/data.md)."""
     K, w, h = camera.K, camera.width, camera.height
     film = {"type": "hdrfilm", "width": w, "height": h, "pixel_format": "rgb"}
     return {

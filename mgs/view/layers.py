@@ -190,7 +190,8 @@ def gaussian_colours(subject: Subject, layer: str) -> np.ndarray:
 def kernel_image(
     subject: Subject, camera: Camera, layer: str
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """Draw a layer from a camera: sRGB uint8 [H,W,3], z-depth float32 [H,W], ends of its scale.
+    """Draw a layer from a camera: sRGB uint8 [H,W,3], z-depth float32 [H,W], and (low, high) of the
+    colour scale.
 
     Camera and depth have the lengths that are shown, the scale of depth those of the world. Behind
     the model it is black, and FAR away. Scalars are drawn where the opacity is at least VISIBLE."""
