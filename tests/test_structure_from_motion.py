@@ -135,7 +135,7 @@ def test_pictures_without_texture_get_no_points(tmp_path):
 @pytest.fixture(scope="module")
 def placed(frames, tmp_path_factory):
     """Import of the same pictures as JPEG without poses: one lies on its side and says so in its
-    EXIF, all have GPS, and there are a copy, a blank one and one that is cut off."""
+    EXIF, all have GPS, and there are a copy, a PNG of one, a blank one and one that is cut off."""
     root = tmp_path_factory.mktemp("photographs") / "photos"
     root.mkdir()
     for k, frame in enumerate(frames):
@@ -150,6 +150,7 @@ def placed(frames, tmp_path_factory):
             image = image.transpose(Image.Transpose.ROTATE_90)
         image.save(root / f"{frame.name}.jpg", exif=exif, quality=98)
     shutil.copy(root / "view 00.jpg", root / "z copy.jpg")
+    shutil.copy(frames[1].image_path, root / "view 01.png")
     Image.new("RGB", (WIDTH, HEIGHT), "grey").save(root / "blank.jpg")
     whole = (root / "view 01.jpg").read_bytes()
     for name, part in {"cut off": whole[:100], "half": whole[: len(whole) // 2]}.items():
@@ -186,10 +187,10 @@ def test_photographs_alone_get_their_poses_in_metres(frames, placed):
 
 
 def test_photographs_that_are_left_out_are_named_with_the_reason(placed):
-    assert sum(placed[1].left_out.values()) == 5
+    assert sum(placed[1].left_out.values()) == 6
     notes = " ".join(placed[1].notes)
     for names, why in {
-        "z copy.jpg": "are copies",
+        "view 01.png, z copy.jpg": "are copies",
         "blank.jpg": "are blurred",
         "cut off.jpg, half.jpg": "cannot be read",
         "phone.heic": "are HEIC or raw: convert them to JPEG",

@@ -93,8 +93,9 @@ def read_photographs(
 
 
 def _usable(paths: Sequence[Path]) -> tuple[list[Path], dict[str, str]]:
-    """Photographs that can be read and are no copies, and why the others are left out, by name."""
-    usable, dropped, seen = [], dict[str, str](), dict[str, str]()
+    """Photographs that can be read and are no copies, also by name without its ending, and why the
+    others are left out, by name."""
+    usable, dropped, seen = [], dict[str, str](), set[str]()
     for k, path in enumerate(paths):
         report("reading photographs", k, len(paths))
         if path.suffix.lower() in UNREAD:
@@ -105,11 +106,11 @@ def _usable(paths: Sequence[Path]) -> tuple[list[Path], dict[str, str]]:
         except InputError:
             dropped[path.name] = "that cannot be read"
             continue
-        copy = hashlib.sha256(path.read_bytes()).hexdigest()
-        if copy in seen:
-            dropped[path.name] = "that are copies of others"
+        same = {hashlib.sha256(path.read_bytes()).hexdigest(), str(path.with_suffix(""))}
+        if same & seen:
+            dropped[path.name] = "that are copies of others, or have their name"
             continue
-        seen[copy] = path.name
+        seen |= same
         usable.append(path)
     return usable, dropped
 
