@@ -225,8 +225,8 @@ DETECTORS: dict[str, Detector] = {
     "exposure": Detector(
         0.22,
         "exposure drifts: one image as a whole is brighter or darker than the model fitted to all, "
-        "by {share:.0f} % of the spread of its pixels (limit {most:.0f} %); try `exposure`, but "
-        "not where the light changed",
+        "by {share:.0f} % of the spread of its pixels (limit {most:.0f} %); try `exposure`, which "
+        "mends little where the light changed: there, use pictures of one light",
     ),
     "pose": Detector(
         1.0,  # good runs: up to 0.96
