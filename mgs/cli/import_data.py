@@ -18,7 +18,8 @@ from mgs.files import Ours, clear_folder, scratch_folder
 if TYPE_CHECKING:
     from mgs.data.clouds import SparseCloud
     from mgs.data.dataset import Dataset
-    from mgs.data.shots import Source
+    from mgs.data.shots import Shot, Source
+    from mgs.data.structure import Matcher
 
 MANY_PIXELS = 2_000_000  # pixels of an image beyond which --downscale is recommended
 EXPOSURE_DIFFERS = 0.1  # stops by EXIF beyond which --exposure is recommended
@@ -126,8 +127,8 @@ def import_data(
                 result, cloud, moves = refined(result, scratch / "every")
                 console.print(moves_in_words(moves, result.unit))
             elif lacks_points(result) and right:
-                cameras = [result.world.leave(frame.camera) for frame in result.frames]
-                cloud = matcher.triangulated(cameras)
+                larger = source_shots.shots if downscale > 1 else []
+                cloud = _triangulated(result, matcher, larger, scratch / "source")
             if cloud is not None:
                 write_cloud(out / CLOUD, cloud)
     if mesh is not None and mesh.suffix.lower() in GLTF:
@@ -145,6 +146,23 @@ def import_data(
     world = f"up {_numbers(upward)}, {reason}"
     _print_summary(console, shots, tests, result, f"{fits}; {world}")
     console.print(f"{out} is finished already" if finished else f"wrote {out}", soft_wrap=True)
+
+
+def _triangulated(
+    result: Dataset, matcher: Matcher, larger: Sequence[Shot], folder: Path
+) -> SparseCloud | None:
+    """Points at the poses of a dataset; where its pictures give too few, those of the `larger` ones
+    that they were made of, if any. matcher: of its pictures. folder: for other matches."""
+    from mgs.data.structure import Matcher
+    from mgs.images import exif_orientation
+
+    cameras = [result.world.leave(frame.camera) for frame in result.frames]
+    cloud = matcher.triangulated(cameras)
+    upright = {s.name: s for s in larger if s.turned or exif_orientation(s.image) == 1}
+    if cloud is None and len(upright) == len(cameras):
+        shots = [upright[frame.name] for frame in result.frames]
+        cloud = Matcher.of_shots(shots, folder).triangulated(cameras)
+    return cloud
 
 
 def _points(cloud: SparseCloud) -> str:
