@@ -222,7 +222,7 @@ PAIRS = {
     "mgs with mesh / SPZ": (WITH, "SPZ"),
     "compressed PLY / SPZ": ("compressed PLY", "SPZ"),
     "SOG / SPZ": (SOG, "SPZ"),
-    "mgs / JPEG": (ALONE, JPEG),
+    "mgs with mesh / JPEG": (WITH, JPEG),
 }
 """Coders compared, by the heading of their column."""
 

@@ -51,23 +51,19 @@ def compact_run(
     neither can be reached, for a shared prior whose Gaussians were moved or changed by the fit, and
     as `Run.state`."""
     measured = _measure(run)
-    before, best = measured(run.gaussians), list[tuple[float, Compact]]()
+    before, files = measured(run.gaussians), list[tuple[float, Compact]]()
     _check_reachable(str(run.folder), psnr, before)
     encoder = encoding(run, shared)
     enough = None if psnr is None else lambda model: measured(model) >= psnr
     for some, kept in thinned(run, whole=shared):
         report("choosing steps")
         file = _fitted(encoder(some, kept), size, enough)
-        if file is None:
-            continue
-        value = measured(file.model) if size else -len(file)
-        if best and value <= best[-1][0]:
-            break  # fewer Gaussians would be worse still
-        best.append((value, file))
-    if not best:
+        if file is not None:
+            files.append((measured(file.model) if size else -len(file), file))
+    if not files:
         least = "it takes more bytes to place its Gaussians" if size else "no steps are fine enough"
         raise InputError(f"{run.folder}: {least}; ask for more bytes or a lower psnr")
-    file = best[-1][1]
+    file = max(files, key=lambda pair: pair[0])[1]
     return Compacted(bytes(file), len(file.model), (before, measured(file.model)))
 
 
