@@ -161,7 +161,8 @@ def _triangulated(
     upright = {s.name: s for s in larger if s.turned or exif_orientation(s.image) == 1}
     if cloud is None and len(upright) == len(cameras):
         shots = [upright[frame.name] for frame in result.frames]
-        cloud = Matcher.of_shots(shots, folder).triangulated(cameras)
+        pictures = [(shot.image, shot.camera, shot.lens) for shot in shots]
+        cloud = Matcher.of_lenses(pictures, folder).triangulated(cameras)
     return cloud
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from mgs.data.lens import Lens
 from mgs.files import read_json, write_json
 from mgs.images import exif_orientation, unlimited_headers
 from mgs.progress import report
-
-if TYPE_CHECKING:
-    from mgs.data.shots import Shot
 
 WIDEST = 1000  # longer side, pixels, to which larger pictures are reduced for features
 FEATURES = 4096  # most features of a picture
@@ -72,14 +69,19 @@ class Matcher:
     @classmethod
     def of_frames(cls, frames: Sequence[Frame], folder: Path) -> "Matcher":
         """Matcher of the images of a dataset."""
-        cameras = [_camera(frame.camera) for frame in frames]
-        return cls([frame.image_path for frame in frames], folder, cameras)
+        return cls.of_lenses([(frame.image_path, frame.camera, None) for frame in frames], folder)
 
     @classmethod
-    def of_shots(cls, shots: "Sequence[Shot]", folder: Path) -> "Matcher":
-        """Matcher of pictures as they were taken, before an import shrinks them."""
-        cameras = [_camera(shot.camera, shot.lens) for shot in shots]
-        return cls([shot.image for shot in shots], folder, cameras)
+    def of_lenses(
+        cls, pictures: Sequence[tuple[Path, Camera, Lens | None]], folder: Path
+    ) -> "Matcher":
+        """Matcher of files, each with its camera and lens, None for a pinhole."""
+        cameras = []
+        for _, camera, lens in pictures:
+            K = camera.K
+            lens = lens or Lens("PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+            cameras.append(lens.camera(camera.width, camera.height))
+        return cls([path for path, _, _ in pictures], folder, cameras)
 
     def match(self, pairs: Iterable[tuple[int, int]]) -> None:
         """Match pairs of pictures, given by their places; what is matched already is not again."""
@@ -217,13 +219,6 @@ class Matcher:
         return pycolmap.triangulate_points(
             model, self.database, self.folder, self.folder, options=options
         )
-
-
-def _camera(camera: Camera, lens: Lens | None = None) -> Any:
-    """Camera of pycolmap. lens: None for a pinhole."""
-    K = camera.K
-    lens = lens or Lens("PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    return lens.camera(camera.width, camera.height)
 
 
 def _link_upright(path: Path, link: Path) -> None:
