@@ -22,8 +22,9 @@ LOOSER = "scale and rotation four times as free"
 STAGES = {
     "fits-training": ("fits", "--training", "--variant", "loss=squared", "--variant", LOOSER),
     "fits": ("fits", "--rocks", "8"),
-    "certificate": ("certificate", "--rocks", "12"),
+    "certificate": ("certificate", "--rocks", "8"),
     "setups": ("setups", "--rocks", "8"),
+    "setups-8": ("setups", "--rocks", "8", "--images", "8"),
     "oracle": ("oracle", "--rocks", "1"),
     "paper": ("paper", "--rocks", "8"),
     "table1": ("table1",),
