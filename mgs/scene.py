@@ -320,7 +320,9 @@ class Scene:
     def seeds(self, count: int, among: Sequence[int] | None = None) -> list[int]:
         """Views to begin with, spread over the directions of near poses (`poses.seed_views`).
 
-        among: indices to choose from, by default all."""
+        among: indices to choose from, by default all. Raises InputError if they are fewer."""
         views = range(len(self.frames)) if among is None else among
+        if count > len(views):
+            raise InputError(f"scene: {count} seeds of {len(views)} poses; ask for fewer")
         positions = self.positions([self.frames[i] for i in views])
         return [int(views[k]) for k in poses.seed_views(positions, self.centre, count)]

@@ -5,9 +5,9 @@ from numpy.typing import NDArray
 
 from mgs.policy.criteria import Array
 
-NEAR = 2**0.5
-"""Distance up to which poses are seeds, over that of the nearest: it sees the surface in half as
-many pixels."""
+# Chosen: distance up to which poses are seeds, over that of the nearest (half as many pixels see the
+# surface), and the most by which such seeds may spread less evenly than the best of all poses.
+NEAR, LESS_EVEN = 2**0.5, 1.5
 
 
 def azimuths(positions: Array, centre: Array) -> NDArray[np.float64]:
@@ -70,14 +70,22 @@ def path_length(positions: Array) -> float:
 
 
 def seed_views(positions: Array, centre: Array, count: int) -> list[int]:
-    """`count` distinct frames to begin with: `medoids` of the poses near the rock.
+    """`count` distinct frames to begin with: `medoids` of the near poses, if these are all around.
 
     Near are poses up to NEAR times as far as the nearest, because far ones say little about small
-    Gaussians; where these are fewer than `count`, the nearest. Arguments as `medoids`."""
+    Gaussians. Where they are fewer than `count`, or leave directions of the pool out, as close-ups
+    of one side do, the medoids of all poses. Arguments as `medoids`."""
+    everywhere = medoids(positions, centre, count)
     distance = _rounded(np.linalg.norm(positions - centre, axis=1))
-    near = distance <= max(NEAR * distance.min(), np.partition(distance, count - 1)[count - 1])
-    frames = np.flatnonzero(near)
-    return [int(frames[k]) for k in medoids(positions[frames], centre, count)]
+    near = np.flatnonzero(distance <= NEAR * distance.min())
+    if len(near) < count:
+        return everywhere
+    seeds = [int(near[k]) for k in medoids(positions[near], centre, count)]
+    apart, least = (
+        (angles(positions[some], positions, centre) ** 2).min(axis=0).sum()
+        for some in (seeds, everywhere)
+    )
+    return seeds if apart <= LESS_EVEN * least else everywhere
 
 
 def medoids(positions: Array, centre: Array, count: int) -> list[int]:
