@@ -178,7 +178,9 @@ LARGEST_TOML, LONGEST_LINE = 1 << 16, 1 << 12  # bytes of a file, a line: a.a.a 
 
 
 def write_columns(
-    path: str | Path, elements: Mapping[str, Mapping[str, Any]], comments: Sequence[str] = ()
+    path: str | Path,
+    elements: Mapping[str, Mapping[str, tuple[Any, str]]],
+    comments: Sequence[str] = (),
 ) -> None:
     """Write a binary PLY, atomically. elements: the properties of each, name -> (values [N], type
     of NumPy). Raises InputError if it cannot be written."""

@@ -236,7 +236,10 @@ def read_mask(path: str | Path) -> np.ndarray:
 
 
 def write_exr(
-    path: str | Path, channels: Mapping[str, Any], camera: Camera | None = None, unit: str = ""
+    path: str | Path,
+    channels: Mapping[str, np.ndarray],
+    camera: Camera | None = None,
+    unit: str = "",
 ) -> None:
     """Write an OpenEXR file with a float32 channel for each named array [H,W]; the file appears
     complete.

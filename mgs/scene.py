@@ -290,7 +290,7 @@ class Scene:
         """The same for directional gains. Where there are many pairs of a pose and a Gaussian, one
         in k Gaussians, of k times the area, in images of 1/k of the pixels."""
         k = one_in(len(self.prior.points), len(state.frames))
-        if k == 1:
+        if k == 1 or any(camera.film is not None for camera in state.cameras):
             return self.surface(state)
         key = "plan", state.taken[: state.seeds], state.moved
         return self.once(key, lambda: self._visibility(state, k))
@@ -311,7 +311,7 @@ class Scene:
             return self.fisher_of_colours(start, camera)[:count]
 
         points, lam = start.means[:count], float(self.surface_lam[0])
-        return Visibility(cameras, exact, colour, points, self.centre, lam)
+        return Visibility(cameras, exact, colour, points, self.centre, lam, k)
 
     def positions(self, frames: Sequence[Frame]) -> np.ndarray:
         """Camera centres [V,3], metres."""

@@ -192,6 +192,13 @@ def test_where_there_are_many_pairs_few_large_gaussians_choose_as_well(tmp_path,
     assert coarse.cameras[0].width == 48
     gains = [surface.gains(state.taken, views, model) for surface in (fine, coarse)]
     assert np.corrcoef(gains)[0, 1] > 0.95
+    assert np.sum(gains[1]) == pytest.approx(np.sum(gains[0]), rel=0.3)
+    gain_of = fine.relaxation(state.taken, views, model).gain
+    best, found = (
+        gain_of([views.index(v) for v in of.planned(tuple(state.taken), tuple(views), 6, model)])
+        for of in (fine, coarse)
+    )
+    assert 0.98 * best < found <= best
 
 
 @pytest.mark.parametrize("points", [0, 3])

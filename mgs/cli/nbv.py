@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from mgs.gaussians import Gaussians
     from mgs.run.folder import Checkpoint, Run
     from mgs.run.live import Live
+    from mgs.scene import Scene
 
 NAMES = f"Names (docs/nbv.md): {', '.join(POLICIES)}."
 
@@ -152,9 +153,17 @@ def start_and_print(
     return run
 
 
-def resume_and_print(run: Path | Run, console: Terminal, **options: Any) -> None:
+def resume_and_print(
+    run: Path | Run,
+    console: Terminal,
+    policy: str | None = None,
+    live: Live | None = None,
+    like: Scene | None = None,
+) -> None:
     """Run or resume the loop of a run with a line for each step, evaluate, print the quality.
-    options: `policy`, `live` and `like` of `mgs.run.nbv.resume_nbv`."""
+
+    policy: FILE.py:FUNCTION where the run has a policy of the user's own. live: of its pictures.
+    like: as in `mgs.run.nbv.scene_of`."""
     from mgs.cli.terminal import print_run, step_lines
     from mgs.reports.evaluation import drawn_test_view, evaluate_run
     from mgs.run.folder import open_run
@@ -176,7 +185,7 @@ def resume_and_print(run: Path | Run, console: Terminal, **options: Any) -> None
                 path, psnr = drawn_test_view(run, model)
                 progress.print(f"pass {done} of {most}: {psnr:.2f} dB, {path}")
 
-        state = resume_nbv(run, on_step, progress, on_pass=on_pass, **options).state
+        state = resume_nbv(run, on_step, progress, policy, live, on_pass, like).state
         metrics = evaluate_run(run.folder, pictures=False)
     print_run(run.folder, state, metrics, console)
 

@@ -153,7 +153,7 @@ def export(
     - most N|Nk|NM: Write the best model of a run of at most so many bytes, as in 40k. Formats other
       than mgs get fewer Gaussians, fitted once more.
     - psnr: Write the smallest model of a run of so many dB in the views taken.
-    - shared_prior: For mgs: the reader has the run's prior, and no positions are written.
+    - shared_prior: For mgs: the reader has the run's prior, which gives the positions.
     - prior: Folder of the prior that an mgs file was written with, to read it."""
     from mgs.reports.exporting import read_model, to_y_up
     from mgs.splat_files import FORMATS, write_gaussians

@@ -153,11 +153,11 @@ def _opened(model: Path) -> tuple[Any, dict[int, str]]:
         if (model / file).is_file() and not _is_whole(model / file):
             raise InputError(f"{model / file}: is damaged or cut off; export the model again")
     with parsing(model, "COLMAP model", "export it again"), TemporaryDirectory() as scratch:
-        texts = {path: path.read_bytes() for path in model.glob("*.txt") if path.is_file()}
-        # pycolmap takes the mark for a word
-        has_mark = any(text.startswith(codecs.BOM_UTF8) for text in texts.values())
-        for path, text in texts.items() if has_mark else ():
-            Path(scratch, path.name).write_bytes(text.removeprefix(codecs.BOM_UTF8))
+        texts = [path for path in model.glob("*.txt") if path.is_file()]
+        has_mark = any(_has_mark(path) for path in texts)  # pycolmap takes the mark for a word
+        for path in texts if has_mark else ():
+            text = path.read_bytes().removeprefix(codecs.BOM_UTF8)
+            Path(scratch, path.name).write_bytes(text)
         reconstruction = pycolmap.Reconstruction(scratch if has_mark else model)
         names = {number: image.name for number, image in reconstruction.images.items()}
     if (model / "images.bin").is_file():
@@ -169,6 +169,11 @@ def _opened(model: Path) -> tuple[Any, dict[int, str]]:
             "read; the file is cut off or damaged, export it again"
         )
     return reconstruction, every_name
+
+
+def _has_mark(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(codecs.BOM_UTF8)) == codecs.BOM_UTF8
 
 
 def _names_in_text(path: Path) -> dict[int, str]:

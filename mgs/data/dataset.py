@@ -3,7 +3,7 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -251,7 +251,10 @@ def intrinsics(camera: Camera) -> dict[str, float]:
 
 
 def write_transforms(
-    root: str | Path, frames: Sequence[Frame], world: World = UPRIGHT, **notes: str | float
+    root: str | Path,
+    frames: Sequence[Frame],
+    world: World = UPRIGHT,
+    notes: Mapping[str, str | float] | None = None,
 ) -> None:
     """Write transforms.json into the folder `root`, with paths relative to it if they are below it.
     world: the one to write them in; the frames have +Z up. notes: more entries. Frames are either
@@ -278,7 +281,7 @@ def write_transforms(
         own = intrinsics(frame.camera)
         record |= {key: value for key, value in own.items() if value != header[key]}
         records.append(record)
-    about = header | place | demand | notes
+    about = header | place | demand | dict(notes or {})
     write_json(root / "transforms.json", about | {"frames": records})
 
 

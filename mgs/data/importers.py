@@ -1,6 +1,7 @@
 """Imports of a `Source` into a dataset folder, with lens distortion undone."""
 
 import hashlib
+import json
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -92,7 +93,7 @@ def import_source(
         world = World(up, source.unit or "unit", source.origin)
         upright = [replace(frame, camera=world.enter(frame.camera)) for frame in frames]
         place = {"place": source.place} if source.place and up == PLUS_Z else {}
-        write_transforms(out, upright, world, **place)
+        write_transforms(out, upright, world, place)
     return load_dataset(out)
 
 
@@ -127,11 +128,26 @@ def _mask_file(masks: Path, shot: Shot, shots: Sequence[Shot]) -> Path:
 
 def _digest(shots: list[Shot]) -> str:
     """SHA-256 of names, cameras, times and paths of the shots, but not of file contents."""
-    digest = hashlib.sha256()
-    for shot in shots:
-        for value in (vars(shot) | {"camera": shot.camera.key}).values():
-            digest.update(repr(value.resolve() if isinstance(value, Path) else value).encode())
-    return digest.hexdigest()
+    rows = [
+        (
+            shot.name,
+            shot.camera.K.tolist(),
+            shot.camera.width,
+            shot.camera.height,
+            shot.camera.world_to_camera.tolist(),
+            shot.lens and [shot.lens.model, *shot.lens.parameters],
+            shot.timestamp,
+            shot.depth_unit,
+            shot.float_unit,
+            shot.turned,
+            [
+                path and str(path.resolve())
+                for path in (shot.image, shot.depth, shot.mask, shot.rock)
+            ],
+        )
+        for shot in shots
+    ]
+    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
 
 def import_shot(

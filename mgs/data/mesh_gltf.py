@@ -86,7 +86,11 @@ def _base_colour(
 
 
 def _visual(
-    gltf: Gltf, primitive: dict[str, Any], n: int, image: Callable[[int], Any], textured: bool
+    gltf: Gltf,
+    primitive: dict[str, Any],
+    n: int,
+    image: Callable[[int], Image.Image],
+    textured: bool,
 ) -> Any:
     """Colours of a primitive with n vertices for trimesh; None if its file says none. textured:
     whether another primitive has a texture, so that this one needs one, too."""

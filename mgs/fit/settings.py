@@ -147,7 +147,7 @@ class ModelSettings(Frozen):
         return by_kind if surface or self.lam is None else np.full_like(by_kind, self.lam)
 
     def lam_by_kind(self, groups: dict[str, slice]) -> dict[str, Any]:
-        """lambda as `mgs.fit.fitting.fit` takes it (`criteria.lam_by_kind`)."""
+        """lambda as `mgs.fit.fitting.fit_gaussians` takes it (`criteria.lam_by_kind`)."""
         return lam_by_kind(self.regularisation(groups), groups)
 
 

@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from mgs.policy.criteria import Array
 
-# Chosen: distance up to which poses are seeds, over that of the nearest (half as many pixels see the
-# surface), and the most by which such seeds may spread less evenly than the best of all poses.
+# Chosen: distance up to which poses are seeds, over that of the nearest (half as many pixels see
+# the surface), and the most by which such seeds may spread less evenly than the best of all poses.
 NEAR, LESS_EVEN = 2**0.5, 1.5
 
 

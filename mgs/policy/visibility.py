@@ -21,7 +21,7 @@ FEW = 500  # about the number of Gaussians by which a flight is planned; chosen
 # Pairs of a pose and a Gaussian: most for which gains of all Gaussians are computed, and
 # about how many otherwise. Chosen constants (docs/speed-accuracy.md).
 MOST_PAIRS, COARSE_PAIRS = 1 << 24, 1 << 21
-MATRICES = 18  # memory of the matrices of a Gaussian (`PoolGains`), as a number of pairs
+MATRICES = 18  # 45 numbers of 16 bytes for a Gaussian, degree 2 (`PoolGains`), over 40 for a pair
 BETTER = 1 + 1e-6  # least ratio of gains for an exchange: above rounding errors; chosen
 WIDTH = 16  # paths that `planned_path` keeps at each step; chosen
 
@@ -36,6 +36,7 @@ class Visibility:
     - exact(camera): exact information about the Gaussians before any training [N,P].
       colour(camera): its columns of the colours.
     - points: their means [N,3], metres. centre: middle of the rock [3]. lam: lambda of colours.
+    - stands_for: number of Gaussians for which each stands; gains are those of all.
 
     Attributes:
     - positions: camera centres [V,3], metres.
@@ -54,8 +55,9 @@ class Visibility:
         points: Array,
         centre: Array,
         lam: float,
+        stands_for: int = 1,
     ) -> None:
-        self.cameras, self.colour = cameras, colour
+        self.cameras, self.colour, self.stands_for = cameras, colour, stands_for
         self.points, self.centre, self.lam = points, centre, lam
         self.positions = np.array([camera.position for camera in cameras])
         self.seen = cache(lambda frame: squared_weights(colour(cameras[frame])))
@@ -75,7 +77,7 @@ class Visibility:
                 return np.zeros(len(candidates))
             self.states[model] = state
         state.take(taken[len(state.taken) :])
-        return state.of_poses(candidates)
+        return self.stands_for * state.of_poses(candidates)
 
     def relaxation(
         self, taken: Sequence[int], candidates: Sequence[int], model: Model

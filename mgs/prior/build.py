@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from plyfile import PlyData
 from scipy.ndimage import binary_dilation, binary_erosion
 
@@ -121,7 +122,11 @@ def build_prior(
 
 
 def prior_and_cloud(
-    dataset: Dataset, settings: PriorSettings, source: str | None = None, points: Path | None = None
+    dataset: Dataset,
+    settings: PriorSettings,
+    *,
+    source: str | None = None,
+    points: Path | None = None,
 ) -> tuple[Prior, SegmentedCloud | None]:
     """Build the prior of a dataset. Returns it, and the cloud of its mesh (None for a hull).
     Arguments as `build_prior`. Raises InputError as `choose_source`, `check_masks`, `surface_of`,
@@ -256,7 +261,9 @@ def _samples(
 
 
 def prior_from_mesh(
-    source: str | Path | tuple[Any, Any], settings: PriorSettings, dataset: Dataset | None = None
+    source: str | Path | tuple[ArrayLike, ArrayLike],
+    settings: PriorSettings,
+    dataset: Dataset | None = None,
 ) -> Prior:
     """Sample a mesh in the coordinates of the dataset's files, all over.
 
@@ -363,9 +370,9 @@ def load_prior(folder: str | Path) -> Prior:
         if not np.isfinite(columns).all() or len(columns) < 2:
             raise ValueError("points.ply has NaN values, or fewer than two points")
         if not (0 < spacing < np.inf and 0 < tolerance < np.inf):
-            raise ValueError("spacing and depth_tolerance must be positive metres")
+            raise ValueError("prior.json: spacing and depth_tolerance must be positive metres")
         if not 0 <= backed <= len(columns):
-            raise ValueError("backed must be a number of the points")
+            raise ValueError("prior.json: backed must be a number of the points")
     mesh = read_mesh(folder / "mesh.ply")
     points, normals = columns[:, :3], columns[:, 3:]
     prior = Prior(mesh, points, normals, spacing, tolerance, numbers, backed)

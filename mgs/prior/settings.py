@@ -14,7 +14,7 @@ class PriorSettings:
 
     - gaussians: number of Gaussians, on the surface and behind it. "auto", the default if neither
       spacing nor density is given: as many as the closest camera resolves, up to a limit
-      (`mgs.prior.resolution`).
+      (`mgs.prior.surface.resolution`).
     - spacing: distance between samples, metres, in place of `gaussians`.
     - density: samples per square voxel of the cloud, in place of both; a voxel is about a pixel on
       the rock.

@@ -159,7 +159,7 @@ def _write_nerfstudio(out: Path, frames: Sequence[Frame], points: np.ndarray, wo
     PlyData([PlyElement.describe(points, "vertex")]).write(str(out / "points.ply"))
     notes: dict[str, str | float] = {"ply_file_path": "points.ply"}
     notes |= {"depth_unit_scale_factor": step} if deepest else {}
-    write_transforms(out, copies, world, **notes)
+    write_transforms(out, copies, world, notes)
 
 
 def _write_colmap(out: Path, frames: Sequence[Frame], points: np.ndarray, world: World) -> None:

@@ -39,7 +39,7 @@ def write_suggestion(out: Path, run: Run, suggestion: Suggestion) -> None:
     for k, view in enumerate(suggestion.plan):
         image = out / f"images/{view.name}.png"
         frames.append(Frame(view.name, world.whole(view.camera), float(k), image, on_demand=True))
-    write_transforms(out, frames, world.home, convention=CONVENTION)
+    write_transforms(out, frames, world.home, {"convention": CONVENTION})
     draw_suggestion(out / "suggestions.png", run, suggestion)
 
 

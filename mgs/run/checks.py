@@ -30,7 +30,11 @@ class Checks:
     policy: Policy
 
     def entries(
-        self, state: State, before: Gaussians | None, new: Sequence[int], steps: Sequence[Any]
+        self,
+        state: State,
+        before: Gaussians | None,
+        new: Sequence[int],
+        steps: Sequence[dict[str, Any]],
     ) -> dict[str, Any]:
         """Entries of the last line in `steps`, the lines of all steps: `residual`, `indicators`,
         `warnings` and `prediction`. new: views that the model `before` was not fitted to."""

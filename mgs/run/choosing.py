@@ -40,7 +40,11 @@ def choose(
 
 
 def rated(
-    scene: Scene, state: State, policy: Policy, views: list[int], cost: np.ndarray | None = None
+    scene: Scene,
+    state: State,
+    policy: Policy,
+    views: list[int],
+    cost: np.ndarray | float | None = None,
 ) -> list[tuple[int, float]]:
     """(view, score) by falling score / cost [C]; of equals, the farthest from the views taken comes
     first. Raises InputError as `choose`."""

@@ -211,7 +211,11 @@ def _weights(scene: Scene, state: State, taken: int) -> dict[int, NDArray[np.flo
 
 
 def _describer(
-    scene: Scene, state: State, poses: list[Named], weights: dict[int, Any], way: Callable[..., str]
+    scene: Scene,
+    state: State,
+    poses: Sequence[Named],
+    weights: dict[int, Any],
+    way: Callable[[Camera], str],
 ) -> Callable[..., View]:
     """A function (choice, place in the plan or 0) -> `View`."""
     unseen = ~criteria.observed(state.surface, scene.surface_lam)
@@ -298,17 +302,11 @@ def _coarse_scene(
 ) -> tuple[_CoarseScene, State]:
     """Scene of the images taken, then the poses, with a coarse model; and its state, whose last
     view is the first image, where the flight starts."""
-    model, own = run.state.gaussians, run.prior
-    if run.settings.train.density != "fixed":  # the Gaussians are no longer those of the samples
-        near = cKDTree(own.points).query(model.means)[1]
-        own = replace(own, points=model.means, normals=own.normals[near], backed=0)
+    whole = run.state.gaussians
+    own = run.prior if run.settings.train.density == "fixed" else _on_model(run.prior, whole)
     prior, rows = coarse_prior(own)
     thinning = len(prior.points) / len(own.points)
-    model = model if thinning == 1 else model[rows]
-    grown = model.log_scales - np.float32(0.5 * np.log(thinning))
-    # None is black: a colour that is clamped at 0 has no information.
-    lit = np.maximum(model.sh, np.float32(-0.49 / SH_C0))
-    model = replace(model, log_scales=grown, sh=lit)
+    model = _coarse(whole, rows, thinning)
     width = max(round(images[0].camera.width * thinning**0.5), 1)
 
     def small(camera: Camera) -> Camera:
@@ -323,6 +321,12 @@ def _coarse_scene(
     H = information(scene, model, [frames[i] for i in taken])
     state = State(scene.frames, taken, count, model, H, H, skipped=count)
     return scene, replace(state, surface=surface_information(scene, state, taken))
+
+
+def _on_model(prior: Prior, model: Gaussians) -> Prior:
+    """A prior with a sample at each Gaussian of a model whose Gaussians are no longer its own."""
+    near = cKDTree(prior.points).query(model.means)[1]
+    return replace(prior, points=model.means, normals=prior.normals[near], backed=0)
 
 
 def coarse_prior(prior: Prior, most: int = COARSE) -> tuple[Prior, NDArray[np.int64]]:
@@ -348,3 +352,11 @@ def coarse_prior(prior: Prior, most: int = COARSE) -> tuple[Prior, NDArray[np.in
         backed=0,
     )
     return thinned, rows
+
+
+def _coarse(model: Gaussians, rows: np.ndarray, thinning: float) -> Gaussians:
+    """Gaussians of a model for the samples of a coarse prior. None is black: a colour that is
+    clamped at 0 has no information."""
+    some = model if thinning == 1 else model[rows]
+    grown = some.log_scales - np.float32(0.5 * np.log(thinning))
+    return replace(some, log_scales=grown, sh=np.maximum(some.sh, np.float32(-0.49 / SH_C0)))

@@ -223,7 +223,12 @@ def _lanes_by_tile(length: Any, number: Any, numbers: int) -> Any:
 
 
 def _pairs(
-    foot: Footprints, order, place, first_block: tuple[Any, Any], blocks_x: int, blocks_y: int
+    foot: Footprints,
+    order: Any,
+    place: Any,
+    first_block: tuple[Any, Any],
+    blocks_x: int,
+    blocks_y: int,
 ) -> tuple[Any, ...]:
     """All (splat, block) pairs in the order of their slots: front to back, and for one splat row
     by row. first_block: as `first` in `_orders`.

@@ -191,7 +191,13 @@ def _finished(pixels: Any, background: Any, real: Any) -> Any:
 
 
 def _slopes(
-    colours: list[Any], behind: list[Any], alpha: Any, w, after, free: Any, last: Any = None
+    colours: list[Any],
+    behind: list[Any],
+    alpha: Any,
+    w: Any,
+    after: Any,
+    free: Any,
+    last: Any = None,
 ) -> list[Any]:
     """s_c = D_c alpha, the derivative of each channel of a pixel by ln alpha of one splat, Float.
 
@@ -220,7 +226,14 @@ ADJOINT_SUMS = {False: 8, True: 10}  # sums per splat of `adjoint`, without and 
 
 
 @frozen(recorded_sizes)
-def adjoint(lists: BlockLists, packed, out: tuple, d_out: tuple, means: bool, channels: int) -> Any:
+def adjoint(
+    lists: BlockLists,
+    packed: Any,
+    out: tuple[Any, ...],
+    d_out: tuple[Any, ...],
+    means: bool,
+    channels: int,
+) -> Any:
     """Sums over pixels for `splat_gradient`, to be read by `sums_by_splat`.
 
     out, d_out: output of `forward`, and the gradient dL of a loss by it.

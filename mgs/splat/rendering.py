@@ -166,7 +166,13 @@ class _Rasterise(dr.CustomOp):
     have gradients. channels: number of outputs, from red on, at least 3."""
 
     def eval(
-        self, splats: Splats, packed: Any, lists: BlockLists, places, means: bool, channels: int
+        self,
+        splats: Splats,
+        packed: Any,
+        lists: BlockLists,
+        places: Any,
+        means: bool,
+        channels: int,
     ) -> Any:
         self.splats, self.packed, self.lists, self.places = splats, packed, lists, places
         self.means, self.channels = means, channels

@@ -274,7 +274,12 @@ TOGETHER = 2  # splats drawn in an iteration: the pixels' state does not fit the
 
 
 def walk(
-    lists: BlockLists, packed, lane: Lane, pixels: list[list[Any]], draw: Callable, start
+    lists: BlockLists,
+    packed: Any,
+    lane: Lane,
+    pixels: list[list[Any]],
+    draw: Callable[..., Any],
+    start: Any,
 ) -> Any:
     """Draw each lane's list front to back, until it ends or all pixels of the block are finished.
 
@@ -305,7 +310,12 @@ def walk(
 
 
 def walk_and_store(
-    lists: BlockLists, packed, lane: Lane, pixels: list[list[Any]], visit: Callable, count: int
+    lists: BlockLists,
+    packed: Any,
+    lane: Lane,
+    pixels: list[list[Any]],
+    visit: Callable[..., Any],
+    count: int,
 ) -> Any:
     """Draw each lane's list as `walk` does, and store sums over the pixels of each pair.
 
@@ -367,7 +377,12 @@ def pair_at(
 
 
 def _walk_until_done(
-    lists: BlockLists, packed, lane: Lane, pixels: list[list[Any]], visit: Callable, together: int
+    lists: BlockLists,
+    packed: Any,
+    lane: Lane,
+    pixels: list[list[Any]],
+    visit: Callable[..., Any],
+    together: int,
 ) -> tuple[Any, list[list[Any]]]:
     """The loop of `walk`. Returns the pair after the last visited one, and the pixels' state.
     visit(pair, pairs, pixels) -> (pixels, alive), with `pairs` the results of `pair_at` for

@@ -1,7 +1,7 @@
 """Cameras that fly around a rock at the origin and look at its middle."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -99,7 +99,12 @@ def evaluation_cameras(
 
 
 def _aimed(
-    scene: SceneFile, orbit: Orbit, size: tuple[int, int], frames: int, rock: Any, what: str
+    scene: SceneFile,
+    orbit: Orbit,
+    size: tuple[int, int],
+    frames: int,
+    rock: "trimesh.Trimesh",
+    what: str,
 ) -> list[Camera]:
     target = np.array([0, 0, rock.bounds[1, 2] / 2])
     cameras = orbit_cameras(orbit, frames, target, scene.camera.fov, *size)
