@@ -3,6 +3,7 @@
 import gc
 import os
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ if WORKER := os.environ.get("PYTEST_XDIST_WORKER"):
     # Threads of two workers on the same two processors cost a third more seconds.
     processors = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {processors[int(WORKER[2:]) % len(processors)]})
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it
 runtime.start()
 terminal.SECONDS_BETWEEN = float("inf")  # a busy machine would print lines of progress
 # No deadline: the machine may be busy, and a first call loads libraries.

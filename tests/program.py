@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -50,13 +51,13 @@ def python(program: str, *arguments, env=(), **options) -> subprocess.CompletedP
 
 
 def stop_at(count: int = 1) -> Callable[..., None]:
-    """A callback that interrupts at its count-th call."""
+    """A callback that interrupts at its count-th call, as Ctrl-C does."""
     calls = []
 
     def called(*_, **__):
         calls.append(1)
         if len(calls) == count:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
 
     return called
 

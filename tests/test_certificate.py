@@ -68,6 +68,10 @@ def test_every_set_is_below_the_bound_and_branch_and_bound_finds_the_best(kind, 
     assert best.bound == pytest.approx(largest, rel=1e-6)
 
 
+def test_many_cuts_close_the_gap_of_coverage():
+    assert upper_bound(case("coverage", 10)[0], 2).gap <= TOLERANCE
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_bound_is_the_optimum_that_scipy_finds(kind):
     made, _ = case(kind)

@@ -62,6 +62,7 @@ def test_the_transform_has_an_inverse_and_an_adjoint():
     np.testing.assert_allclose(tree.inverse(y), x, atol=1e-12)
     assert (g * x).sum() == pytest.approx((tree.forward(g, adjoint=True) * y).sum())
     assert set(tree.tile) == {0, 1, 2, 3}
+    np.testing.assert_allclose(tree.forward(np.ones((500, 1)))[:-1], 0, atol=1e-12)
 
 
 def test_integers_come_back_at_once_or_in_layers():

@@ -416,3 +416,7 @@ def test_a_travel_cost_is_weighed_against_the_gain_of_every_pose(loaded, tmp_pat
     cost = 1 + np.linalg.norm(positions[views] - here, axis=1) / 1e-3
     worth = policy(scene, state, views) / cost
     assert choose(scene, state, policy, near)[0] == views[int(worth.argmax())]
+
+
+def test_the_precision_of_a_prior_is_that_of_its_degrees():
+    assert directional.precision(1, 0.5, 3.0).tolist() == [3, 12, 12, 12]

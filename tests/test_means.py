@@ -82,7 +82,9 @@ def test_one_step_is_natural_on_the_gradient_of_the_objective(cameras, targets):
         begun.logit_opacities -= np.float32(0.3)
         train = settings("free", 1, 0.002).model_copy(update={"loss": "squared"})
         goal = objective(begun, cameras[:1], targets[:1], start, LAM, means="free")
-        moved = fitted(begun, cameras[:1], targets[:1], train, start).gaussians
+        found = fitted(begun, cameras[:1], targets[:1], train, start)
+        assert found.losses == pytest.approx([goal.loss(as_drjit(begun))] * 2, rel=1e-4)
+        moved = found.gaussians
         parts = goal.gradient(as_drjit(begun)), goal.diagonal(as_drjit(begun))
         for (name, kind), *of_kind in zip(learned("free").items(), *parts, strict=True):
             g, d = map(np.asarray, of_kind)

@@ -116,6 +116,7 @@ def test_a_lam_for_each_degree_of_the_colours():
     settings = TrainSettings(passes=360, rates={"colour": 0.2})  # nine coefficients: 1/9 as far
     found = fit_gaussians(model, [camera], [UNSEEN], settings, start=start, lam={"colour": lam})
     assert found.losses[0] == pytest.approx((lam * away**2).sum() / UNSEEN[..., :3].size, rel=1e-5)
+    assert found.losses[1] == pytest.approx(found.losses[0], rel=1e-5)
     assert found.loss < 0.05 * found.losses[0]
 
 
@@ -203,4 +204,4 @@ def test_a_fit_has_the_loss_of_its_settings():
     drawn = np.asarray(render(model, camera).rgb, np.float64)
     found = fit_gaussians(model, [camera], [black], TrainSettings(passes=1))
     expected = slow_loss(drawn, 0 * drawn, np.ones_like(drawn)).mean()
-    assert found.losses[0] == pytest.approx(expected, rel=1e-4)
+    assert found.losses == pytest.approx([expected] * 2, rel=1e-4)

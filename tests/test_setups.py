@@ -47,6 +47,7 @@ def done(capsys, *arguments, **changes):
 
 def test_setups_are_made_once_and_compare_a_policy_of_ones_own(tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
+    assert setups.sized(FEW, setups.STUDY.parser().parse_args(["OUT"])).images == FEW.images
     some = ("setups", out, "--rocks", 1, "--images", 5)
     with monkeypatch.context() as patched:
         patched.setattr("mgs.learn", None)  # these policies need no model to choose
