@@ -37,7 +37,7 @@ Key = tuple[int, str, int]  # tile, group and layer of a packet
 
 @dataclass(frozen=True)
 class Header:
-    """Data that all packets need. steps: [BANDS,C] codes, uint8; see `step`. The rest as in
+    """Data that all packets need. steps: [BANDS,C] codes, uint8; see `last_steps`. The rest as in
     `HEAD`."""
 
     flags: int
@@ -59,7 +59,7 @@ class Header:
     steps: np.ndarray
 
     @property
-    def step(self) -> np.ndarray:
+    def last_steps(self) -> np.ndarray:
         """Steps [BANDS,C] of the last layer."""
         code = self.steps.astype(np.int64) - ZERO_STEP
         return np.asarray(np.ldexp(np.array(QUARTERS)[code % 4], code // 4) * self.scale)

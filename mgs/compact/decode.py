@@ -156,7 +156,7 @@ def _coefficients(header: Header, packets: Mapping[Key, bytes], tree: Tree) -> n
         whole[tile, group] = layer, integers(stream, zeros, before)
     for (tile, group), (layer, numbers) in whole.items():
         rows = rows_of(tree, tile)
-        step = header.step[tree.band[rows], of[group]]
+        step = header.last_steps[tree.band[rows], of[group]]
         table[rows, of[group]] = step * restored(numbers, header.layers - 1 - layer)
     return table
 

@@ -151,7 +151,7 @@ class Encoder:
     ) -> Compact:
         """File of coefficients [N,C]. payloads, worth: of positions; those of the rest are added.
         h: [BANDS,C]."""
-        steps = header.step[tree.band]
+        steps = header.last_steps[tree.band]
         parts = allocate.rounded(values, steps, header.layers)
         shown = [steps * restored(part, header.layers - 1 - k) for k, part in enumerate(parts)]
         gains = allocate.gain(values, shown, h[tree.band])

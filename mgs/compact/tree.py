@@ -48,6 +48,8 @@ def code_descendants(
     these, to be written; None: they are read. Each node has a left child, a right one, or both.
     among: sorted codes of the cells that can be there; None: all. Raises ValueError if more than
     `most` are read."""
+    # Context of a node: whether its parent forked, and its level; where it is known what can be
+    # there, how many cells each child can have, up to MANY. Counts of the kinds of node by context.
     counts = np.ones((2 * max(3, MANY**2), 3))
     forked = np.zeros(len(nodes), np.int64)
     for shift in range(depth - 1, -1, -1):
@@ -58,7 +60,7 @@ def code_descendants(
             left, right = np.minimum(np.diff(ends), MANY).T
             kinds = np.where(left == 0, 1, 0)
             context = forked + 2 * (MANY * (left - 1) + right - 1)
-            context[(left == 0) | (right == 0)] = -1
+            context[(left == 0) | (right == 0)] = -1  # nothing to code
         if codes is not None:
             left, right = np.isin(pairs, codes >> shift).T
             kinds = left + 2 * right - 1
