@@ -235,6 +235,15 @@ def read_mask(path: str | Path) -> np.ndarray:
     return layer >= half
 
 
+def write_sheet(path: Path, pictures: list[np.ndarray], across: int) -> None:
+    """Write pictures uint8 [H,W,3] of the same width as a PNG, `across` in a row."""
+    height = max(len(picture) for picture in pictures)
+    padded = [np.pad(picture, ((0, height - len(picture)), (0, 0), (0, 0))) for picture in pictures]
+    padded += [np.zeros_like(padded[0])] * (-len(padded) % across)
+    rows = [np.hstack(padded[k : k + across]) for k in range(0, len(padded), across)]
+    write_png(path, np.vstack(rows))
+
+
 def write_exr(
     path: str | Path,
     channels: Mapping[str, np.ndarray],

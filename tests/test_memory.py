@@ -14,7 +14,7 @@ from program import python
 import mgs
 from mgs import Dataset, Frame, PriorSettings, build_prior, evaluation, load_dataset, run_nbv, scene
 from mgs.data import importers
-from mgs.data.check import make_masks
+from mgs.data.masks import make_masks
 from mgs.data.meshes import read_mesh
 from mgs.data.sources import read_source
 from mgs.fit import objective

@@ -21,10 +21,11 @@ from scipy.spatial.transform import Rotation
 from test_bad_input import bare
 
 from mgs import Camera, Frame, PriorSettings, initial_gaussians, look_at
-from mgs.data.check import check_dataset, make_masks
+from mgs.data.check import check_dataset
 from mgs.data.clouds import SparseCloud, read_cloud, views_of, write_cloud
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.data.importers import import_source
+from mgs.data.masks import make_masks
 from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.shots import Shot, Source
 from mgs.data.sources import read_source

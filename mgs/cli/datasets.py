@@ -203,8 +203,8 @@ def dataset(action: Literal["check", "masks"], path: Path, prior: Path | None = 
 
 
 def _make_masks(path: Path, prior: Path) -> None:
-    from mgs.data.check import SHEET, make_masks
     from mgs.data.dataset import load_dataset
+    from mgs.data.masks import SHEET, make_masks
     from mgs.prior.build import load_prior
 
     data, mesh_prior = load_dataset(path), load_prior(prior)

@@ -1,18 +1,14 @@
-"""Consistency checks of a dataset, and masks for one that has none: the outlines of a mesh."""
+"""Consistency checks of a dataset."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_erosion, minimum_filter
+from scipy.ndimage import binary_erosion, minimum_filter
 
-from mgs.colour import srgb_from_linear
-from mgs.data.dataset import Dataset, write_transforms
+from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame, has_masks, in_image
-from mgs.data.meshes import Mesh
 from mgs.errors import InputError
-from mgs.images import write_png
 from mgs.progress import report
 
 TOLERANCE = 0.02  # relative excess of depth beyond which a frame sees through a point of the rock
@@ -141,62 +137,3 @@ def seen_through(
     surface = np.where(other_depth > 0, nearest, 0)[rows, columns]
     through = (surface > z[inside] * (1 + TOLERANCE))[surface > 0]
     return float(through.mean()) if len(through) else float("nan")
-
-
-SHEET = "masks.png"  # contact sheet, in the folder of the dataset
-THUMBNAIL = 240  # width of a photograph in the contact sheet, pixels
-ACROSS = 6  # photographs in a row of the contact sheet
-
-
-def make_masks(dataset: Dataset, mesh: Mesh) -> Dataset:
-    """Write a mask of a mesh for each frame of a dataset, a contact sheet, and transforms.json; the
-    same first for its test views, if they have no masks. Raises InputError if a frame has a mask
-    already, if the mesh is in no image, or if a file cannot be read or written."""
-    from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
-
-    for frame in dataset.frames:
-        if frame.mask_path is not None or frame.rock_path is not None:
-            cure = "import the data without masks to make others"
-            raise InputError(f"frame {frame.name}: has a mask already; {cure}")
-    tests = dataset.test_views()
-    if tests is not None and not has_masks(tests.frames):
-        make_masks(tests, mesh)
-    depth, frames, visible = mesh_depth(mesh), [], False
-    thumbnails = []
-    for k, frame in enumerate(dataset.frames):
-        report("masks", k, len(dataset))
-        mask, rgb = depth(frame.camera) > 0, frame.rgb()
-        visible |= bool(mask.any())
-        path = dataset.root / "masks" / f"{frame.name}.png"
-        write_png(path, mask)
-        frames.append(replace(frame, mask_path=path))
-        thumbnails.append(_outlined(rgb, mask))
-    if not visible:
-        cure = "make masks with one that fits the poses"
-        raise InputError(f"{dataset.root}: the mesh is in no image; {cure}")
-    write_sheet(dataset.root / SHEET, thumbnails, ACROSS)
-    write_transforms(dataset.root, frames, dataset.world)
-    return replace(dataset, frames=tuple(frames))
-
-
-def _outlined(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Thumbnail of a photograph, uint8, darkened outside the mask, with a magenta outline."""
-    import cv2
-
-    size = (THUMBNAIL, max(1, round(THUMBNAIL * mask.shape[0] / mask.shape[1])))
-    small = np.asarray(
-        cv2.resize(srgb_from_linear(rgb), size, interpolation=cv2.INTER_AREA), np.float32
-    )
-    inside = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5
-    small[~inside] *= 0.45
-    small[binary_dilation(inside) ^ inside] = [1, 0, 1]
-    return np.round(np.clip(small, 0, 1) * 255).astype(np.uint8)
-
-
-def write_sheet(path: Path, pictures: list[np.ndarray], across: int) -> None:
-    """Write pictures uint8 [H,W,3] of the same width as a PNG, `across` in a row."""
-    height = max(len(picture) for picture in pictures)
-    padded = [np.pad(picture, ((0, height - len(picture)), (0, 0), (0, 0))) for picture in pictures]
-    padded += [np.zeros_like(padded[0])] * (-len(padded) % across)
-    rows = [np.hstack(padded[k : k + across]) for k in range(0, len(padded), across)]
-    write_png(path, np.vstack(rows))

@@ -14,7 +14,6 @@ from PIL import Image
 
 from mgs import runtime
 from mgs.camera import Camera, opengl_from_opencv
-from mgs.data.check import write_sheet
 from mgs.data.dataset import (
     FRAME_INTERVAL,
     SURVEY_FOLDER,
@@ -28,7 +27,7 @@ from mgs.data.frames import Frame, write_rock_image
 from mgs.data.meshes import to_glb
 from mgs.errors import InputError, row_named
 from mgs.files import atomic_path, copy_file, fingerprint, folder_locked, reading, write_json
-from mgs.images import write_exr, write_png
+from mgs.images import write_exr, write_png, write_sheet
 from mgs.memory import check_room
 from mgs.progress import report
 from mgs.provenance import versions
