@@ -33,6 +33,7 @@ STAGES = {
     "survey": ("survey", "--rocks", "8"),
     "parsimony": ("parsimony", "--rocks", "8"),
     "chart": ("chart",),
+    "link": ("link", "--rocks", "6"),
     "stress": ("stress", "--rocks", "8"),
     "table1-paper": ("table1", "--scale", "paper", "--batch", "5"),
 }

@@ -18,7 +18,7 @@ from mgs.fit.settings import ALPHA_WEIGHT
 from mgs.run.folder import read_checkpoint
 from mgs.survey import flight
 from mgs.survey.flight import SurveySettings, fly
-from studies import certificate, fits, flights, setups, table1
+from studies import certificate, fits, flights, link, setups, table1
 from studies.frame import case
 from studies.frame.case import Case, Rock, Size
 from studies.frame.output import read_rows
@@ -112,6 +112,19 @@ def test_flights_keep_their_length_and_are_compared_with_even_spacing(tmp_path, 
         assert row["metres"] <= (row["length"] or 1) * found["whole"] * 1.000001
         assert len(set(row["taken"])) == row["images"]
     assert "| dome | 20% | planned tour |" in (out / "flights.md").read_text()
+
+
+def test_models_of_chosen_views_are_sent_over_a_link(tmp_path, capsys):
+    size = link.LinkSize(**vars(FEW) | {"views": (5,), "sent": (750, 4000)})
+    done(capsys, "link", tmp_path, "--rocks", 1, sizes={"quick": size})
+    rows = read_rows(tmp_path / "link.csv")
+    assert [(row["views"], row["by"], row["seconds"]) for row in rows] == [
+        (5, by, seconds) for by in ("chosen", "evenly spaced") for seconds in (1.5, 8)
+    ]
+    less, more = (row["psnr"] for row in rows[:2])
+    assert less < more
+    assert [row["gain"] for row in rows[2:]] == [0, 0]
+    assert "| 5 evenly spaced | +0.00 | +0.00 |" in (tmp_path / "link.md").read_text()
 
 
 def test_a_fit_with_changed_settings_is_compared_with_the_default(tmp_path, capsys):
