@@ -378,6 +378,21 @@ def small_run(dataset, prior, out, **train):
     return mgs.run_nbv(dataset, out, **settings)
 
 
+def test_fewer_gaussians_are_tried_until_all_fit_at_the_finest_steps(
+    dataset, prior, tmp_path, monkeypatch
+):
+    run, tried = small_run(dataset, prior, tmp_path / "run"), []
+    models = list(compacting.thinned(run, whole=True))
+    again = lambda *_, **__: (tried.append(model) or model for model in models)  # noqa: E731
+    monkeypatch.setattr(compacting, "thinned", again)
+    encoder, finest = compacting.encoding(run, shared=True), compacting.SCALES[0]
+    sizes = [len(encoder(*model).file(finest)) for model in models]
+    for size in (sizes[-1], sizes[2] * 9 // 10, sizes[1] * 9 // 10, sizes[0]):
+        tried.clear()
+        compacting.compact_run(run, size, shared=True)
+        assert len(tried) == 1 + next(k for k, s in enumerate(sizes) if s <= size)
+
+
 def test_a_small_file_is_better_with_fewer_gaussians_fitted_once_more(dataset, prior, tmp_path):
     run = small_run(dataset, prior, tmp_path / "run")
     made = compacting.compact_run(run, 600)

@@ -27,7 +27,6 @@ SCALES = (1e-3, 1.0)  # of steps: rms error of an image, (pixel value) per coeff
 HALVINGS = 9  # halvings of that range, in its logarithm: steps are found to 1.4 %
 VIEWS = 16  # most views, evenly spread over those taken, in which errors are weighed
 STEP = 1e-4  # linear RGB, by which the slope of sRGB is measured
-FILLED = 0.9  # least share of the bytes asked for that is used where steps are not the finest
 CLOSE = 50  # searches for a PSNR end at numbers of Gaussians that differ by 1/CLOSE
 THINNINGS = 4  # times that half of the Gaussians are removed
 AGAIN = 0.3  # learning rates of a further fit over those of a first one, which leave its optimum
@@ -61,7 +60,7 @@ def compact_run(
         file = _fitted(encoder(some, kept), size, enough)
         if file is not None:
             files.append((measured(file.model) if size else -len(file), file))
-            if size and len(file) < FILLED * size:  # its steps are the finest
+            if size and file.header.scale < 1.02 * SCALES[0]:  # all fits at the finest steps
                 break
     if not files:
         least = "it takes more bytes to place its Gaussians" if size else "no steps are fine enough"
