@@ -1,4 +1,4 @@
-"""What a controller sees over a slow link: views by the default policy against evenly spaced ones.
+"""Quality over a slow link: views by the default policy against evenly spaced ones.
 
 Models of several numbers of views are sent in several numbers of bytes, as by `mgs export --bytes
 --shared-prior`, to a receiver that has the mesh.
@@ -26,6 +26,7 @@ from studies.frame.output import (
 from studies.frame.program import WORKERS, Study, Work, study_of
 from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
+from studies.rate import LINK
 from studies.setups import SETUPS, SetupSize, case_of, sized
 
 SEEDS = 4
@@ -34,16 +35,13 @@ EVEN = "evenly spaced"
 
 POLICIES = {"directional-i": "chosen", "uniform": EVEN}
 
-LINK = 4000
-"""Bits per second."""
-
 
 @dataclass(frozen=True)
 class LinkSize(SetupSize):
     """Size of the study. views: of a run, seeds among them. sent: bytes of a file."""
 
     gaussians: int | None = 5000
-    count: int = 3
+    count: int = 6
     views: tuple[int, ...] = (6, 12, 24)
     sent: tuple[int, ...] = (3000, 10_000, 30_000)
 

@@ -155,7 +155,7 @@ def test_every_command_line_is_one(page):
 
 
 def test_every_option_that_a_page_names_is_one():
-    """Of code that begins with --, in a sentence: `--dome N`."""
+    """Check code that begins with --, in a sentence: `--dome N`."""
     parsers = [study_of(path.stem).parser() for path in (ROOT / "studies").glob("[!_]*.py")
                if "STUDY" in path.read_text()]  # fmt: skip
     known = {name for parser in parsers for name in parser._option_string_actions}

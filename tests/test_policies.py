@@ -293,8 +293,8 @@ def test_seeds_are_spread_over_elevations_too():
 
 
 def test_seeds_are_near_the_rock_and_all_around():
-    """Of two shells the seeds are those of the inner one alone, but close-ups of one side do not
-    keep them from the others."""
+    """Seeds of two shells are those of the inner one alone, but close-ups of one side do not keep
+    them from the others."""
     shells = np.concatenate([2 * CIRCLE, CIRCLE])
     assert pose_policies.seed_views(shells, CENTRE, 4) == [12, 15, 18, 21]
     for inner in (1, 4, 6):

@@ -229,7 +229,7 @@ def test_photographs_that_cannot_be_placed_are_refused(case, frames, tmp_path, c
 
 
 def test_a_video_gives_the_sharpest_frames_up_to_where_it_ends(tmp_path):
-    """Of 24 frames at 10 a second, the last of each five is sharp; the copy is cut at 60 %."""
+    """Cut a copy at 60 % of 24 frames at 10 a second, of which the last of each five is sharp."""
     rng, whole = np.random.default_rng(0), tmp_path / "whole.avi"
     film = cv2.VideoWriter(str(whole), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
     for k in range(24):
