@@ -39,6 +39,7 @@ from studies.frame.output import table, write_table
 from studies.frame.program import Study, Work, at_least, study_of
 from studies.frame.statistics import Row
 from studies.frame.sweep import Cell, cell_folder
+from studies.frame.timing import peak_megabytes
 from studies.setups import RANDOM, RING
 
 SEEDS = 4
@@ -242,12 +243,6 @@ def _begin() -> None:
         os._exit(1)
 
     Thread(target=wait, daemon=True).start()
-
-
-def peak_megabytes() -> float:
-    """Most memory that this process has held, megabytes. `getrusage` would include the parent's."""
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) * 1.024e-3
 
 
 def time_3dgs(

@@ -5,15 +5,16 @@ Charts show seconds: the median ratio times the reference's median seconds over 
 """
 
 import functools
+import gc
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from mgs import runtime
 from mgs.memory import padded
-from studies.frame.statistics import Row
 
 REFERENCE = 10_000, 320, 240
 """Gaussians, width and height of the reference, which renders REFERENCE_CALLS times with gradients.
@@ -87,14 +88,17 @@ def timed(
     }
 
 
-def with_seconds(rows: Iterable[Row], unit: float) -> list[Row]:
-    """Rows with seconds, seconds_low and seconds_high: ratio times `unit`."""
-    ends = ("", "_low", "_high")
-    return [row | {f"seconds{end}": row[f"ratio{end}"] * unit for end in ends} for row in rows]
+def peak_megabytes() -> float:
+    """Most memory that this process has held, megabytes, since its start or `forget_peak`.
+    `getrusage` would include the parent's."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) * 1.024e-3
 
 
-def span(row: Row) -> str:
-    """Seconds of a row with their extremes, as text of three digits."""
-    seconds = (row[key] for key in ("seconds_low", "seconds", "seconds_high"))
-    low, value, high = (f"{s:,.0f}" if s >= 100 else f"{s:.3g}" for s in seconds)
-    return value if low == high else f"{value} ({low} to {high})"
+def forget_peak() -> None:
+    """Give back memory that Dr.Jit keeps for later, and let `peak_megabytes` count from now on."""
+    import drjit as dr
+
+    gc.collect()
+    dr.flush_malloc_cache()
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # proc(5): resets VmHWM
