@@ -30,8 +30,9 @@ def points_over_rocks(rows: Sequence[Row]) -> list[Row]:
     "psnr_more". "front": whether no point of its kind and number of images has a higher PSNR in
     less time.
 
-    The rows "of" it get "times" the seconds, and "psnr_more" and "psnr_mask_more", dB, against the
-    base of the kind on the same rock.
+    The rows "of" it get "times" the seconds, and "psnr_more", "psnr_mask_more" (dB) and
+    "peak_megabytes_more" against the base of the kind on the same rock. One process does all
+    points, so its memory is more than that of a run alone; the differences are not.
     """
     points = grouped([row | {"policy": row["policy"] or ""} for row in rows], *SETTINGS)
     for kind in grouped(points, "kind"):
@@ -40,7 +41,8 @@ def points_over_rocks(rows: Sequence[Row]) -> list[Row]:
             for row in point["of"]:
                 base = usual[row["rock"]]
                 row["times"] = row["seconds"] / base["seconds"]
-                row |= {f"{key}_more": row[key] - base[key] for key in ("psnr", "psnr_mask")}
+                for key in ("psnr", "psnr_mask", "peak_megabytes"):
+                    row[f"{key}_more"] = row[key] - base[key]
             point["preset"] = point["of"][0]["preset"]
             for key in ("seconds", "psnr_more"):
                 point[key] = float(np.mean([row[key] for row in point["of"]]))
@@ -96,8 +98,9 @@ def tables(rows: Sequence[Row]) -> str:
     columns |= {"PSNR (dB)": scene_mean("psnr_more", "+.2f")}
     columns |= {"rock (dB)": scene_mean("psnr_mask_more", "+.2f")}
     texts = [table(columns, changes(points))]
-    means = {"seconds": ("seconds", ".2g"), "megabytes": ("peak_megabytes", ".0f")}
-    means |= {
+    means = {
+        "seconds": ("seconds", ".2g"),
+        "MB over the base": ("peak_megabytes_more", "+.0f"),
         "PSNR (dB)": ("psnr", ".2f"),
         "SSIM": ("ssim", ".4f"),
         "rock (dB)": ("psnr_mask", ".2f"),
@@ -152,11 +155,13 @@ def _draw_kind(axes: "Axes", points: Sequence[Row]) -> None:
         bars = np.abs(np.transpose(ends) - gains)
         drawn = {"elinewidth": 0.8, "markersize": 6, "linewidth": 0.6, "linestyle": ":"}
         axes.errorbar(seconds, gains, yerr=bars, **(look | drawn))
-    for point in points:
-        at, text = (point["seconds"], point["psnr_more"]), f"{point['density']:g}"
-        text += f" {point['preset']}" if point["preset"] else ""
-        axes.annotate(text, at, (6, -9), textcoords="offset points", fontsize=7)
+        offset, side = ((6, -9), "left") if line is lines[0] else ((-6, 4), "right")
+        for point in line["of"]:
+            text = " ".join(word for word in (f"{point['density']:g}", point["preset"]) if word)
+            at = point["seconds"], point["psnr_more"]
+            how = {"textcoords": "offset points", "fontsize": 7, "ha": side}
+            axes.annotate(text, at, offset, **how)
     logarithmic(axes)
-    axes.margins(0.08)
+    axes.margins(0.13)
     axes.set(xlabel=f"seconds, {most} images", ylabel="PSNR over the base, test views (dB)")
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2, fontsize=8)
