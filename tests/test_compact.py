@@ -16,7 +16,7 @@ from refusals import fails, refused
 from test_render_command import CAMERAS, gaussians
 
 import mgs
-from mgs import jvp, load_prior, open_run, render, vjp
+from mgs import load_prior, open_run, render, vjp
 from mgs.colour import srgb_from_linear
 from mgs.compact import allocate, coder, container, decode
 from mgs.compact.columns import Start, columns_of, gaussians_of, gradient_of, start_of
@@ -105,23 +105,42 @@ def test_columns_are_gaussians_and_gradients_are_by_them(degree):
     axes = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
     columns = columns_of(model, start, axes)
     back = gaussians_of(columns, model.means, start, axes)
-    for name in ("log_scales", "sh"):
-        np.testing.assert_allclose(getattr(back, name), getattr(model, name), atol=1e-5)
-    turns = (rotmat_from_quat(one.quats) for one in (back, model))
-    np.testing.assert_allclose(*turns, atol=1e-4)
+    np.testing.assert_allclose(back.sh, model.sh, atol=1e-5)
+    shapes = (
+        np.einsum("nij,nj,nkj->nik", (turn := rotmat_from_quat(g.quats)), g.log_scales, turn)
+        for g in (back, model)
+    )
+    np.testing.assert_allclose(*shapes, atol=1e-5)
     rng, step = np.random.default_rng(5), 1e-4
-    weights = {name: rng.normal(size=getattr(back, name).shape) for name in ("quats", "sh")}
-    weights |= {"log_scales": rng.normal(size=(40, 3)), "logit_opacities": rng.normal(size=40)}
+    weights = rng.normal(size=back.sh.shape), rng.normal(size=40), rng.normal(size=(40, 3, 3))
+
+    def parts(g, quats, scales):
+        """Weighted sums of colours, opacities and covariances, which no order of scales changes."""
+        turn = rotmat_from_quat(quats)
+        covariance = np.einsum("nij,nj,nkj->nik", turn, np.exp(2 * scales), turn)
+        values = g.sh, g.logit_opacities, 100 * covariance
+        sums = [(w * v).reshape(40, -1).sum(1) for w, v in zip(weights, values, strict=True)]
+        return np.sum(sums, 0, np.float64)
 
     def total(c):
         g = gaussians_of(c, model.means, start, axes)
-        return sum((w * getattr(g, name).astype(float)).sum() for name, w in weights.items())
+        return parts(g, g.quats, g.log_scales).sum()
 
+    quats, scales = back.quats.astype(float), back.log_scales.astype(float)
+    by = {"sh": weights[0], "logit_opacities": weights[1]}
+    by["quats"], by["log_scales"] = (
+        np.column_stack([(parts(back, *ends[0]) - parts(back, *ends[1])) / 2e-4 for ends in pairs])
+        for pairs in (
+            [((quats + d, scales), (quats - d, scales)) for d in step * np.eye(4)],
+            [((quats, scales + d), (quats, scales - d)) for d in step * np.eye(3)],
+        )
+    )
     direction = rng.normal(size=columns.shape)
     slope = (total(columns + step * direction) - total(columns - step * direction)) / (2 * step)
-    each = gradient_of(columns, start, axes, weights) * direction
+    each = gradient_of(back, start, axes, by) * direction
     each[np.abs(columns[:, -1] - 0.5) >= 6.4, -1] = 0  # opacities that are clamped
     assert each.sum() == pytest.approx(slope, rel=2e-2)
+    assert np.abs(each[:, -7:-1]).sum() > 0.1 * np.abs(each).sum()
 
 
 def test_sensitivity_is_that_of_brute_force():
@@ -141,12 +160,10 @@ def test_sensitivity_is_that_of_brute_force():
             moved[k, column] += sign * step
             other = np.empty_like(columns)
             other[order] = tree.inverse(moved)
-            ends.append(gaussians_of(other, model.means, quats, axes))
-        names = ("sh", "log_scales", "quats", "logit_opacities")
-        tangents = {n: (getattr(ends[0], n) - getattr(ends[1], n)) / (2 * step) for n in names}
-        images = (np.asarray(jvp(model, tangents, camera).rgb, float) for camera in CAMERAS)
-        exact[k, column] = sum(np.square(image).sum() for image in images)
-    each = [gradient_of(columns, quats, axes, by)[order] for by in signs(model, 60)]
+            g = gaussians_of(other, model.means, quats, axes)
+            ends.append(replace(g, antialiased=False))
+        exact[k, column] = change(*ends) / (2 * step) ** 2
+    each = [gradient_of(model, quats, axes, by)[order] for by in signs(model, 60)]
     turned = np.stack([tree.forward(one, adjoint=True) for one in each])
     h = allocate.sensitivity(turned, np.zeros(12, int))
     for column in (0, 4, 6, 9):
@@ -173,7 +190,7 @@ def test_a_file_gives_the_same_numbers_everywhere():
     digest = hashlib.blake2b(digest_size=8)
     for array in (g.means, g.log_scales, g.quats, g.logit_opacities, g.sh):
         digest.update(np.ascontiguousarray(array, "<f4").tobytes())
-    assert (len(g), digest.hexdigest()) == (300, "377157de5947e187")
+    assert (len(g), digest.hexdigest()) == (300, "02b6198249d92ab3")
 
 
 def test_a_file_comes_back_as_its_encoder_says(tmp_path):
@@ -280,6 +297,7 @@ def hostile(data: bytes, place: int, form: str, value) -> bytes:
         (13, "<H", 0, "impossible numbers"),
         (17, "<d", float("nan"), "impossible numbers"),
         (89, "<d", -1.0, "impossible numbers"),
+        (129, "<H", 65535, "damaged or incomplete"),
     ],
 )
 def test_hostile_headers_are_refused(tmp_path, place, form, value, message):
@@ -298,7 +316,7 @@ def test_damaged_files_are_refused_or_read(tmp_path):
                 broken[at] = rng.integers(256)
         payload = rng.bytes(40)
         if trial % 3 == 2:  # packets whose sums are right
-            key = int(rng.integers(3)), container.GROUPS[rng.integers(6)], int(rng.integers(3))
+            key = int(rng.integers(3)), container.GROUPS[rng.integers(4)], int(rng.integers(3))
             end = data.index(container.MARK, 200)
             broken = bytearray(data[:end] + container.packet(key, payload) + data[end:])
         path.write_bytes(bytes(broken))
@@ -370,7 +388,7 @@ def test_the_command_writes_what_fits_and_programs_read_it(dataset, prior, tmp_p
     assert alone.stat().st_size < 1200
     prior.rename(tmp_path / "gone")
     command("export", run, "--bytes", "2k", "--force")
-    assert 1200 < alone.stat().st_size <= 2000
+    assert 1000 < alone.stat().st_size <= 2000
 
 
 def small_run(dataset, prior, out, **train):
@@ -395,14 +413,14 @@ def test_fewer_gaussians_are_tried_until_all_fit_at_the_finest_steps(
 
 def test_a_small_file_is_better_with_fewer_gaussians_fitted_once_more(dataset, prior, tmp_path):
     run = small_run(dataset, prior, tmp_path / "run")
-    made = compacting.compact_run(run, 600)
+    made = compacting.compact_run(run, 400)
     encoders = starmap(compacting.encoding(run, shared=False), compacting.thinned(run, whole=False))
-    files = [compacting._fitted(encoder, 600, None) for encoder in encoders]
+    files = [compacting._fitted(encoder, 400, None) for encoder in encoders]
     pruned, measured = files[0], compacting._measure(run)
     assert made.psnr[1] == max(measured(file.model) for file in files if file)
     prior.rename(tmp_path / "gone")
-    unfitted = compacting.compact_run(open_run(run.folder), 600)
-    assert max(len(made.data), len(pruned), len(unfitted.data)) <= 600
+    unfitted = compacting.compact_run(open_run(run.folder), 400)
+    assert max(len(made.data), len(pruned), len(unfitted.data)) <= 400
     assert made.count < len(pruned.model)
     assert made.psnr[1] > measured(pruned.model) + 1
     assert made.psnr[1] > unfitted.psnr[1] + 0.2

@@ -14,8 +14,10 @@ Stream = Callable[[np.ndarray, Any], np.ndarray]
 FINER = 4  # steps of a layer over those of the next
 CLASSES = 21  # numbers of bits of a magnitude: 0 to 20
 LARGEST = (1 << (CLASSES - 1)) - 1  # largest magnitude that is coded
-FIRST_BLOCK, LAST_BLOCK = 32, 4096  # symbols coded with the same probabilities, doubled to the last
+FIRST_BLOCK, LAST_BLOCK = 16, 4096  # symbols coded with the same probabilities, doubled to the last
 UNSEEN = 0.02  # count of a symbol that was never coded
+FIRST_COUNTS = 4.0  # count of the smallest symbol before any; each further one has half of that
+CARRIED = 32.0  # most counts with which a further column begins
 
 
 def _library() -> Any:
@@ -73,25 +75,26 @@ def flag(stream: Stream, value: bool) -> bool:
 def integers(stream: Stream, values: np.ndarray, before: np.ndarray) -> np.ndarray:
     """Code integers [n,C] of magnitudes up to LARGEST, column by column, of which before [n,C] are
     known: the magnitudes without their last digit to base FINER, and signs. Where that is not 0,
-    the digit is coded adaptively. Elsewhere the number of bits of a magnitude is, separately for
-    rows in which an earlier column is not 0; then sign and lower bits as they are."""
+    the digit is coded adaptively. Elsewhere the number of bits of a magnitude is; then sign and
+    lower bits as they are. A column begins with the counts of the one before it."""
     result = np.zeros(values.shape, np.int64)
     uniform = _library().model.Uniform
+    counts = {size: FIRST_COUNTS * 0.5 ** np.arange(size) for size in (FINER, CLASSES)}
     for column in range(values.shape[1]):
         known = before[:, column] != 0
         least = FINER * np.abs(before[known, column])
         digits = np.abs(values[known, column]) - least
-        digits = adaptive(stream, digits, 0.5 ** np.arange(FINER))
+        digits = adaptive(stream, digits, counts[FINER])
         result[known, column] = np.sign(before[known, column]) * (least + digits)
-        busy = (result[:, :column] != 0).any(1)
-        for rows in (np.flatnonzero(~known & busy), np.flatnonzero(~known & ~busy)):
-            part = values[rows, column]
-            classes = adaptive(stream, np.frexp(np.abs(part))[1], 0.5 ** np.arange(CLASSES))
-            for bits in range(1, int(classes.max(initial=0)) + 1):
-                of = np.flatnonzero(classes == bits)
-                if len(of):
-                    least = 1 << (bits - 1)
-                    code = 2 * (np.abs(part[of]) - least) + (part[of] < 0)
-                    code = stream(code, uniform(1 << bits))
-                    result[rows[of], column] = (code // 2 + least) * (1 - 2 * (code % 2))
+        rows = np.flatnonzero(~known)
+        part = values[rows, column]
+        classes = adaptive(stream, np.frexp(np.abs(part))[1], counts[CLASSES])
+        for bits in range(1, int(classes.max(initial=0)) + 1):
+            of = np.flatnonzero(classes == bits)
+            if len(of):
+                least = 1 << (bits - 1)
+                code = 2 * (np.abs(part[of]) - least) + (part[of] < 0)
+                code = stream(code, uniform(1 << bits))
+                result[rows[of], column] = (code // 2 + least) * (1 - 2 * (code % 2))
+        counts = {size: part * min(1, CARRIED / part.sum()) for size, part in counts.items()}
     return result

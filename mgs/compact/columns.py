@@ -1,8 +1,8 @@
 """Gaussians as columns of numbers that vary smoothly over a surface, and back.
 
-Columns: 3K colours in the axes of `Layout.colours`, 3 log-scales, 3 of a rotation, 1 opacity logit.
-A rotation u from its start is p = u_xyz / (1 + u_w), so the quaternion is the start times
-(1 - |p|^2, 2 p), which needs no function whose last bit depends on the machine.
+Columns: 3K colours in the axes of `Header.colours`, 6 of the shape, 1 opacity logit. The shape is
+the symmetric matrix M = V diag(log s) V^T in the axes of the start, as (M_xx + M_yy) / 2,
+(M_xx - M_yy) / 2, M_zz, M_yz, M_zx, M_xy. Of equal scales it has no rotation that shows nothing.
 """
 
 import hashlib
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mgs.gaussians import SH_MAX, Gaussians
+from mgs.rotation import rotmat_from_quat
 from mgs.splat.constants import LOG_SCALE_RANGE
 
 if TYPE_CHECKING:
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 LOGITS = (-6.0, 7.0)  # range of opacity logits: 0.0025, below ALPHA_MIN, to 0.9991, above ALPHA_MAX
 FINE = 10  # binary digits of a means' grid below the spacing of a prior
 UNIT = 20  # binary digits of normals. The grids hide the last bits, in which machines differ.
+TINY = 1e-300  # added to a divisor: 0 / TINY is 0
+SWEEPS = 5  # of Jacobi's rotations, after which nothing is left off the diagonal
+NEAR = 1e-3  # difference of log-scales below which gradients by a turn are rounding errors
 
 
 @dataclass(frozen=True)
@@ -62,12 +66,7 @@ def _whole(values: np.ndarray) -> np.ndarray:
 def groups(coefficients: int) -> dict[str, slice]:
     """Columns by group, for K colour coefficients."""
     k = 3 * coefficients
-    colour = {"colour": slice(0, 3), "directional": slice(3, k)}
-    return colour | {
-        "scale": slice(k, k + 3),
-        "rotation": slice(k + 3, k + 6),
-        "opacity": slice(k + 6, k + 7),
-    }
+    return {"colour": slice(0, 3), "directional": slice(3, k), "shape": slice(k, k + 7)}
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -88,46 +87,77 @@ CONJUGATE = np.array([1, -1, -1, -1])
 
 def columns_of(g: Gaussians, quats: np.ndarray, colours: np.ndarray) -> np.ndarray:
     """Columns [N,3K+7] of Gaussians. quats: [N,4] of the start. colours: [3,3] axes, rows."""
-    u = product(quats * CONJUGATE, g.quats.astype(np.float64))
-    u *= np.where(u[:, :1] < 0, -1, 1) / np.maximum(np.linalg.norm(u, axis=1), 1e-30)[:, None]
     sh = np.einsum("nkc,dc->nkd", g.sh.astype(np.float64), colours).reshape(len(g), -1)
     scales, logits = np.clip(g.log_scales, *LOG_SCALE_RANGE), np.clip(g.logit_opacities, *LOGITS)
-    return np.column_stack([sh, scales, u[:, 1:] / (1 + u[:, :1]), logits])
+    turn = rotmat_from_quat(product(quats * CONJUGATE, g.quats.astype(np.float64)))
+    m = np.einsum("nij,nj,nkj->nik", turn, scales.astype(np.float64), turn)
+    mean, half = (m[:, 0, 0] + m[:, 1, 1]) / 2, (m[:, 0, 0] - m[:, 1, 1]) / 2
+    shape = [mean, half, m[:, 2, 2], m[:, 1, 2], m[:, 2, 0], m[:, 0, 1]]
+    return np.column_stack([sh, *shape, logits])
 
 
 def gaussians_of(
     columns: np.ndarray, means: np.ndarray, quats: np.ndarray, colours: np.ndarray
 ) -> Gaussians:
-    """Gaussians of columns, the inverse of `columns_of`, each number by the same operations in the
-    same order on every machine."""
+    """Gaussians of columns, the inverse of `columns_of` but for the order of the scales, each
+    number by the same operations in the same order on every machine."""
     n, k = len(columns), columns.shape[1] - 7
-    axes, scales, p, logits = np.split(columns, [k, k + 3, k + 6], axis=1)
-    axes = axes.reshape(n, -1, 3)
+    axes = columns[:, :k].reshape(n, -1, 3)
     sh = sum(axes[..., d, None] * colours[d] for d in range(3))
-    x, y, z = p.T
-    turn = np.column_stack([1 - (x * x + y * y + z * z), 2 * x, 2 * y, 2 * z])
+    scales, quats = _eigen(columns[:, k : k + 6], np.broadcast_to(quats, (n, 4)))
     return Gaussians(
         means=means.astype(np.float32),
         log_scales=np.clip(scales, *LOG_SCALE_RANGE).astype(np.float32),
-        quats=product(quats, turn).astype(np.float32),
-        logit_opacities=np.clip(logits[:, 0], *LOGITS).astype(np.float32),
+        quats=quats.astype(np.float32),
+        logit_opacities=np.clip(columns[:, -1], *LOGITS).astype(np.float32),
         sh=np.clip(sh, -SH_MAX, SH_MAX).astype(np.float32),
     )
 
 
+def _eigen(shape: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues [N,3] of matrices [N,6] of `columns_of`, and quats [N,4] times the rotations to
+    the eigenvectors, by Jacobi's method."""
+    mean, half, last, *off = shape.T
+    values = [mean + half, mean - half, last]  # off[k]: the element of the two other axes
+    for k in [0, 1, 2] * SWEEPS:
+        i, j = (k + 1) % 3, (k + 2) % 3
+        between, twice = values[j] - values[i], 2 * off[k]
+        root = np.sqrt(between * between + twice * twice)
+        tan = np.where(between < 0, -twice, twice) / (np.abs(between) + root + TINY)
+        cos = 1 / np.sqrt(1 + tan * tan)
+        sin = tan * cos
+        values[i], values[j] = values[i] - tan * off[k], values[j] + tan * off[k]
+        off[i], off[j] = cos * off[i] + sin * off[j], cos * off[j] - sin * off[i]
+        off[k] = np.zeros(len(shape))
+        turn = np.zeros((len(shape), 4))
+        turn[:, 0], turn[:, 1 + k] = 1 + cos, -sin
+        quats = product(quats, turn / 2)
+    return np.column_stack(values), quats
+
+
 def gradient_of(
-    columns: np.ndarray, quats: np.ndarray, colours: np.ndarray, by: Mapping[str, np.ndarray]
+    g: Gaussians, quats: np.ndarray, colours: np.ndarray, by: Mapping[str, np.ndarray]
 ) -> np.ndarray:
-    """Gradient [N,3K+7] by the columns. by: gradients by the fields of `gaussians_of`."""
-    p = columns[:, -4:-1]
-    turn = product(quats * CONJUGATE, by["quats"].astype(np.float64))
-    sh = np.einsum("nkc,dc->nkd", by["sh"].astype(np.float64), colours).reshape(len(p), -1)
-    rotation = 2 * (turn[:, 1:] - p * turn[:, :1])
-    return np.column_stack([sh, by["log_scales"], rotation, by["logit_opacities"]])
+    """Gradient [N,3K+7] by the columns of Gaussians. by: gradients by the fields of g."""
+    n, own = len(g), g.quats.astype(np.float64)
+    sh = np.einsum("nkc,dc->nkd", by["sh"].astype(np.float64), colours).reshape(n, -1)
+    # In the axes of the Gaussian, a turn w about axis k changes M_ij by w (log s_i - log s_j).
+    turns = product(own * CONJUGATE, by["quats"].astype(np.float64))[:, 1:] / 2
+    m = np.einsum("ni,ij->nij", by["log_scales"].astype(np.float64), np.eye(3))
+    scales = g.log_scales.astype(np.float64)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        between = scales[:, i] - scales[:, j]
+        m[:, i, j] = m[:, j, i] = turns[:, k] * between / (between**2 + NEAR**2) / 2
+    turn = rotmat_from_quat(product(quats * CONJUGATE, own))
+    m = np.einsum("nij,njk,nlk->nil", turn, m, turn)
+    mean, half = m[:, 0, 0] + m[:, 1, 1], m[:, 0, 0] - m[:, 1, 1]
+    shape = [mean, half, m[:, 2, 2], 2 * m[:, 1, 2], 2 * m[:, 2, 0], 2 * m[:, 0, 1]]
+    return np.column_stack([sh, *shape, by["logit_opacities"]])
 
 
 def colour_axes(sh: np.ndarray) -> np.ndarray:
     """Axes [3,3] along which the differences between neighbours vary most, one after the other.
     sh: [N,K,3], neighbours together."""
     step = np.diff(sh[:, 0].astype(np.float64), axis=0)
-    return np.linalg.eigh(step.T @ step)[1].T[::-1].astype(np.float32).astype(np.float64)
+    return np.asarray(np.linalg.eigh(step.T @ step)[1].T[::-1])

@@ -8,20 +8,33 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mgs.compact import allocate
-from mgs.compact.coder import Stream, encode, flag, integers
+from mgs.compact.coder import FINER, Stream, encode, flag, integers
 from mgs.compact.columns import Start, colour_axes, columns_of, gaussians_of, gradient_of, groups
-from mgs.compact.container import ANTIALIASED, LINEAR, SHARED, Header, Key, join, packet, step_codes
+from mgs.compact.container import (
+    ANTIALIASED,
+    AXES,
+    CENTRES,
+    LINEAR,
+    SHARED,
+    Header,
+    Key,
+    fixed,
+    join,
+    packet,
+    step_codes,
+)
 from mgs.compact.decode import IDENTITY, decoded, grid_cells, lone_cells, restored, rows_of
 from mgs.compact.tree import AXIS_BITS, DEPTH, Tree, cells_of, code_descendants, codes_of, tree_of
 from mgs.data.world import PLUS_Z, Vector
 from mgs.gaussians import Gaussians
 
-LAYERS = 3  # layers of a file; the first has steps 16 times those of the last
-TILE = 8000  # Gaussians of a tile
+COARSEST = 0.16  # scale of the steps of a first layer, about
+TILE = 2500  # Gaussians of a tile: a packet of their positions has 5 kB
 # Where positions are sent, a node stands for its cells in the first packets; elsewhere it has 8
 # times as many, which takes 3 % fewer bytes.
 TOP = 3  # fewest cells of a node at the cut, in the mean
-WIDEST = 0.6  # largest step of positions over neighbours' median distance, who would share a cell
+FINEST = 1 / 16  # smallest step of positions over neighbours' median distance
+WIDEST = 0.6  # largest one; neighbours would share a cell of a larger one
 
 Gradients = Callable[[Gaussians], Iterator[Mapping[str, np.ndarray]]]
 """Gradients of sum(z image) by the fields of a model, of some views, z independent signs."""
@@ -85,15 +98,13 @@ class Encoder:
         near = cKDTree(start.means).query(start.means, min(2, len(start.means)))[0].max(axis=-1)
         self.spacing = float(np.median(near)) or 1.0
         self.low, self.extent = start.means.min(0), float(np.ptp(start.means, 0).max())
-        self.axes = colour_axes(g.sh[self._codes(self.extent / 1e6)[0]])
+        self.axes = fixed(colour_axes(g.sh[self._codes(self.extent / 1e6)[0]]), AXES)
         quats = start.quats[self.kept]
         columns = columns_of(g, quats, self.axes)
         # Reading cuts to ranges, so the gradients are those of what is read.
         model = gaussians_of(columns, start.means[self.kept], quats, self.axes)
         model = replace(model, antialiased=g.antialiased, linear=g.linear)
-        each = [
-            (gradient_of(columns, quats, self.axes, by), by["means"]) for by in gradients(model)
-        ]
+        each = [(gradient_of(model, quats, self.axes, by), by["means"]) for by in gradients(model)]
         self.columns, self.gradients = columns, np.stack([columns for columns, _ in each])
         self.of_means = float(np.square([means for _, means in each]).sum(0).mean())
 
@@ -108,7 +119,7 @@ class Encoder:
         """The file whose last layer rounds each coefficient at an expected cost of scale^2 / 12,
         (pixel value)^2."""
         grid = scale / np.sqrt(self.of_means + 1e-30) if self.start is None else 0.0
-        grid = float(np.clip(grid, self.spacing / 8, self.spacing * WIDEST))
+        grid = float(np.clip(grid, self.spacing * FINEST, self.spacing * WIDEST))
         grid = max(grid, 2 * self.extent / 2**AXIS_BITS)
         order, codes, among = self._codes(grid)
         least = 8 * TOP if self.start and len(codes) == len(among) else TOP
@@ -122,14 +133,15 @@ class Encoder:
         centres = np.zeros((2, columns.shape[1]))
         for number in np.unique(layer):
             centres[number] = columns[layer == number].mean(0)
-        centres = centres.astype(np.float32).astype(np.float64)
+        centres = fixed(centres, CENTRES)
         values = tree.forward(columns - centres[layer])
         slopes = np.stack([tree.forward(one[order], adjoint=True) for one in self.gradients])
         h = allocate.sensitivity(slopes, tree.band)
+        layers = 1 + max(0, round(np.log(COARSEST / scale) / np.log(FINER)))
         start, g = self.places, self.g
         flags = ANTIALIASED * g.antialiased + LINEAR * g.linear + SHARED * bool(self.start)
         header = Header(
-            *(flags, self.g.sh_degree, cut, LAYERS, len(codes), tiles, 0),
+            *(flags, self.g.sh_degree, cut, layers, len(codes), tiles, 0),
             *(self.low, *self.world, grid, start.inset, scale),
             *(start.digest, self.axes, centres, step_codes(1 / np.sqrt(h))),
         )
@@ -165,7 +177,7 @@ class Encoder:
                         key = tile, group, layer
                         payloads[key] = _numbers(numbers, before)
                         worth[key] = float(gains[layer][rows, of].sum())
-        sizes = {key: len(data) + 13 for key, data in payloads.items()}
+        sizes = {key: len(packet(key, data)) for key, data in payloads.items()}
         keys = allocate.in_order(worth, sizes)
         header = replace(header, packets=len(keys))
         expected = float((h[tree.band] * np.square(values)).sum() - gains.sum())
