@@ -298,6 +298,7 @@ def hostile(data: bytes, place: int, form: str, value) -> bytes:
         (17, "<d", float("nan"), "impossible numbers"),
         (89, "<d", -1.0, "impossible numbers"),
         (129, "<H", 65535, "damaged or incomplete"),
+        (140, "<I", 0, "impossible numbers"),
     ],
 )
 def test_hostile_headers_are_refused(tmp_path, place, form, value, message):
