@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
 
@@ -24,6 +25,7 @@ from mgs.data.importers import import_source
 from mgs.data.photographs import sharpest_frames
 from mgs.data.shots import Spacing
 from mgs.data.sources import read_source
+from mgs.data.structure import Matcher
 from mgs.errors import Notice
 from mgs.files import read_json
 from mgs.fit.poses import displaced, motion_between
@@ -264,6 +266,16 @@ def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, monkeypatch):
     command("import", root, "--out", out)
     assert len(load_dataset(out)) == len(frames)
     assert not (tmp_path / "d.unpacked").exists()
+
+
+def test_photographs_added_later_are_taken_with_the_same_camera(frames, tmp_path):
+    paths = [frame.image_path for frame in frames]
+    for count in (3, 5):
+        matcher = Matcher(paths[:count], tmp_path / "m")
+        matcher.match([(0, count - 1)])
+    with closing(pycolmap.Database.open(matcher.database)) as database:
+        assert len(database.read_all_images()) == 3
+        assert len(database.read_all_cameras()) == 1
 
 
 def test_photographs_alone_are_one_command_to_the_next_picture(

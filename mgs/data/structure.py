@@ -110,16 +110,17 @@ class Matcher:
         groups = defaultdict[str, list[int]](list)
         numbers = dict[str, int]()
         with closing(pycolmap.Database.open(self.database)) as database:
-            with_features = {
-                image.name
-                for image in database.read_all_images()
-                if database.exists_keypoints(image.image_id)
-            }
+            images = {image.name: image for image in database.read_all_images()}
+            for name, camera in zip(self.names, self.cameras, strict=True):
+                if name in images:  # of a call before, with whose cameras it shares its own
+                    numbers[str(camera.todict())] = images[name].camera_id
             for place in places:
-                if self.names[place] not in with_features:
+                image = images.get(self.names[place])
+                if image is None or not database.exists_keypoints(image.image_id):
                     groups[str(self.cameras[place].todict())].append(place)
             for key, members in groups.items():
-                numbers[key] = database.write_camera(self.cameras[members[0]])
+                if key not in numbers:
+                    numbers[key] = database.write_camera(self.cameras[members[0]])
         options = pycolmap.FeatureExtractionOptions(max_image_size=WIDEST)
         options.sift.max_num_features = FEATURES
         done, total = 0, sum(map(len, groups.values()))
