@@ -60,6 +60,12 @@ def test_a_full_disk_behind_the_standard_output():
     assert ended.returncode == 2
 
 
+def test_a_standard_output_that_is_closed():
+    words = f"exec {sys.executable} -m mgs doctor --help >&-"
+    ended = subprocess.run(words, shell=True, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
 def test_a_terminal_of_ascii_and_no_home():
     script = (
         "import typer; from mgs.cli import app; from mgs import runtime\n"

@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 import synthetic
 from PIL import ExifTags, Image
-from program import command, exit_code, said, stop_at
+from program import command, exit_code, python, said, stop_at
 from refusals import fails, refused
 from scipy.ndimage import map_coordinates
 
@@ -276,6 +276,14 @@ def test_photographs_added_later_are_taken_with_the_same_camera(frames, tmp_path
     with closing(pycolmap.Database.open(matcher.database)) as database:
         assert len(database.read_all_images()) == 3
         assert len(database.read_all_cameras()) == 1
+
+
+def test_a_process_that_is_asked_to_end_prints_no_stack(frames, tmp_path):
+    program = "import os, signal, sys; from pathlib import Path\n"
+    program += "from mgs.data.structure import Matcher; Matcher([Path(sys.argv[1])], Path('m'))\n"
+    program += "os.kill(os.getpid(), signal.SIGTERM)"
+    ended = python(program, frames[0].image_path, cwd=tmp_path)
+    assert (ended.returncode, ended.stderr) == (-15, "")
 
 
 def test_photographs_alone_are_one_command_to_the_next_picture(

@@ -137,7 +137,8 @@ def main(arguments: list[str] | None = None) -> None:
     warnings.showwarning = _print_warning  # type: ignore[assignment]
     try:
         code = app(arguments, prog_name="mgs", standalone_mode=False)
-        sys.stdout.flush()
+        if sys.stdout is not None:  # closed by who started the process
+            sys.stdout.flush()
     except OSError as error:
         if error.errno not in CURES:
             raise

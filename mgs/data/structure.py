@@ -2,9 +2,10 @@
 results repeat, but bundle adjustments of over 50,000 observations sum in any order."""
 
 import shutil
+import signal
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,8 @@ class Matcher:
         import PIL.Image  # noqa: F401  # after pycolmap, writing a PNG would crash in its zlib
         import pycolmap
 
+        with suppress(ValueError, TypeError):  # else pycolmap prints its stack where it is stopped
+            signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
         pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
         self.folder, self.database = folder, folder / "database.db"
         about = [[str(path.resolve()), path.stat().st_mtime_ns] for path in pictures]
