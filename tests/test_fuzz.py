@@ -15,7 +15,11 @@ import struct
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import starmap
 from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -23,23 +27,32 @@ import pytest
 import synthetic
 import tiny
 import trimesh
-from PIL import Image
+from PIL import ExifTags, Image
 from test_recordings import WRITERS
 
 from mgs import InputError, evaluate_run, images, load_dataset, load_prior, open_run, write_page
 from mgs.cli.app import CURES
+from mgs.compact import container
+from mgs.compact.columns import start_of
+from mgs.compact.encode import Encoder
 from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
 from mgs.data.meshes import load_mesh
+from mgs.data.photographs import _usable, sharpest_frames
+from mgs.data.shots import Spacing
 from mgs.data.sources import read_source
+from mgs.data.structure import Matcher
 from mgs.files import read_json, write_json
+from mgs.gaussians import ARRAYS
 from mgs.images import exif_exposure, image_size, read_mask, read_values, write_exr, write_png
 from mgs.reports.tables import compare_runs
 from mgs.run.candidates import Site, read_poses, refusals
-from mgs.splat_files import load_gaussians
+from mgs.splat_files import load_gaussians, write_gaussians
 from mgs.splat_ply import read_ply, write_compressed_ply, write_ply
 from mgs.synth.scene_file import load_scene_file
 from mgs.view.layers import read_subject
 from studies.frame.sweep import Cell, result_of
+
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read once, by the first video
 
 FLOATS = (float("nan"), float("inf"), -1.0, 0.0, 1e-300)
 NUMBERS = [struct.pack(form, n) for form in ("<I", ">I", "<Q") for n in (0, 1, 255, 2**32 - 1)]
@@ -185,6 +198,67 @@ def read_all(path: Path) -> None:
     read_subject(root / "run")
 
 
+HALF = Spacing.parse("0.5s")
+
+
+def spz(path: Path) -> None:
+    write_gaussians(path, replace(tiny.initial([]), antialiased=True), "spz", np.eye(3))
+
+
+def video(path: Path) -> None:
+    code = {".avi": "MJPG", ".mp4": "mp4v"}[path.suffix]
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 10, (32, 24))
+    for k in range(24):
+        film.write(np.roll(NOISE[..., :3] >> 8, k, axis=1).astype(np.uint8))
+    film.release()
+
+
+def photograph(path: Path) -> None:
+    """A JPEG on its side with exposure, focal length and GPS in its EXIF."""
+    image = Image.fromarray((NOISE[..., :3] >> 8).astype(np.uint8))
+    exif = image.getexif()
+    exif[ExifTags.Base.Orientation] = 6
+    tags = ExifTags.Base
+    shot = {tags.ExposureTime: 0.01, tags.FNumber: 2.8, tags.FocalLengthIn35mmFilm: 28}
+    exif.get_ifd(ExifTags.IFD.Exif).update(shot)
+    gps = {1: "N", 2: (48.0, 1.0, 2.0), 3: "E", 4: (11.0, 1.0, 2.0), 5: b"\0", 6: 300.0}
+    exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps)
+    image.save(path, exif=exif)
+
+
+def of_photograph(path: Path) -> None:
+    """Read a photograph as an import of a folder does, as far as its features."""
+    read_image(path)
+    usable, _ = _usable([path])
+    if usable:
+        Matcher(usable, path.parent / "matches")._extract([0])
+
+
+NO_SUMS = mock.patch.object(container, "zlib", SimpleNamespace(crc32=lambda _: 0))
+"""Without checks of sums, so that damage reaches the decoder."""
+
+
+def without_sums(path: Path) -> None:
+    header, packets = container.split((CORPUS / "MGS/one.mgs").read_bytes(), path)
+    with NO_SUMS:
+        path.write_bytes(container.join(header, starmap(container.packet, packets.items())))
+
+
+def masked(path: Path) -> None:
+    """A file of three quarters of a prior's Gaussians, in the receiver's places."""
+    prior = load_prior(tiny.write_prior(path.parent / "prior"))
+    model, kept = tiny.initial([]), np.flatnonzero(np.arange(tiny.POINTS) % 4)
+    gradients = lambda g: iter([{name: np.ones_like(getattr(g, name)) for name in ARRAYS}])  # noqa: E731
+    with NO_SUMS:
+        start = start_of(prior, 0.0)
+        path.write_bytes(bytes(Encoder(model[kept], gradients, start, kept).file(0.1)))
+
+
+def of_masked(path: Path) -> None:
+    with NO_SUMS:
+        load_gaussians(path, path.parent / "prior")
+
+
 def result(path: Path) -> None:
     result_of(path.parents[2], Cell(path.parent.name, "a:b", {"a": 1}))
 
@@ -218,6 +292,11 @@ SOURCE = lambda path: read_source(path.parent)  # noqa: E731
 
 LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]] = {
     "PNG": ("a.png", png, read_image),
+    "photograph": ("a.jpg", photograph, of_photograph),
+    **{
+        kind: (f"a.{kind.lower()}", video, lambda path: sharpest_frames(path, path.parent, HALF))
+        for kind in ("AVI", "MP4")
+    },
     "JPEG": ("a.jpg", lambda path: Image.effect_noise((32, 24), 50).save(path), read_image),
     "depth": ("d.png", lambda path: Image.new("I;16", (32, 24), 9).save(path), read_values),
     "EXR": ("a.exr", exr, images.read_exr),
@@ -228,6 +307,9 @@ LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]]
         read_ply,
     ),
     "MGS": ("a.mgs", lambda path: shutil.copy(CORPUS / "MGS/one.mgs", path), load_gaussians),
+    "MGS without sums": ("a.mgs", without_sums, NO_SUMS(load_gaussians)),
+    "MGS masked": ("a.mgs", masked, of_masked),
+    "SPZ": ("a.spz", spz, load_gaussians),
     "cloud": ("cloud.ply", cloud, read_cloud),
     "GLB": ("a.glb", mesh, load_mesh),
     "OBJ": ("a.obj", trimesh.creation.icosphere(subdivisions=0).export, load_mesh),

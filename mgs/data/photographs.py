@@ -104,7 +104,7 @@ def _usable(paths: Sequence[Path]) -> tuple[list[Path], dict[str, str]]:
         try:
             read_rgba(path)
         except InputError:
-            dropped[path.name] = "that cannot be read"
+            dropped[path.name] = "that cannot be read: damaged, or neither grey nor RGB"
             continue
         same = {hashlib.sha256(path.read_bytes()).hexdigest(), str(path.with_suffix(""))}
         if same & seen:
@@ -254,6 +254,7 @@ def sharpest_frames(video: Path, folder: Path, spacing: Spacing) -> list[Path]:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else it prints the faults of a video
     import cv2
 
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     if spacing.metres:
         raise InputError(f"{video}: a video has no distances; give keyframes in seconds, as 0.5s")
     about = [str(video.resolve()), video.stat().st_mtime_ns, spacing.least]
@@ -263,7 +264,7 @@ def sharpest_frames(video: Path, folder: Path, spacing: Spacing) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("*.png"):
         old.unlink()
-    capture = cv2.VideoCapture(str(video))
+    capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)  # others look for pictures
     rate, total = capture.get(cv2.CAP_PROP_FPS), int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     window, number = max(1, round(rate * spacing.least)), 0
     best, sharpest = None, -1.0
@@ -285,6 +286,9 @@ def sharpest_frames(video: Path, folder: Path, spacing: Spacing) -> list[Path]:
     capture.release()
     if number == 0:
         raise InputError(f"{video}: not a readable video, or cut off; convert it to MP4 (H.264)")
+    if number <= (FEWEST - 1) * window:
+        cure = "give a longer one, or keyframes nearer in time, as 0.1s"
+        raise InputError(f"{video}: its {number} frames give under {FEWEST} keyframes; {cure}")
     if number < WHOLE * total:
         read = f"only {number} of {total} frames can be read, and are used"
         warnings.warn(
