@@ -123,7 +123,7 @@ BLACK, ZEROS = np.zeros((48, 64), bool), {"Z": np.zeros((48, 64))}
 BUILD, PRIOR = "prior {d} --gaussians 300", "nbv {d} --out {out} --prior {d}/prior --budget 1"
 ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
     (tiny.write_dataset, "nbv {d} --out {out}"): [
-        ("transforms.json", remove("transforms.json")),
+        ("holds no transforms.json; make", remove("transforms.json")),
         ("no frames", text("transforms.json", "[1, 2]")),
         ("frame 2", frame(transform_matrix=[["a"] * 4] * 4)),
         ("not a finite 4x4", frame(transform_matrix=[[float("nan")] * 4] * 4)),

@@ -107,9 +107,9 @@ def load_dataset(
     the same name."""
     root = Path(root)
     path = root / "transforms.json"
-    if not root.is_dir():
-        cure = "make one with `mgs import` or `mgs synth-orbit`"
-        raise InputError(f"{root}: no such dataset folder; {cure}")
+    if not path.exists():
+        fault = "holds no transforms.json" if root.is_dir() else "no such dataset folder"
+        raise InputError(f"{root}: {fault}; make a dataset with `mgs import` or `mgs synth-orbit`")
     data, records = read_records(path)
     upward = up or data.get("up") or PLUS_Z
     world = World(unit_up(upward), unit_of(path, data) or "m", _origin_of(path, data))

@@ -173,7 +173,7 @@ def start_run(
     rule = policy_of(policy)  # a user's policy fails here, before there is a folder
     check_settings(mission, len(dataset))
     inputs = [path for path in (root, folder) if path]
-    ours = Ours(FILES, inputs) if holds_run(out) else None
+    ours = Ours(FILES, inputs) if force else None
     with atomic_folder(out, ours) as unfinished, listening(progress):
         how = PriorSettings(gaussians=gaussians, seed=mission.seed, parts=parts)
         shown = _seed_frames(dataset, mission) if source == "random" else None
