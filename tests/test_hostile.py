@@ -249,19 +249,24 @@ METRICS = [
     {"pictures": "no"}, {"test_views": {}}, {"held_out": None},
 ]  # fmt: skip
 LINES = {
-    "config.json": ['{"settings": 1}', '{"settings": {}, "frames": 7}', "[]"],
-    "steps.jsonl": ["", "[]", "[" * 100_000],
-    "metrics.json": [*(json.dumps(SOUND | change) for change in METRICS), "[]", "[" * 100_000],
+    "config.json": dict.fromkeys(('{"settings": 1}', '{"settings": {}, "frames": 7}', "[]"), ""),
+    "steps.jsonl": dict.fromkeys(("", "[]", "[" * 100_000), ""),
+    "metrics.json": {
+        **{json.dumps(SOUND | change): f"({next(iter(change))}" for change in METRICS},
+        "[]": "",
+        "[" * 100_000: "",
+    },
 }
-"""File of a run -> damaged contents."""
+"""File of a run -> damaged contents -> key that the line names."""
 
 
 @pytest.mark.parametrize("file", LINES)
 def test_the_text_files_of_a_stranger(capsys, stranger, file):
-    for text in LINES[file]:
+    for text, key in LINES[file].items():
         (stranger / file).write_text(text)
         line = refused(capsys, ["report", stranger, "--html", stranger / "a.html"], stranger)
         assert str(stranger / file) in line
+        assert key in line
     if file == "metrics.json":
         fails(r"metrics\.json", read_subject, stranger)
 
