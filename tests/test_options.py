@@ -110,6 +110,7 @@ def writers(dataset: Path, prior: Path, splats: Path, out: Path) -> dict[str, li
 
 IN_THE_WAY = {
     "is there already": lambda tmp_path: occupied(tmp_path / "out"),
+    "leaves it alone": lambda tmp_path: occupied(tmp_path / "out"),
     "is a file": lambda tmp_path: a_file(tmp_path / "out"),
     "under a file": lambda tmp_path: a_file(tmp_path / "file") / "out",
     "long name": lambda tmp_path: tmp_path / ("long" * 99),
@@ -121,15 +122,17 @@ COMMANDS_THAT_WRITE = list(writers(*[Path()] * 4))
 @pytest.mark.parametrize(
     ("command", "place"),
     [(command, "is there already") for command in COMMANDS_THAT_WRITE]
-    + [("render", place) for place in IN_THE_WAY if place != "is there already"]
-    + [("prior", "read only"), ("nbv", "read only")],
+    + [("render", place) for place in ("is a file", "under a file", "long name", "read only")]
+    + [("prior", "read only"), ("nbv", "read only"), ("nbv", "leaves it alone")],
 )
 def test_output_that_is_in_the_way(capsys, dataset, prior, tmp_path, command, place):
     write_ply(tmp_path / "splats.ply", tiny.initial([]))
     out = IN_THE_WAY[place](tmp_path)
     before = listing(tmp_path)
-    line = refused(capsys, writers(dataset, prior, tmp_path / "splats.ply", out)[command])
-    assert (place if place in ("is there already", "is a file") else "cannot be written") in line
+    force = ["--force"] * (place == "leaves it alone")
+    line = refused(capsys, writers(dataset, prior, tmp_path / "splats.ply", out)[command] + force)
+    said = place if place.startswith(("is ", "leaves ")) else "cannot be written"
+    assert said in line
     assert listing(tmp_path) == before
 
 
