@@ -34,7 +34,9 @@ def points_over_rocks(rows: Sequence[Row]) -> list[Row]:
     "peak_megabytes_more" against the base of the kind on the same rock. One process does all
     points, so its memory is more than that of a run alone; the differences are not.
     """
-    points = grouped([row | {"policy": row["policy"] or ""} for row in rows], *SETTINGS)
+    unset = dict.fromkeys((*SETTINGS, "preset"))
+    filled = [unset | row | {"policy": row.get("policy") or ""} for row in rows]
+    points = grouped(filled, *SETTINGS)
     for kind in grouped(points, "kind"):
         usual = {row["rock"]: row for row in base_of(kind["of"])["of"]}
         for point in kind["of"]:

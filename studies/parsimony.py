@@ -11,6 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import mgs
 from mgs.fit.evidence import lean_fit
 from mgs.fit.pruning import prune
@@ -198,18 +200,18 @@ def write(work: Work) -> list[Path]:
 
 
 def draw(path: Path, rows: Sequence[Row]) -> None:
-    """Draw PSNR against the number of parameters, a panel for each rock."""
-    default = [row for row in rows if row["choice"] == DEFAULT]
-    joined = [
-        row | {"choice": choice} for row in default for choice in (NUMBER, KINDS, PRUNED, LOSS)
-    ]
-    shown = joined + [row for row in rows if row["choice"] in (NUMBER, KINDS, PRUNED, LOSS, REFIT)]
-    label, axes = "PSNR inside the rock (dB)", ("parameters", "psnr_inside")
-    panels = [
-        Panel(*axes, "learned parameters", label, "choice", True, (("scene", scene),), scene)
-        for scene in dict.fromkeys(row["scene"] for row in rows)
-    ]
-    draw_panels(path, panels, shown, "`refit` (star) beside fixed numbers and kinds of parameters")
+    """Draw PSNR against the number of parameters, both over those of the default, means of
+    rocks."""
+    lines = (NUMBER, KINDS, PRUNED, LOSS)
+    shown: list[Row] = []
+    for group in grouped([row | {"name": name_of(row)} for row in rows], "name"):
+        choice = group["of"][0]["choice"]
+        percent = {"percent": 100 * float(np.mean([row["share"] for row in group["of"]]))}
+        names = lines if choice == DEFAULT else (choice,) if choice in (*lines, REFIT) else ()
+        shown += [row | percent | {"choice": name} for name in names for row in group["of"]]
+    labels = "learned parameters (%)", "PSNR inside the rock over the default (dB)"
+    panel = Panel("percent", "psnr_inside_over", *labels, "choice", True)
+    draw_panels(path, [panel], shown)
 
 
 STUDY = Study(

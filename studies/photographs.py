@@ -147,13 +147,18 @@ def write(work: Work) -> list[Path]:
         about = {"dataset": dataset.absolute().name, "program": program, "passes": passes}
         rows.append(about | result | {"command": shlex.join([*words, "--out", "RUN"])})
     rows += work.size.peer_rows()
-    labels = "cpu_seconds", "psnr", "CPU seconds", "PSNR on the test views (dB)", "program", True
+    draw(work.out / f"{NAME}.png", rows)
+    return [*write_table(work, NAME, rows, tables(rows)), work.out / f"{NAME}.png"]
+
+
+def draw(path: Path, rows: Sequence[Row]) -> None:
+    """Draw PSNR against CPU seconds, a panel for each dataset."""
+    labels = "cpu_seconds", "psnr", "CPU seconds", "PSNR on test views (dB)", "program", True
     panels = [
         Panel(*labels, only=(("dataset", name),), title=name)
         for name in dict.fromkeys(row["dataset"] for row in rows)
     ]
-    draw_panels(work.out / f"{NAME}.png", panels, rows)
-    return [*write_table(work, NAME, rows, tables(rows)), work.out / f"{NAME}.png"]
+    draw_panels(path, panels, rows)
 
 
 STUDY = Study(

@@ -1,21 +1,28 @@
 """Draw the figures of docs/results again from the rows beside them.
 
-python tools/figures.py [NAME ...]     # chart, parsimony, setups, stress; default: all
+python tools/figures.py [NAME ...]     # names of FIGURES; default: all
 """
 
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from studies import chart, parsimony, setups, stress
+from studies import chart, parsimony, photographs, setups, stress
 from studies.frame.output import read_rows
 from studies.frame.statistics import Row
 
 RESULTS = Path(__file__).parent.parent / "docs/results"
 
+
+def draw_chart(path: Path, rows: list[Row]) -> None:
+    """Draw the chart of speed and accuracy."""
+    chart.draw(path, chart.points_over_rocks(rows))
+
+
 FIGURES: Mapping[str, tuple[str, Callable[[Path, list[Row]], None]]] = {
-    "chart": ("chart/chart", chart.draw),
+    "chart": ("chart/chart", draw_chart),
     "parsimony": ("parsimony/parsimony", parsimony.draw),
+    "photographs": ("photographs/photographs", photographs.draw),
     "setups": ("setups/setups", setups.draw),
     "stress": ("stress/stress", stress.draw),
 }

@@ -262,10 +262,14 @@ def _size(panel: Panel, rows: Sequence[Row]) -> tuple[float, float]:
     return WIDTH + PER_LETTER * max(map(len, names)), height + legend
 
 
+UNLIKE = [STYLES[k] for k in (3, 6, 10, 8, 9, 0, 4, 5)]
+"""Styles of groups that are no policies, bright ones first."""
+
+
 def group_styles(groups: Sequence[Any]) -> list[dict[str, Any]]:
-    """Keywords for matplotlib: policies as in all figures, else in that order."""
+    """Keywords for matplotlib: policies as in all figures, others as in UNLIKE."""
     of_policies = all(group in POLICY_STYLE for group in groups)
-    looks = [POLICY_STYLE[one] for one in groups] if of_policies else cycle(STYLES)
+    looks = [POLICY_STYLE[one] for one in groups] if of_policies else cycle(UNLIKE)
     pairs = zip(groups, looks, strict=False)
     return [{"color": c, "marker": m, "label": group} for group, (c, m) in pairs]
 
@@ -308,7 +312,7 @@ def logarithmic(axis: "Axes") -> None:
     axis.set_xscale("log")
     axis.xaxis.set_minor_formatter(NullFormatter())
     if low > 1e-3 and high < min(1e6, 300 * low):
-        subs = (1, 2, 5) if high > 3 * low else range(1, 10)
+        subs = (1, 2, 5) if high > 12 * low else (1, 1.5, 2, 3, 5, 7)
         axis.xaxis.set_major_locator(LogLocator(subs=subs))
         axis.xaxis.set_major_formatter(lambda x, _: f"{x:g}" if x < 1e4 else f"{x / 1000:g}k")
 
