@@ -69,9 +69,11 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
     metres = prior.numbers.get("unit", "m") == "m"
     spacing = f"{1e3 * prior.spacing:.2f} mm" if metres else f"{prior.spacing:.3g} units"
     area = f"{prior.mesh.areas.sum():.2f} {'m' if metres else 'unit'}²"
-    with drawing(path, 17 if segmented is not None else 7, 4.2, FRAMED, dpi=100) as figure:
-        axes = figure.subplots(1, 5 if segmented is not None else 2)
+    lines, columns = (1, 2) if segmented is None else (2, 3)
+    with drawing(path, 3 * columns, 3.6 * lines, FRAMED, dpi=150) as figure:
+        axes = list(figure.subplots(lines, columns).ravel())
         if segmented is not None:
+            axes.pop().remove()
             _cloud_panels(axes[:3], view, segmented)
         _shaded_mesh(axes[-2], view, prior.mesh)
         axes[-2].set_title(f"mesh, {area}{error}{unseen}")

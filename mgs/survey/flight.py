@@ -209,8 +209,8 @@ def draw_survey(
     reach = float(np.abs(survey.truth[:, :3, 3] - around).max())
     points = cloud.points[np.argsort(cloud.points[:, 2])]
     stride = max(1, len(points) // 120_000)
-    with drawing(path, 17, 4.4, dpi=100) as figure:
-        axes = figure.subplots(1, 4, gridspec_kw={"width_ratios": [1.1, 1, 1, 1.1]})
+    with drawing(path, 8, 7, dpi=150) as figure:
+        axes = figure.subplots(2, 2).ravel()
         _trajectories(axes[0], survey)
         _errors(axes[1], survey, numbers)
         _depth_error(axes[2], dataset, survey, numbers)
@@ -218,7 +218,7 @@ def draw_survey(
         axes[3].scatter(x, y, c=z, s=0.4, cmap="viridis", linewidths=0, rasterized=True)
         axes[3].set(xlim=(around[0] - reach, around[0] + reach), xlabel="x, m", aspect="equal")
         axes[3].set(ylim=(around[1] - reach, around[1] + reach), ylabel="y, m")
-        axes[3].set_title(f"fused cloud from above: {len(cloud.points):,} points")
+        axes[3].set_title(f"{len(cloud.points):,} points from above, by height")
 
 
 def _trajectories(axis, survey: Survey) -> None:
