@@ -180,6 +180,8 @@ def _unzipped(data: bytes) -> bytes:
     contents = stream.decompress(stream.unconsumed_tail, size)
     if stream.unconsumed_tail:
         raise ValueError("it unpacks to more than its header says")
+    if int.from_bytes(data[-4:], "little") != len(head + contents):  # which the codec allocates
+        raise ValueError("it unpacks to another size than its end says")
     return head + contents
 
 
