@@ -17,10 +17,12 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import synthetic
 import tiny
+from test_structure_from_motion import arc, views
 
 from mgs.run.nbv import resume_nbv, start_run
 
@@ -46,9 +48,13 @@ COMMANDS = {
     "nbv": f"nbv {{data}} --prior {{prior}} --out {{out}} {LOOP} --set evaluate_every=1",
     "synth-orbit": "synth-orbit {out} --scene {scene} --frames 6 --size 64x48 --spp 2",
     "import": "import {data} --mesh {data}/rock.glb --out {out}",
+    "photographs": "import {photographs} --out {out}",
+    "video": "import {video} --keyframes 0.1s --out {out}",
+    "export": "export {run} --to mgs --bytes 3000 --out {out} --force",
+    "prune": "simplify {out}",
     "refit": "simplify {out} --method refit",
 }
-"""Name -> arguments; refit gets a copy of {run}."""
+"""Name -> arguments; those of simplify get a copy of {run} as {out}."""
 
 LOST = "works on it|is finished already|is there already"
 """Pattern of the loser's line."""
@@ -68,6 +74,12 @@ def places(tmp_path_factory) -> dict[str, Path]:
     paths = {"data": data, "prior": root / "prior", "run": root / "run"}
     paths |= {"scene": root / "scene.toml", "out": root / "work/out"}
     paths["scene"].write_text(TOML)
+    paths |= {"photographs": root / "photographs/images", "video": root / "video.avi"}
+    shots = views(root / "photographs", arc(8))
+    film = cv2.VideoWriter(str(paths["video"]), cv2.VideoWriter.fourcc(*"MJPG"), 10, (320, 240))
+    for shot in shots:
+        film.write(cv2.imread(str(shot.image_path)))
+    film.release()
     made = f"prior {data} --mesh {data}/rock.glb --gaussians 150 --out {paths['prior']}"
     nbv = COMMANDS["nbv"].format(**paths | {"out": paths["run"]})
     for arguments in (made, nbv, f"eval {paths['run']}"):
@@ -89,7 +101,7 @@ def cleared(name: str, places: dict[str, Path]) -> Path:
     work = places["out"].parent
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir()
-    if name == "refit":
+    if COMMANDS[name].startswith("simplify"):
         shutil.copytree(places["run"], places["out"])
     return work
 
