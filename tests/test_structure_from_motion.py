@@ -70,14 +70,14 @@ def distances(points):
     return np.minimum(np.abs(points[:, 2]), np.abs(synthetic.level(points)) * synthetic.AXES.min())
 
 
-@pytest.mark.parametrize("downscale", [1, 4])
+@pytest.mark.parametrize("downscale", [1, 2, 4])
 def test_poses_without_points_get_them(downscale, frames, tmp_path, capsys):
     root = frames[0].image_path.parent.parent
     write_transforms(root, frames[::-1])
     command("import", root, "--out", tmp_path / "d", "--downscale", downscale)
     assert "points with a reprojection error of 0." in said(capsys)[0]
     points = read_cloud(tmp_path / "d/sparse.ply").points
-    assert len(points) > 300
+    assert len(points) > 1000, "of the pictures of the source"
     assert np.median(distances(points)) < 0.005
 
 

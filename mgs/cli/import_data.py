@@ -151,19 +151,19 @@ def import_data(
 def _triangulated(
     result: Dataset, matcher: Matcher, larger: Sequence[Shot], folder: Path
 ) -> SparseCloud | None:
-    """Points at the poses of a dataset; where its pictures give too few, those of the `larger` ones
-    that they were made of, if any. matcher: of its pictures. folder: for other matches."""
+    """Points at the poses of a dataset: of the `larger` pictures that its were made of, which give
+    several times as many, else of its own. matcher: of these. folder: for matches of the others."""
     from mgs.data.structure import Matcher
     from mgs.images import exif_orientation
 
     cameras = [result.world.leave(frame.camera) for frame in result.frames]
-    cloud = matcher.triangulated(cameras)
     upright = {s.name: s for s in larger if s.turned or exif_orientation(s.image) == 1}
-    if cloud is None and len(upright) == len(cameras):
+    cloud = None
+    if len(upright) == len(cameras):
         shots = [upright[frame.name] for frame in result.frames]
         pictures = [(shot.image, shot.camera, shot.lens) for shot in shots]
         cloud = Matcher.of_lenses(pictures, folder).triangulated(cameras)
-    return cloud
+    return matcher.triangulated(cameras) if cloud is None else cloud
 
 
 def _points(cloud: SparseCloud) -> str:
