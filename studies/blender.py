@@ -1,9 +1,11 @@
-"""Policies on NeRF-synthetic scenes by FisherRF's protocol, beside published numbers.
+"""Policies on scenes of others: NeRF-synthetic by FisherRF's protocol, and photographs.
 
-View 0 and those farthest from it are the seeds, the other training views are the candidates, the
-200 test views judge, in front of white. Models start at random points in the ball that all cameras
-see, inside the masks of the views taken: no picture or mask of a candidate is read. Every policy
-chooses one view at a time. A new fit to all views taken is judged.
+Of NeRF-synthetic, view 0 and those farthest from it are the seeds, the other training views are the
+candidates, the 200 test views judge, in front of white. Models start at random points in the ball
+that all cameras see, inside the masks of the views taken: no picture or mask of a candidate is
+read. Of photographs without masks, every TEST_EVERY-th is a test view, the seeds are drawn, and
+models start at the points that came with the cameras. Every policy chooses one view at a time. A
+new fit to all views taken is judged.
 """
 
 import time
@@ -19,15 +21,19 @@ import numpy as np
 
 import mgs
 from mgs.colour import srgb_from_linear
+from mgs.data.frames import has_masks
 from mgs.data.importers import import_source
-from mgs.data.sources import read_source
+from mgs.data.sources import TRAINING, read_source
+from mgs.data.structure import CLOUD
+from mgs.files import copy_file
 from mgs.fit.settings import TrainSettings
 from mgs.learning import fit_views
 from mgs.metrics import psnr
 from mgs.policy.poses import spread
-from mgs.run.nbv import LOOSE
+from mgs.run.nbv import FREE_TRAIN, LOOSE
 from mgs.run.policy_file import policy_of
 from mgs.run.settings import NbvSettings, validated
+from mgs.seeds import generator
 from mgs.splat import render
 from studies import policies as others
 from studies.frame.case import test_views_of
@@ -48,6 +54,9 @@ from studies.setups import before_any_fit, choose_views
 NAME = "blender"
 
 RANDOM = "random"
+
+TEST_EVERY = 5
+"""Of so many photographs, by name, the middle one is a test view."""
 
 ALPHA_WEIGHT = 1.0
 """Weight of alpha in fits. In front of white, an error of alpha counts as much as one of colour."""
@@ -87,15 +96,16 @@ choice on an RTX A2000."""
 class BlenderSize:
     """Sizes of images and models, and numbers of runs.
 
-    downscale: of the 800x800 images. gaussians: of every model. views: numbers of views at the
-    start and at the end. passes: of the fit that is judged, twice the default. loss: of all fits.
-    draws: seeds of the random start. scenes: folders with transforms_train.json and
-    transforms_test.json, set by the options.
+    downscale: of the images. gaussians: of every model. views: numbers of views at the start and at
+    the end; below 1 a share of the training views. nearest: numbers of candidates, those nearest to
+    the last view; None: all. passes: of the fit that is judged, twice the default. loss: of all
+    fits. draws: seeds of the random start. scenes: folders that are `scene_in`, set by the options.
     """
 
     downscale: int = 4
     gaussians: int = 10_000
-    views: tuple[tuple[int, int], ...] = ((2, 10),)
+    views: tuple[tuple[int, float], ...] = ((2, 10),)
+    nearest: tuple[int | None, ...] = (None,)
     passes: int = 20
     loss: str = TrainSettings().loss
     draws: int = 3
@@ -106,18 +116,35 @@ class BlenderSize:
 SIZES = {
     "quick": BlenderSize(),
     "full": BlenderSize(1, 100_000, ((2, 10), (4, 20)), draws=10),
+    "photographs": BlenderSize(
+        downscale=3,
+        gaussians=5_000,
+        views=((2, 0.5),),
+        nearest=(None, 5),
+        passes=15,
+        draws=5,
+        policies=(
+            *("random", "farthest", "directional-i", "d-optimal", "cover"),
+            *("paper, no means", "fisherrf, code"),
+        ),
+    ),
 }
+
+
+def scene_in(folder: Path) -> bool:
+    """Whether a folder is a scene: one of NeRF-synthetic, or a dataset of photographs."""
+    split = [(folder / name).is_file() for name in (TRAINING, "transforms_test.json")]
+    return all(split) or (folder / "transforms.json").is_file()
 
 
 def sized(size: BlenderSize, options: Namespace) -> BlenderSize:
     """Size with the options. Raises InputError where --dir has no scene, or a policy is unknown."""
     root = options.dir.resolve()
-    scenes = [path.parent for path in root.glob("*/transforms_train.json")]
-    scenes = [path for path in scenes if (path / "transforms_test.json").is_file()]
+    scenes = [folder for folder in root.glob("*") if scene_in(folder)]
     if not scenes:
         raise mgs.InputError(
-            f"--dir {options.dir}: has no scene, a folder with transforms_train.json and "
-            "transforms_test.json; give the folder that holds lego, mic and the others"
+            f"--dir {options.dir}: has no scene, a folder with transforms.json, or with {TRAINING} "
+            "and transforms_test.json; give the folder that holds lego, mic and the others"
         )
     for policy in options.policy or ():
         if policy not in size.policies:
@@ -140,15 +167,18 @@ def cells_of(size: BlenderSize) -> list[Cell]:
         for scene in size.scenes
     }
     cells = list(data.values())
+    setups = list(product(size.views, size.nearest))
     for draw in range(size.draws):
-        for (first, last), policy, scene in product(size.views, size.policies, size.scenes):
+        for ((first, last), nearest), policy, scene in product(setups, size.policies, size.scenes):
             if draw > 0 and policy in ONCE:
                 continue
             how = {"first": first, "last": last, "policy": policy, "seed": draw}
             how |= {key: getattr(size, key) for key in ("gaussians", "passes", "loss")}
+            how |= {"nearest": nearest} if nearest else {}
             made = data[scene]
             label = policy.replace(", ", "-").replace(" ", "-")
-            where = f"{scene.name}-{size.downscale}/{size.gaussians}/{first}-{last}"
+            views = views_of(last, nearest)
+            where = f"{scene.name}-{size.downscale}/{size.gaussians}/{first}-{views}"
             cells.append(
                 Cell(
                     f"run/{where}/{label}-{draw}",
@@ -156,16 +186,31 @@ def cells_of(size: BlenderSize) -> list[Cell]:
                     {"dataset": f"{CELLS}/{made.name}/dataset"} | how,
                     (made.name,),
                     alone=True,
-                    about={"scene": scene.name, "views": last, "policy": policy, "draw": draw},
+                    about={"scene": scene.name, "views": views, "policy": policy, "draw": draw},
                 )
             )
     return cells
 
 
+def views_of(last: float, nearest: int | None) -> int | str:
+    """Value of the column of views: their number or share at the end, and the candidates."""
+    views = f"{last:.0%}" if last < 1 else int(last)
+    return f"{views}, {nearest} nearest" if nearest else views
+
+
 def make_dataset(root: Path, out: Path, source: str, downscale: int) -> dict[str, Any]:
-    """Task: import the training views of a scene, and its test split as test views."""
-    shots, tests = read_source(Path(source), test_split="test").set_apart(None)
-    data = import_source(shots, out / "dataset", tests=tests, downscale=downscale)
+    """Task: import the training views of a scene, its test views, and its points."""
+    folder = Path(source)
+    split = (folder / TRAINING).is_file()
+    given = read_source(folder, test_split="test" if split else None)
+    if not split:
+        names = sorted(shot.name for shot in given.shots)
+        given = replace(given, tests=frozenset(names[TEST_EVERY // 2 :: TEST_EVERY]))
+    shots, tests = given.set_apart(None)
+    up, _ = shots.up_or_estimate()
+    data = import_source(shots, out / "dataset", tests=tests, downscale=downscale, up=up)
+    if (folder / CLOUD).is_file():
+        copy_file(folder / CLOUD, data.root / CLOUD)
     camera = data.frames[0].camera
     return {"frames": len(data), "width": camera.width, "height": camera.height}
 
@@ -175,12 +220,13 @@ def choose_and_judge(
     out: Path,
     dataset: str,
     first: int,
-    last: int,
+    last: float,
     policy: str,
     seed: int,
     gaussians: int,
     passes: int,
     loss: str,
+    nearest: int | None = None,
 ) -> dict[str, Any]:
     """Task: choose views until there are `last`, fit all of them from the start, and judge.
 
@@ -188,35 +234,61 @@ def choose_and_judge(
     score of all candidates, with what it needs beside the fit), "fits" (between choices, together)
     and "fit" (of the model that is judged).
     """
-    data, tests = loaded(root / dataset)
-
-    def start_from(views: Sequence[int]) -> mgs.Scene:
-        shown = [data.frames[i] for i in views]
-        prior = mgs.build_prior(data, gaussians=gaussians, seed=seed, source="random", shown=shown)
-        train = {"means": "free", "alpha_weight": ALPHA_WEIGHT, "loss": loss}
-        about = {"dataset": data.root, "prior": data.root, "seed": seed, "train": train}
-        settings = validated(NbvSettings, about).with_spacing(prior.spacing, LOOSE["random"])
-        return mgs.Scene(data, prior, settings)
-
-    positions = np.array([camera.position for camera in data.cameras])
-    seeds = [0, *(1 + k for k in spread(positions[1:], positions[:1], np.zeros(3))[: first - 1])]
-    scene, rule = start_from(seeds), policy_of(COMPARED.get(policy, policy))
-    mission = mgs.Mission(seeds=first, budget=last - first)
+    data, _ = loaded(root / dataset)
+    model, masked = (gaussians, seed, loss), has_masks(data.frames)
+    count = round(last * len(data)) if last < 1 else int(last)
+    if masked:
+        positions = np.array([camera.position for camera in data.cameras])
+        others = spread(positions[1:], positions[:1], np.zeros(3))
+        seeds = [0, *(1 + k for k in others[: first - 1])]
+        scene = scene_of(data, seeds, *model)
+    else:
+        seeds = generator(seed, "start").permutation(len(data))[:first].tolist()
+        scene = scene_of(data, range(len(data)), *model)
+    rule = policy_of(COMPARED.get(policy, policy))
+    mission = mgs.Mission(seeds=first, budget=count - first, nearest=nearest)
     clock = time.process_time
     start = clock()
     state = mgs.learn(scene, seeds) if rule.needs_fit else before_any_fit(scene, seeds)
     state, choices = choose_views(scene, rule, mission, state)
     fits = clock() - start - sum(choices)
-    start, taken = clock(), list(state.taken)
-    scene = start_from(taken)
-    train = scene.settings.train.model_copy(update={"passes": passes})
+    views = state.taken if masked else tuple(sorted(state.taken))
+    result, fit = judged(root / dataset, views, *model, passes)
+    seconds = {"choice": float(np.mean(choices)), "fits": fits, "fit": fit}
+    return {"psnr": result, "taken": list(state.taken), **seconds}
+
+
+def scene_of(
+    data: mgs.Dataset, shown: Sequence[int], gaussians: int, seed: int, loss: str
+) -> mgs.Scene:
+    """Scene that starts at points of the views shown, in their masks if there are any."""
+    frames = [data.frames[i] for i in shown]
+    prior = mgs.build_prior(data, gaussians=gaussians, seed=seed, source="random", shown=frames)
+    weight = ALPHA_WEIGHT if has_masks(data.frames) else 0.0
+    train = {"means": "free", "alpha_weight": weight, "loss": loss}
+    about = {"dataset": data.root, "prior": data.root, "seed": seed, "train": train}
+    settings = validated(NbvSettings, about).with_spacing(prior.spacing, LOOSE["random"])
+    return mgs.Scene(data, prior, settings)
+
+
+@lru_cache
+def judged(
+    dataset: Path, taken: tuple[int, ...], gaussians: int, seed: int, loss: str, passes: int
+) -> tuple[float, float]:
+    """PSNR of a new fit to the views taken, dB, mean over the test views, and its CPU seconds.
+    Policies that take the same photographs share it."""
+    data, tests = loaded(dataset)
+    masked, start = has_masks(data.frames), time.process_time()
+    scene = scene_of(data, taken, gaussians, seed, loss)
+    how = {} if masked else FREE_TRAIN
+    train = scene.settings.train.model_copy(update=how | {"passes": passes})
     model = fit_views(scene, scene.frames, taken, train=train)[0].gaussians
-    seconds = {"choice": float(np.mean(choices)), "fits": fits, "fit": clock() - start}
+    seconds = time.process_time() - start
     errors = []
     for frame, truth in tests:
-        drawn = np.asarray(render(model, frame.camera, 1.0, scene.cache).rgb)
-        errors.append(psnr(truth / np.float32(255), drawn.clip(0, 1)))
-    return {"psnr": float(np.mean(errors)), "taken": taken, **seconds}
+        image = render(model, frame.camera, 1.0 if masked else 0.0, scene.cache)
+        errors.append(psnr(truth / np.float32(255), np.asarray(image.rgb).clip(0, 1)))
+    return float(np.mean(errors)), seconds
 
 
 @lru_cache(maxsize=2)
@@ -242,8 +314,9 @@ def rows_of(work: Work) -> list[Row]:
 
 def means_of(rows: Sequence[Row]) -> list[Row]:
     """A row for each number of views and policy, best first: means over scenes and draws. PSNR and
-    lead over `random` have 95 % intervals over the draws of the random start, each a mean over the
-    scenes."""
+    lead over `random` have 95 % intervals over the scenes, each a mean over the draws; where there
+    are only two, over the draws of the random start."""
+    unit = "scene" if len({row["scene"] for row in rows}) > 2 else "draw"
     base = {
         (row["views"], row["scene"], row["draw"]): row["psnr"]
         for row in rows
@@ -256,13 +329,13 @@ def means_of(rows: Sequence[Row]) -> list[Row]:
             against = base.get((row["views"], row["scene"], row["draw"]))
             row["lead"] = None if against is None else row["psnr"] - against
         for key in ("psnr", "lead") if all(row["lead"] is not None for row in of) else ("psnr",):
-            draws = [_mean(draw["of"], key) for draw in grouped(of, "draw")]
-            low, high = interval(draws) or (None, None)
+            values = [_mean(one["of"], key) for one in grouped(of, unit)]
+            low, high = interval(values) or (None, None)
             group |= {key: _mean(of, key), f"{key}_low": low, f"{key}_high": high}
         group |= {f"psnr {one['scene']}": _mean(one["of"], "psnr") for one in grouped(of, "scene")}
         group |= {key: _mean(of, key) for key in ("choice", "fits", "fit")}
         means.append(group | {"runs": len(of)})
-    return sorted(means, key=lambda row: (row["views"], -row["psnr"]))
+    return sorted(means, key=lambda row: (str(row["views"]), -row["psnr"]))
 
 
 def _mean(rows: Sequence[Row], key: str) -> float:
@@ -270,10 +343,11 @@ def _mean(rows: Sequence[Row], key: str) -> float:
 
 
 def tables(rows: Sequence[Row]) -> str:
-    """Table of policies, and that of PUBLISHED."""
+    """Table of policies, with a column for each scene if these are two, and that of PUBLISHED."""
     columns: dict[str, Content] = {"views": "views", "policy": "policy"}
-    scenes = dict.fromkeys(row["scene"] for row in rows)
-    columns |= {f"{scene} (dB)": f"psnr {scene}:.2f" for scene in scenes}
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    if len(scenes) <= 2:
+        columns |= {f"{scene} (dB)": f"psnr {scene}:.2f" for scene in scenes}
     columns |= {
         "mean (dB)": "psnr:.2f",
         "over random (dB)": lambda row: with_interval(row, "lead"),
@@ -290,18 +364,19 @@ def write(work: Work) -> list[Path]:
     """Write blender.csv, a row for each run, .json, .md and .png."""
     rows = rows_of(work)
     means = means_of(rows)
-    ordered = [row for mean in means for row in rows if row["policy"] == mean["policy"]]
+    keys = ("views", "policy")
+    ordered = [row for mean in means for row in rows if all(row[k] == mean[k] for k in keys)]
     panels = [
         Panel(
             "policy",
             "psnr",
             "",
-            "PSNR on 200 test views (dB)",
-            title=f"{scene.name}, {last} views",
-            only=(("scene", scene.name), ("views", last)),
+            "PSNR on the test views (dB)",
+            title=f"{scene.name}, {views} views",
+            only=(("scene", scene.name), ("views", views)),
         )
         for scene in work.size.scenes
-        for _, last in work.size.views
+        for views in dict.fromkeys(row["views"] for row in ordered)
     ]
     draw_panels(work.out / f"{NAME}.png", panels, ordered)
     size = replace(work.size, scenes=())

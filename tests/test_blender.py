@@ -8,12 +8,16 @@ import pytest
 import tiny
 from program import study
 from refusals import fails
+from synthetic import sphere
 
 import mgs
 from mgs.camera import opengl_from_opencv
+from mgs.data.clouds import SparseCloud, write_cloud
+from mgs.data.dataset import write_transforms
 from mgs.data.importers import import_source
 from mgs.data.sources import read_source
 from mgs.images import write_png
+from mgs.policy.poses import nearest_poses
 from studies import blender
 from studies.frame.output import read_rows
 
@@ -55,6 +59,38 @@ def test_every_policy_runs_and_no_candidate_is_read(scenes, tmp_path, monkeypatc
     assert training == {names[i] for views in taken for i in views}
     assert "POp-GS D" in (out / "blender.md").read_text()
     assert (out / "blender.png").is_file()
+
+
+def test_photographs_are_chosen_among_the_nearest_and_judged_by_those_held_out(
+    tmp_path, monkeypatch
+):
+    root = tiny.write_dataset(tmp_path / "scenes/ball")
+    frames = mgs.load_dataset(root).frames
+    write_transforms(root, [replace(one, depth_path=None, mask_path=None) for one in frames])
+    write_cloud(root / "sparse.ply", SparseCloud(sphere(30)))
+    read, out = [], tmp_path / "out"
+    monkeypatch.setattr(mgs.Frame, "target", _noted(mgs.Frame.target, read))
+    monkeypatch.setattr(mgs.Frame, "rgb", _noted(mgs.Frame.rgb, read))
+    size = replace(FEW, views=((2, 0.5),), nearest=(None, 2), draws=2, policies=("random", "cover"))
+    study("blender", out, "--dir", root.parent, sizes={"quick": size})
+    rows = read_rows(out / "blender.csv")
+    data = mgs.load_dataset(next(out.glob("cells/dataset/*/dataset")))
+    names = [frame.name for frame in data.frames]
+    assert {one.name for one in frames} - set(names) == {"kf_0002", "kf_0007"}
+    assert (data.root / "sparse.ply").is_file(), "models start at the points"
+    taken = [json.loads(row["taken"]) for row in rows]
+    assert all(len(set(views)) == 5 for views in taken)
+    assert set(read) == {names[i] for views in taken for i in views} | {"kf_0002", "kf_0007"}
+    assert len({tuple(views[:2]) for views in taken}) == 2, "each draw has its seeds"
+    positions = np.array([camera.position for camera in data.cameras])
+    for row, views in zip(rows, taken, strict=True):
+        if row["views"] == "50%, 2 nearest":
+            for k in range(2, 5):
+                rest = [i for i in range(len(names)) if i not in views[:k]]
+                near = nearest_poses(positions[rest], positions[views[k - 1]], 2)
+                assert views[k] in [rest[i] for i in near]
+    text = (out / "blender.md").read_text()
+    assert all(views in text for views in ("| 50% ", "| 50%, 2 nearest "))
 
 
 def test_a_run_from_random_points_reads_no_candidate(scenes, tmp_path, monkeypatch):
