@@ -207,7 +207,10 @@ def scattered(
     pixels = sum(int(frame.mask().sum()) for frame in shown)
     count = min(max(pixels // PIXELS, GAUSSIANS), MOST_GAUSSIANS)
     count = gaussians if isinstance(gaussians, int) else count
-    cloud, views_of_cloud = _triangulated(dataset, shown, count, rng)
+    masked = has_masks(shown)
+    # Without random points, nothing is as far away as a sky, and near points take its place.
+    most = count if masked else round(count / (1 + MOST_RANDOM))
+    cloud, views_of_cloud = _triangulated(dataset, shown, most, rng)
     if len(cloud) and not isinstance(gaussians, int):
         count = min(count, max(round((1 + MOST_RANDOM) * len(cloud)), GAUSSIANS))
     middle = focus(dataset.frames).point
@@ -216,7 +219,7 @@ def scattered(
         * np.sin(np.arctan(min(frame.camera.width, frame.camera.height) / 2 / frame.camera.K[0, 0]))
         for frame in dataset.frames
     ]
-    radius, masked = float(np.median(reach)), has_masks(shown)
+    radius = float(np.median(reach))
     parts, tries = [cloud], 0
     while sum(map(len, parts)) < count and tries < DRAWS * count:
         directions = rng.normal(size=(count, 3))
