@@ -239,8 +239,8 @@ def choose_and_judge(
     count = round(last * len(data)) if last < 1 else int(last)
     if masked:
         positions = np.array([camera.position for camera in data.cameras])
-        others = spread(positions[1:], positions[:1], np.zeros(3))
-        seeds = [0, *(1 + k for k in others[: first - 1])]
+        far = spread(positions[1:], positions[:1], np.zeros(3))
+        seeds = [0, *(1 + k for k in far[: first - 1])]
         scene = scene_of(data, seeds, *model)
     else:
         seeds = generator(seed, "start").permutation(len(data))[:first].tolist()
