@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,9 +28,6 @@ from studies.frame.program import Study, Work, at_least, names_of, study_of
 from studies.frame.statistics import Row
 from studies.frame.sweep import Cell, Results
 from studies.frame.timing import REFERENCE, forget_peak, peak_megabytes, timed
-
-if TYPE_CHECKING:
-    pass
 
 KINDS = ("fit", "run")
 

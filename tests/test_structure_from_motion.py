@@ -279,6 +279,17 @@ def test_photographs_added_later_are_taken_with_the_same_camera(frames, tmp_path
         assert len(database.read_all_cameras()) == 1
 
 
+def test_given_cameras_that_change_are_not_those_of_matches_before(frames, tmp_path):
+    for focal in (300.0, 400.0):
+        K = np.array([[focal, 0, WIDTH / 2], [0, focal, WIDTH / 2], [0, 0, 1]])
+        given = [(f.image_path, replace(f.camera, K=K), None) for f in frames[:2]]
+        matcher = Matcher.of_lenses(given, tmp_path / "m")
+        matcher.match([(0, 1)])
+    with closing(pycolmap.Database.open(matcher.database)) as database:
+        (camera,) = database.read_all_cameras()
+    assert camera.params[0] == 400
+
+
 def test_a_process_that_is_asked_to_end_prints_no_stack(frames, tmp_path):
     program = "import os, signal, sys; from pathlib import Path\n"
     program += "from mgs.data.structure import Matcher; Matcher([Path(sys.argv[1])], Path('m'))\n"

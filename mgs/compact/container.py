@@ -24,6 +24,7 @@ from mgs.files import parsing
 from mgs.gaussians import MAX_GAUSSIANS, MAX_SH_DEGREE
 
 MAGIC, MARK, VERSION = b"MGSC", b"\xa7\x5e", 3
+MOST_LAYERS = 8
 # Magic, version, flags, SH degree, cut of the tree, layers, number of Gaussians, tiles, packets;
 # corner of the grid [3], up and origin of the world of the data [3], step of the grid, inset, scale
 # of the steps, hash of the prior, bytes of the integers.
@@ -142,7 +143,7 @@ def split(data: bytes, path: Path) -> tuple[Header, dict[Key, bytes]]:
         up > 1e-9
         and 0 < n <= MAX_GAUSSIANS
         and 0 < tiles <= n
-        and 0 < layers <= 8
+        and 0 < layers <= MOST_LAYERS
         and 3 <= cut < DEPTH
         and 0 <= steps.min() <= steps.max() < 256
     )

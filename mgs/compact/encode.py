@@ -14,7 +14,9 @@ from mgs.compact.container import (
     ANTIALIASED,
     AXES,
     CENTRES,
+    GROUPS,
     LINEAR,
+    MOST_LAYERS,
     SHARED,
     Header,
     Key,
@@ -126,7 +128,10 @@ class Encoder:
         depths = [d for d in range(3, DEPTH, 3) if len(np.unique(codes >> d)) * least < len(codes)]
         cut = depths[0] if depths else 3
         top = np.unique(codes >> cut)
-        tiles = int(np.clip(len(codes) // TILE, 1, min(len(top), 0xFFFF)))
+        layers = 1 + round(np.log(COARSEST / scale) / np.log(FINER))
+        layers = int(np.clip(layers, 1, MOST_LAYERS))
+        most = 0xFFFF // (len(GROUPS) * layers) - 1  # 16 bits of the header count the packets
+        tiles = int(np.clip(len(codes) // TILE, 1, min(len(top), most)))
         tree = tree_of(codes, cut, tiles)
         layer = self.places.layer[self.kept][order]
         columns = self.columns[order]
@@ -137,7 +142,6 @@ class Encoder:
         values = tree.forward(columns - centres[layer])
         slopes = np.stack([tree.forward(one[order], adjoint=True) for one in self.gradients])
         h = allocate.sensitivity(slopes, tree.band)
-        layers = 1 + max(0, round(np.log(COARSEST / scale) / np.log(FINER)))
         start, g = self.places, self.g
         flags = ANTIALIASED * g.antialiased + LINEAR * g.linear + SHARED * bool(self.start)
         header = Header(

@@ -37,7 +37,8 @@ class Matcher:
 
     pictures: files. cameras: of pycolmap, one for each picture, by default as EXIF says; equal ones
     are taken as one camera.
-    folder: of the database, which a later Matcher of the same pictures, or of more, continues."""
+    folder: of the database, which a later Matcher of the same pictures and cameras, or of more,
+    continues."""
 
     def __init__(self, pictures: Sequence[Path], folder: Path, cameras: Sequence[Any] = ()) -> None:
         import PIL.Image  # noqa: F401  # after pycolmap, writing a PNG would crash in its zlib
@@ -47,7 +48,11 @@ class Matcher:
             signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
         pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
         self.folder, self.database = folder, folder / "database.db"
-        about = [[str(path.resolve()), path.stat().st_mtime_ns] for path in pictures]
+        lenses = [str(camera.todict()) for camera in cameras] or [""] * len(pictures)
+        about = [
+            [str(path.resolve()), path.stat().st_mtime_ns, lens]
+            for path, lens in zip(pictures, lenses, strict=True)
+        ]
         record = folder / "pictures.json"
         before = read_json(record) if record.is_file() else []
         if any(picture not in about for picture in before):
