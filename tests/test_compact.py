@@ -101,6 +101,7 @@ def test_cells_come_back_and_none_are_shared():
 @pytest.mark.parametrize("degree", [0, 2])
 def test_columns_are_gaussians_and_gradients_are_by_them(degree):
     model = gaussians(degree)
+    model.log_scales[0, 1] = model.log_scales[0, 0] + 0.02  # nearly equal
     start = np.random.default_rng(3).normal(size=(40, 4))
     axes = np.linalg.qr(np.random.default_rng(4).normal(size=(3, 3)))[0]
     columns = columns_of(model, start, axes)
@@ -111,6 +112,7 @@ def test_columns_are_gaussians_and_gradients_are_by_them(degree):
         for g in (back, model)
     )
     np.testing.assert_allclose(*shapes, atol=1e-5)
+    np.testing.assert_allclose(np.sort(back.log_scales), np.sort(model.log_scales), atol=1e-5)
     rng, step = np.random.default_rng(5), 1e-4
     weights = rng.normal(size=back.sh.shape), rng.normal(size=40), rng.normal(size=(40, 3, 3))
 
@@ -124,7 +126,7 @@ def test_columns_are_gaussians_and_gradients_are_by_them(degree):
 
     def total(c):
         g = gaussians_of(c, model.means, start, axes)
-        return parts(g, g.quats, g.log_scales).sum()
+        return parts(g, g.quats, g.log_scales)
 
     quats, scales = back.quats.astype(float), back.log_scales.astype(float)
     by = {"sh": weights[0], "logit_opacities": weights[1]}
@@ -139,7 +141,7 @@ def test_columns_are_gaussians_and_gradients_are_by_them(degree):
     slope = (total(columns + step * direction) - total(columns - step * direction)) / (2 * step)
     each = gradient_of(back, start, axes, by) * direction
     each[np.abs(columns[:, -1] - 0.5) >= 6.4, -1] = 0  # opacities that are clamped
-    assert each.sum() == pytest.approx(slope, rel=2e-2)
+    assert (np.abs(each.sum(1) - slope) <= 2e-2 * np.abs(each).sum(1)).all()
     assert np.abs(each[:, -7:-1]).sum() > 0.1 * np.abs(each).sum()
 
 
@@ -386,10 +388,11 @@ def test_the_command_writes_what_fits_and_programs_read_it(dataset, prior, tmp_p
     ):
         assert message in refused(capsys, ["export", run, *options, "--force"])
     command("export", run, "--psnr", "12", "--shared-prior", "--force")
-    assert alone.stat().st_size < 1200
+    size_with_prior = alone.stat().st_size
+    assert size_with_prior < 1200
     prior.rename(tmp_path / "gone")
     command("export", run, "--bytes", "2k", "--force")
-    assert 1000 < alone.stat().st_size <= 2000
+    assert size_with_prior < alone.stat().st_size <= 2000
 
 
 def small_run(dataset, prior, out, **train):

@@ -2,7 +2,7 @@
 
 Columns: 3K colours in the axes of `Header.colours`, 6 of the shape, 1 opacity logit. The shape is
 the symmetric matrix M = V diag(log s) V^T in the axes of the start, as (M_xx + M_yy) / 2,
-(M_xx - M_yy) / 2, M_zz, M_yz, M_zx, M_xy. Of equal scales it has no rotation that shows nothing.
+(M_xx - M_yy) / 2, M_zz, M_yz, M_zx, M_xy. A turn between axes of equal scales changes no column.
 """
 
 import hashlib
@@ -23,8 +23,10 @@ LOGITS = (-6.0, 7.0)  # range of opacity logits: 0.0025, below ALPHA_MIN, to 0.9
 FINE = 10  # binary digits of a means' grid below the spacing of a prior
 UNIT = 20  # binary digits of normals. The grids hide the last bits, in which machines differ.
 TINY = 1e-300  # added to a divisor: 0 / TINY is 0
-SWEEPS = 5  # of Jacobi's rotations, after which nothing is left off the diagonal
-NEAR = 1e-3  # difference of log-scales below which gradients by a turn are rounding errors
+SWEEPS = 5  # sweeps of Jacobi's rotations; after so many nothing is left off the diagonal
+# Difference of log-scales below which gradients by a turn are rounding errors. The gradient by M_ij
+# is too small there: 0 for equal scales, where M_ij changes the picture but a turn does not.
+NEAR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -121,9 +123,10 @@ def _eigen(shape: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray
     values = [mean + half, mean - half, last]  # off[k]: the element of the two other axes
     for k in [0, 1, 2] * SWEEPS:
         i, j = (k + 1) % 3, (k + 2) % 3
-        between, twice = values[j] - values[i], 2 * off[k]
-        root = np.sqrt(between * between + twice * twice)
-        tan = np.where(between < 0, -twice, twice) / (np.abs(between) + root + TINY)
+        # t = the angle that makes M_ij 0: tan 2t = 2 M_ij / (M_jj - M_ii)
+        gap, twice_off = values[j] - values[i], 2 * off[k]
+        root = np.sqrt(gap * gap + twice_off * twice_off)
+        tan = np.where(gap < 0, -twice_off, twice_off) / (np.abs(gap) + root + TINY)
         cos = 1 / np.sqrt(1 + tan * tan)
         sin = tan * cos
         values[i], values[j] = values[i] - tan * off[k], values[j] + tan * off[k]
@@ -147,8 +150,8 @@ def gradient_of(
     scales = g.log_scales.astype(np.float64)
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
-        between = scales[:, i] - scales[:, j]
-        m[:, i, j] = m[:, j, i] = turns[:, k] * between / (between**2 + NEAR**2) / 2
+        gap = scales[:, i] - scales[:, j]
+        m[:, i, j] = m[:, j, i] = turns[:, k] * gap / (gap**2 + NEAR**2) / 2
     turn = rotmat_from_quat(product(quats * CONJUGATE, own))
     m = np.einsum("nij,njk,nlk->nil", turn, m, turn)
     mean, half = m[:, 0, 0] + m[:, 1, 1], m[:, 0, 0] - m[:, 1, 1]
