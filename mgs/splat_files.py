@@ -170,8 +170,8 @@ def _spz_end(head: bytes) -> int:
 
 
 def _unzipped(data: bytes) -> bytes:
-    """Contents of a gzip file of SPZ. Raises ValueError if its header says more than so small a
-    file can hold, or less than it does, before they take memory."""
+    """Contents of a gzip file of SPZ. Raises ValueError if it is cut off, or if its header says
+    more than so small a file can hold, or less than it does, before they take memory."""
     stream = zlib.decompressobj(zlib.MAX_WBITS + 16)
     head = stream.decompress(data, SPZ_HEADER.size)
     size = _spz_end(head) + SPZ_EXTENSION_BYTES
@@ -180,6 +180,8 @@ def _unzipped(data: bytes) -> bytes:
     contents = stream.decompress(stream.unconsumed_tail, size)
     if stream.unconsumed_tail:
         raise ValueError("it unpacks to more than its header says")
+    if not stream.eof:
+        raise ValueError("it is cut off")
     if int.from_bytes(data[-4:], "little") != len(head + contents):  # which the codec allocates
         raise ValueError("it unpacks to another size than its end says")
     return head + contents

@@ -4,6 +4,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -107,9 +108,11 @@ def load_dataset(
     the same name."""
     root = Path(root)
     path = root / "transforms.json"
-    if not path.exists():
-        fault = "holds no transforms.json" if root.is_dir() else "no such dataset folder"
-        raise InputError(f"{root}: {fault}; make a dataset with `mgs import` or `mgs synth-orbit`")
+    with suppress(OSError):  # of a path that cannot be searched: `read_records` says why
+        if not path.exists():
+            fault = "holds no transforms.json" if root.is_dir() else "no such dataset folder"
+            cure = "make a dataset with `mgs import` or `mgs synth-orbit`"
+            raise InputError(f"{root}: {fault}; {cure}")
     data, records = read_records(path)
     upward = up or data.get("up") or PLUS_Z
     world = World(unit_up(upward), unit_of(path, data) or "m", _origin_of(path, data))

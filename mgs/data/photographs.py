@@ -6,11 +6,11 @@ import os
 import shutil
 import warnings
 from collections import Counter
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from mgs.errors import InputError, Notice
 from mgs.files import read_json, write_json
 from mgs.images import exif_orientation, read_rgba, write_png
 from mgs.progress import report
+
+if TYPE_CHECKING:
+    from cv2 import VideoCapture
 
 KIND = "photographs"
 FEWEST = 3  # fewest photographs that can be placed
@@ -246,15 +249,29 @@ JUDGED = 640  # longer side, pixels, to which frames are reduced to compare how 
 WHOLE = 0.95  # least share of a video's frames that can be read; their number may be an estimate
 
 
+@contextmanager
+def _opened(video: Path) -> Iterator["VideoCapture"]:
+    """Context manager: a video, whose faults OpenCV does not print meanwhile."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else FFmpeg prints them, too
+    import cv2
+
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)  # others look for pictures
+    try:
+        yield capture
+    finally:
+        capture.release()
+        cv2.utils.logging.setLogLevel(level)
+
+
 def sharpest_frames(video: Path, folder: Path, spacing: Spacing) -> list[Path]:
     """Write the sharpest frame of each time of `spacing` into a folder, and return their files. The
     sharpest has the largest variance of the Laplacian. A video that ends in the middle gives the
     frames before and a warning. A folder that already holds them is taken as it is. Raises
-    InputError for a spacing in metres, and if the video cannot be read."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # else it prints the faults of a video
+    InputError for a spacing in metres, if the video cannot be read, and if it is so short, or cut
+    off so early, that it gives under FEWEST frames."""
     import cv2
 
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     if spacing.metres:
         raise InputError(f"{video}: a video has no distances; give keyframes in seconds, as 0.5s")
     about = [str(video.resolve()), video.stat().st_mtime_ns, spacing.least]
@@ -264,29 +281,31 @@ def sharpest_frames(video: Path, folder: Path, spacing: Spacing) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("*.png"):
         old.unlink()
-    capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)  # others look for pictures
-    rate, total = capture.get(cv2.CAP_PROP_FPS), int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-    window, number = max(1, round(rate * spacing.least)), 0
-    best, sharpest = None, -1.0
-    while True:
-        there, frame = capture.read()
-        if best is not None and (not there or number % window == 0):
-            write_png(folder / f"{number:06d}.png", cv2.cvtColor(best, cv2.COLOR_BGR2RGB))
-            best, sharpest = None, -1.0
-        if not there:
-            break
-        if number % window == 0:
-            report("frames of the video", number, max(total, number))
-        scale = min(1.0, JUDGED / max(frame.shape))
-        small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        grey = cv2.cvtColor(small, cv2.COLOR_BGR2GRAY)
-        if (sharpness := float(cv2.Laplacian(grey, cv2.CV_64F).var())) > sharpest:
-            best, sharpest = frame, sharpness
-        number += 1
-    capture.release()
+    with _opened(video) as capture:
+        rate, total = capture.get(cv2.CAP_PROP_FPS), int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        window, number = max(1, round(rate * spacing.least)), 0
+        best, sharpest = None, -1.0
+        while True:
+            there, frame = capture.read()
+            if best is not None and (not there or number % window == 0):
+                write_png(folder / f"{number:06d}.png", cv2.cvtColor(best, cv2.COLOR_BGR2RGB))
+                best, sharpest = None, -1.0
+            if not there:
+                break
+            if number % window == 0:
+                report("frames of the video", number, max(total, number))
+            scale = min(1.0, JUDGED / max(frame.shape))
+            small = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            grey = cv2.cvtColor(small, cv2.COLOR_BGR2GRAY)
+            if (sharpness := float(cv2.Laplacian(grey, cv2.CV_64F).var())) > sharpest:
+                best, sharpest = frame, sharpness
+            number += 1
     if number == 0:
         raise InputError(f"{video}: not a readable video, or cut off; convert it to MP4 (H.264)")
     if number <= (FEWEST - 1) * window:
+        if number < WHOLE * total:
+            read = f"only {number} of {total} frames can be read"
+            raise InputError(f"{video}: {read}, under {FEWEST} keyframes; copy the file again")
         cure = "give a longer one, or keyframes nearer in time, as 0.1s"
         raise InputError(f"{video}: its {number} frames give under {FEWEST} keyframes; {cure}")
     if number < WHOLE * total:
