@@ -1,11 +1,11 @@
 """Policies on scenes of others: NeRF-synthetic by FisherRF's protocol, and photographs.
 
-Of NeRF-synthetic, view 0 and those farthest from it are the seeds, the other training views are the
+NeRF-synthetic: view 0 and those farthest from it are the seeds, the other training views are the
 candidates, the 200 test views judge, in front of white. Models start at random points in the ball
 that all cameras see, inside the masks of the views taken: no picture or mask of a candidate is
-read. Of photographs without masks, every TEST_EVERY-th is a test view, the seeds are drawn, and
-models start at the points that came with the cameras. Every policy chooses one view at a time. A
-new fit to all views taken is judged.
+read. Photographs without masks: every TEST_EVERY-th is a test view, the seeds are drawn, and models
+start at the points that came with the cameras. Every policy chooses one view at a time. A new fit
+to all views taken is judged.
 """
 
 import time
@@ -56,7 +56,7 @@ NAME = "blender"
 RANDOM = "random"
 
 TEST_EVERY = 5
-"""Of so many photographs, by name, the middle one is a test view."""
+"""Photographs for each test view, which is the middle one of so many by name."""
 
 ALPHA_WEIGHT = 1.0
 """Weight of alpha in fits. In front of white, an error of alpha counts as much as one of colour."""

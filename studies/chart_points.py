@@ -34,14 +34,14 @@ def points_over_rocks(rows: Sequence[Row]) -> list[Row]:
     "peak_megabytes_more" against the base of the kind on the same rock. One process does all
     points, so its memory is more than that of a run alone; the differences are not.
     """
-    unset = dict.fromkeys((*SETTINGS, "preset"))
-    filled = [unset | row | {"policy": row.get("policy") or ""} for row in rows]
-    points = grouped(filled, *SETTINGS)
+    empty_columns = dict.fromkeys((*SETTINGS, "preset"))
+    full_rows = [empty_columns | row | {"policy": row.get("policy") or ""} for row in rows]
+    points = grouped(full_rows, *SETTINGS)
     for kind in grouped(points, "kind"):
-        usual = {row["rock"]: row for row in base_of(kind["of"])["of"]}
+        base_rows = {row["rock"]: row for row in base_of(kind["of"])["of"]}
         for point in kind["of"]:
             for row in point["of"]:
-                base = usual[row["rock"]]
+                base = base_rows[row["rock"]]
                 row["times"] = row["seconds"] / base["seconds"]
                 for key in ("psnr", "psnr_mask", "peak_megabytes"):
                     row[f"{key}_more"] = row[key] - base[key]

@@ -49,6 +49,20 @@ def test_what_takes_little_time_is_timed_more_often(monkeypatch):
         assert len(calls) == 1 + often  # the first is not timed
 
 
+def test_points_are_compared_with_the_base_of_the_same_rock():
+    def row(rock, passes, seconds, psnr):
+        about = {"kind": "fit", "images": 8, "density": 0.1, "passes": passes, "base": passes == 10}
+        results = {"seconds": seconds, "psnr": psnr, "psnr_mask": psnr, "peak_megabytes": 100}
+        return about | results | {"rock": rock}
+
+    rows = [row("a", 10, 2, 20), row("b", 10, 4, 22), row("a", 5, 1, 19), row("b", 5, 1, 24)]
+    base, other = points_over_rocks(rows)
+    assert [one["times"] for one in base["of"] + other["of"]] == [1, 1, 1 / 2, 1 / 4]
+    assert [one["psnr_more"] for one in base["of"] + other["of"]] == [0, 0, -1, 2]
+    assert (base["seconds"], base["psnr_more"], base["front"]) == (3, 0, False)
+    assert (other["seconds"], other["psnr_more"], other["front"]) == (1, 0.5, True)
+
+
 COMMANDS = typer.main.get_command(app).commands
 
 
@@ -98,6 +112,8 @@ def test_a_chart_is_measured_once_and_written(dataset, tmp_path, capsys):
     assert len(rows) == len(record["rows"])
     assert parsed(record["command"])["dataset"] == dataset
     assert all(parsed(row["command"]) for row in rows)
+    for row in rows:
+        assert row["seconds"] == pytest.approx(row["ratio"] * record["reference_seconds"], rel=1e-3)
     points = points_over_rocks(rows)
     for kind in chart.KINDS:
         assert any(point["front"] for point in points if point["kind"] == kind)

@@ -151,8 +151,9 @@ def import_data(
 def _triangulated(
     result: Dataset, matcher: Matcher, larger: Sequence[Shot], folder: Path
 ) -> SparseCloud | None:
-    """Points at the poses of a dataset: of the `larger` pictures that its were made of, which give
-    several times as many, else of its own. matcher: of these. folder: for matches of the others."""
+    """Triangulate points at the dataset's poses: in the source pictures `larger`, else in its own.
+    The former give several times as many. matcher: of its own pictures. folder: for matches of
+    `larger`."""
     from mgs.data.structure import Matcher
     from mgs.images import exif_orientation
 

@@ -262,14 +262,14 @@ def _size(panel: Panel, rows: Sequence[Row]) -> tuple[float, float]:
     return WIDTH + PER_LETTER * max(map(len, names)), height + legend
 
 
-UNLIKE = [STYLES[k] for k in (3, 6, 10, 8, 9, 0, 4, 5)]
+GROUP_STYLES = [STYLES[k] for k in (3, 6, 10, 8, 9, 0, 4, 5)]
 """Styles of groups that are no policies, bright ones first."""
 
 
 def group_styles(groups: Sequence[Any]) -> list[dict[str, Any]]:
-    """Keywords for matplotlib: policies as in all figures, others as in UNLIKE."""
+    """Keywords for matplotlib: policies as in all figures, others as in GROUP_STYLES."""
     of_policies = all(group in POLICY_STYLE for group in groups)
-    looks = [POLICY_STYLE[one] for one in groups] if of_policies else cycle(UNLIKE)
+    looks = [POLICY_STYLE[one] for one in groups] if of_policies else cycle(GROUP_STYLES)
     pairs = zip(groups, looks, strict=False)
     return [{"color": c, "marker": m, "label": group} for group, (c, m) in pairs]
 
