@@ -21,7 +21,7 @@ from test_meshes import Made, coloured, glb, parts_of
 from test_meshes import plain as square
 from test_render_command import foreign_ply, gaussians
 
-from mgs import PriorSettings, images, load_cameras, load_dataset, load_prior, prior_from_mesh
+from mgs import PriorSettings, images, load_cameras, load_prior, prior_from_mesh
 from mgs.data.clouds import read_cloud
 from mgs.data.meshes import load_mesh, read_mesh
 from mgs.data.sources import read_source
@@ -279,7 +279,6 @@ FILES: dict[tuple[Callable[[Path], object], str], list[tuple[str, Write]]] = {
         ("", colmap_model(place, value, "frames", "rigs"))  # else the poses are theirs
         for place, value in BAD_IMAGES
     ],
-    (load_dataset, "a" * 300): [("cannot be read (File name too long)", lambda path: None)],
     (load_cameras, "a.json"): [
         ("frame 0 lacks file_path", holding('{"frames": [1]}')),
         ("frame 0 has a file_path that is no text or cannot be", framed("a\0b.png")),

@@ -152,7 +152,7 @@ def test_force_replaces_what_the_command_made_and_nothing_else(capsys, dataset, 
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     assert "it holds" in refused(capsys, ["prior", dataset, "--out", run, *few, "--force"], run)
     nbv = ["nbv", dataset, "--prior", prior, "--out", out, "--budget", 1, "--force"]
-    assert "is there already" in refused(capsys, nbv, out)
+    assert "it holds mesh.ply" in refused(capsys, nbv, out)
     nbv[nbv.index(out)] = run
     command(*nbv, "--seeds", 3, "--set", "train.passes=1", "--set", "warm_passes=1")
     assert not (run / "renders").exists()

@@ -108,7 +108,7 @@ def load_dataset(
     the same name."""
     root = Path(root)
     path = root / "transforms.json"
-    with suppress(OSError):  # of a path that cannot be searched: `read_records` says why
+    with suppress(PermissionError):  # of a folder that cannot be searched: `read_records` says why
         if not path.exists():
             fault = "holds no transforms.json" if root.is_dir() else "no such dataset folder"
             cure = "make a dataset with `mgs import` or `mgs synth-orbit`"
