@@ -1,4 +1,4 @@
-"""What the charts of `studies.chart` show of its rows: points over rocks, tables, the figure."""
+"""Points over rocks, tables and the figure of the charts (`studies.chart`)."""
 
 from collections.abc import Sequence
 from pathlib import Path
