@@ -57,7 +57,7 @@ class RenderPreset:
     spp: int
 
 
-PRESETS = {"quick": RenderPreset(320, 240, 32, 8), "paper": RenderPreset(640, 480, 100, 12)}
+PRESETS = {"quick": RenderPreset(320, 240, 32, 8), "paper": RenderPreset(640, 480, 100, 9)}
 
 
 def synth_orbit(
