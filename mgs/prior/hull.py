@@ -19,23 +19,28 @@ from mgs.progress import report
 
 COARSE, REFINEMENTS = 48, 2  # cells along an edge of the first grid; its refinements by two
 NEAR_SURFACE = 3.0  # nodes are evaluated anew if their interpolated value is under this many cells
+BLOCK = 32_768  # points that are carved at once
 ROW = 4096  # points are passed to OpenCV in rows of this length
 MOST_PIXELS = 1_000_000  # of a mask to carve with: 4 MB each, with outlines finer than the grid
 MARGIN = 1.3  # half edge of the grid over the largest radius of the object that a mask shows
 LEAST_VIEWS = 3  # A point in the image of fewer frames is outside
-AGREEMENT = 0.8  # least median share of a mask that the hull must fill; above 0.95 if masks fit
+AGREEMENT = 0.8  # least median share of a mask that the hull must fill
+FITTING = 0.95  # the same, above which masks and poses fit each other, so that no view errs
 LEAST_PIECE = 0.02  # least volume of a piece over that of the largest; smaller ones are specks
 ODD = 0.5  # least share of what few frames cut away, for a mask that cuts it away to be left out
 FEW = 0.1  # share of the frames that see a point of the object and may carve it by mistake
 
 
 def visual_hull(frames: Sequence[Frame]) -> Surface:
-    """Visual hull of the masks of frames, smoothed by at most half a cell, unless that takes away
-    a thin object; its numbers have the mean and least share of a mask that it fills.
+    """Visual hull of the masks of frames, smoothed by at most half a cell. Its numbers have the
+    mean and least share of a mask that it fills.
 
-    A few masks that cut away what no others do are left out, with a warning. Raises InputError if
-    all masks are empty or full, if they share no point of space, or if the hull fills too little of
-    them, because poses and masks do not fit; the message names frames."""
+    Where it fills less than FITTING of the median mask, wrong poses each cut a bit away, or
+    smoothing took what is as thin as two cells. Then the hulls without smoothing, and of all but
+    FEW of the frames that see a point, are carved too, and the one that fits the masks best is
+    taken. A few masks that cut away what no others do are left out, with a warning. Raises
+    InputError if all masks are empty or full, if they share no point of space, or if the hull fills
+    too little of them, because poses and masks do not fit; the message names frames."""
     others = list(frames)
     while True:
         try:
@@ -69,30 +74,28 @@ def _carved(frames: Sequence[Frame]) -> Surface:
     report("visual hull")
     views = [_view(frame) for frame in frames]
     lo, edge = _bounds(frames)
-    cells, side = COARSE, np.arange(COARSE + 1)
-    nodes = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1)
-    points = lo + edge / cells * nodes.reshape(-1, 3)
-    field = _inside(views, points, 2 * NEAR_SURFACE * edge / cells).reshape(nodes.shape[:3])
-    if field.max() <= 0:
-        what = "the masks share no point in space"
-        raise _Contradiction(what, frames, _odd_one(views, points))
-    for _ in range(REFINEMENTS):
-        field, cells = _refined(field), 2 * cells
-        near = np.argwhere(np.abs(field) < NEAR_SURFACE * edge / cells)
-        field[tuple(near.T)] = _inside(views, lo + edge / cells * near, NEAR_SURFACE * edge / cells)
-    cell = edge / cells
-    smooth = np.clip(gaussian_filter(field, 1.0), field - cell / 2, field + cell / 2)
-    for values in (smooth, field):  # smoothing takes away what is as thin as two cells
-        mesh = _meshed(values, lo, cell)
-        filled = _filled(views, mesh)
-        if np.nanmedian(filled) >= AGREEMENT:
+    cell, best = edge / (COARSE * 2**REFINEMENTS), -1.0
+    for wrong in (0.0, FEW):
+        field = _field(views, lo, edge, wrong)
+        if field.max() <= 0:
+            what = "the masks share no point in space"
+            raise _Contradiction(what, frames, _odd_one(views, _grid(lo, edge)))
+        smooth = np.clip(gaussian_filter(field, 1.0), field - cell / 2, field + cell / 2)
+        for values in (smooth, field) if smooth.max() > 0 else (field,):
+            mesh = _meshed(values, lo, cell)
+            filled, overlap = _fit(views, mesh)
+            if np.nanmedian(overlap) > best:
+                best, hull, fill = float(np.nanmedian(overlap)), mesh, filled
+            if np.nanmedian(fill) >= FITTING and not wrong:
+                break
+        if np.nanmedian(fill) < AGREEMENT:
+            share = f"{np.nanmedian(fill):.0%} of the median mask"
+            what = f"the masks carve away most of the object (the hull fills {share})"
+            raise _Contradiction(what, frames, _odd_one(views, _grid(lo, edge)))
+        if np.nanmedian(fill) >= FITTING:
             break
-    else:
-        share = f"{np.nanmedian(filled):.0%} of the median mask"
-        what = f"the masks carve away most of the object (the hull fills {share})"
-        raise _Contradiction(what, frames, _odd_one(views, points))
-    fills = {"hull_fills_masks": np.nanmean(filled), "hull_fills_least": np.nanmin(filled)}
-    return Surface(mesh, cell, {"hull_cell": cell} | {key: float(fills[key]) for key in fills})
+    fills = {"hull_fills_masks": np.nanmean(fill), "hull_fills_least": np.nanmin(fill)}
+    return Surface(hull, cell, {"hull_cell": cell} | {key: float(fills[key]) for key in fills})
 
 
 @dataclass(frozen=True)
@@ -155,18 +158,45 @@ def _bounds(frames: Sequence[Frame]) -> tuple[np.ndarray, float]:
     return centre - half, float(2 * half)
 
 
-def _inside(views: Sequence[_View], points: np.ndarray, reach: float) -> np.ndarray:
-    """Least value of points [N,3] over the views, clipped to +-reach, float32 [N]; -reach if fewer
-    than LEAST_VIEWS have the point in their image."""
-    least, count = np.full(len(points), np.inf), np.zeros(len(points), int)
-    active = np.arange(len(points))
-    for view in views:
-        value = view(points[active])
-        count[active] += np.isfinite(value)
-        least[active] = np.minimum(least[active], value)
-        active = active[least[active] > -reach]  # what is carved deeper is far from the surface
-    outside = (least <= -reach) | (count < min(LEAST_VIEWS, len(views)))
-    return np.where(outside, -reach, np.minimum(least, reach)).astype(np.float32)
+def _grid(lo: np.ndarray, edge: float) -> np.ndarray:
+    """Nodes [N,3] of the coarse grid, world."""
+    side = edge / COARSE * np.arange(COARSE + 1)
+    return lo + np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
+
+
+def _field(views: Sequence[_View], lo: np.ndarray, edge: float, wrong: float) -> np.ndarray:
+    """`_inside` of the nodes of the finest grid, [N,N,N]; interpolated away from the surface. If
+    no node of the coarse grid is inside, that grid."""
+    cells = COARSE
+    field = _inside(views, _grid(lo, edge), 2 * NEAR_SURFACE * edge / cells, wrong)
+    field = field.reshape([COARSE + 1] * 3)
+    for _ in range(REFINEMENTS if field.max() > 0 else 0):
+        field, cells = _refined(field), 2 * cells
+        cell = edge / cells
+        near = np.argwhere(np.abs(field) < NEAR_SURFACE * cell)
+        field[tuple(near.T)] = _inside(views, lo + cell * near, NEAR_SURFACE * cell, wrong)
+    return field
+
+
+def _inside(views: Sequence[_View], points: np.ndarray, reach: float, wrong: float) -> np.ndarray:
+    """Least value of points [N,3] over the views, but for the share `wrong` of those that see them,
+    clipped to +-reach, float32 [N]; -reach if fewer than LEAST_VIEWS have the point in their
+    image."""
+    field = np.full(len(points), -reach, np.float32)
+    for first in range(0, len(points), BLOCK):
+        part = points[first : first + BLOCK]
+        values, active = np.empty((len(views), len(part))), np.arange(len(part))
+        deep = np.zeros(len(part), int)
+        for row, view in zip(values, views, strict=True):
+            row[active] = view(part[active])
+            deep[active] += row[active] <= -reach
+            active = active[deep[active] <= wrong * len(views)]  # others are far from the surface
+        values = np.sort(values[:, active], axis=0)
+        count = np.isfinite(values).sum(axis=0)
+        value = np.take_along_axis(values, (wrong * count).astype(int)[None], 0)[0]
+        value[count < min(LEAST_VIEWS, len(views))] = -reach
+        field[first + active] = np.clip(value, -reach, reach)
+    return field
 
 
 def _odd_one(views: Sequence[_View], points: np.ndarray) -> tuple[int, float, float]:
@@ -210,10 +240,16 @@ def _meshed(field: np.ndarray, lo: np.ndarray, cell: float) -> Mesh:
     return Mesh(vertices, faces.astype(np.int64), np.ones(len(faces), bool))
 
 
-def _filled(views: Sequence[_View], mesh: Mesh) -> np.ndarray:
-    """Share of the mask of each view that the mesh fills; NaN for an empty mask."""
+def _fit(views: Sequence[_View], mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Share of the mask of each view that the mesh fills, and intersection over union of the two;
+    NaN for an empty mask."""
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
-    depth, masks = mesh_depth(mesh), [view.distance > 0 for view in views]
-    pairs = zip(views, masks, strict=True)
-    return np.array([(depth(v.camera)[m] > 0).mean() if m.any() else np.nan for v, m in pairs])
+    depth, shares = mesh_depth(mesh), list[tuple[float, float]]()
+    for view in views:
+        mask, outline = view.distance > 0, depth(view.camera) > 0
+        both = (mask & outline).sum()
+        areas = mask.sum(), (mask | outline).sum()
+        shares.append((both / areas[0], both / areas[1]) if areas[0] else (np.nan, np.nan))
+    filled, overlap = np.array(shares).T
+    return filled, overlap
