@@ -71,6 +71,8 @@ class Lost:
 
     def plan(self, *_):
         return None
+
+from mgs.run.policies import Coverage
 """
 
 
@@ -145,6 +147,13 @@ def test_a_policy_that_fails_keeps_the_steps_before(loaded, file, tmp_path, func
 
 def test_an_error_in_a_plan_is_one_line(file):
     fails(r"mine\.py failed: TypeError", policy_of(f"{file}:Lost").plan, None, None, [], 1, None)
+
+
+def test_an_object_in_a_file_keeps_its_bound(loaded, file, tmp_path):
+    rules = {"own": f"{file}:Coverage", "ours": "coverage"}
+    first = [run(tmp_path / key, loaded, policy=rule).steps[0] for key, rule in rules.items()]
+    own, ours = (step["certificate"] for step in first)
+    assert own == ours | {"criterion": "mine.py:Coverage"}
 
 
 def test_a_run_goes_on_with_the_same_file_only(dataset, file, tmp_path, monkeypatch):

@@ -99,7 +99,7 @@ def test_refined_poses_gain_within_the_limits(run, site, tmp_path, monkeypatch):
         assert 29 <= view.elevation <= 31
 
 
-def test_as_few_views_are_planned_as_have_a_share_of_what_all_would_give(run, site):
+def test_as_few_views_are_planned_as_have_a_share_of_what_all_would_give(run, site, capsys):
     opened, ring = open_run(run), place_poses("ring", 12, 2.6, (25, 35), site)
     few, more = (suggest(opened, ring, "auto", enough=share) for share in (0.5, 0.8))
     assert 1 <= len(few.plan) < len(more.plan) < 12
@@ -116,6 +116,10 @@ def test_as_few_views_are_planned_as_have_a_share_of_what_all_would_give(run, si
     assert run.settings.enough == 0.7
     later = mgs.start_run(data, run.folder.parent / "more", seeds=2, budget="auto", enough=1.0)
     assert later.settings.budget == 6
+    out = ["--out", run.folder.parent / "no", "--prior", later.settings.prior]
+    for policy in ("a-optimal", "random"):
+        words = ["nbv", data, *out, "--seeds", 2, "--budget", "auto", "--policy", policy]
+        assert f"policy {policy}: has no bound to tell how many" in refused(capsys, words)
 
 
 def test_candidates_of_one_pose_are_one_and_those_that_see_nothing_none(run, site):

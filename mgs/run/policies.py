@@ -14,7 +14,7 @@ and may have
 - plan(scene, state, views, count, nearest): the views to choose from, those of a plan of at most
   `count` of `views`; with `nearest`, each among so many nearest to the one before.
 - tour_gains(scene, state): gains by which a flight is planned (`PoolGains`), if any.
-- relaxation(scene, state, views): criterion with upper bounds of plans, if any.
+- relaxation(scene, state, views): criterion with upper bounds of plans.
 
 To add one, write a class and a row of POLICIES, or a file of your own (docs/howto/policy.md)."""
 
@@ -73,17 +73,18 @@ class Information:
         F, H, lam = scene.information, state.H, scene.lam
         return each(views, lambda i: self.criterion(F(state, i), H, lam))
 
-    def relaxation(self, scene: Scene, state: State, views: Sequence[int]) -> Relaxation | None:
+
+@dataclass(frozen=True)
+class DOptimal(Information):
+    """The paper's Eq. 7 with exact information (`criteria.d_optimal`)."""
+
+    name: str = "d-optimal"
+    criterion: criteria.Score = criteria.d_optimal
+
+    def relaxation(self, scene: Scene, state: State, views: Sequence[int]) -> Relaxation:
         """Eq. 7 of these views, at the model so far."""
-        if self.criterion is not criteria.d_optimal:
-            return None
         F = np.stack([scene.information(state, i) for i in views])
         return relaxed.d_optimal(F, state.H, scene.lam)
-
-
-def DOptimal() -> Information:
-    """The paper's Eq. 7 with exact information (`criteria.d_optimal`)."""
-    return Information("d-optimal", criteria.d_optimal)
 
 
 def AOptimal() -> Information:

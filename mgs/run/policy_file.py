@@ -52,7 +52,7 @@ OF_ONE: dict[str, Callable[[Scene, State, int], Any]] = {
 """Arguments of one candidate: information about model and surface, and its place [3]."""
 
 OF_THE_FIT = {"scene", "state", "F", "H"}  # arguments that depend on the fitted model
-OPTIONAL = ("plan", "tour_gains", "geometric")  # attributes that a policy may have
+OPTIONAL = ("plan", "tour_gains", "relaxation", "geometric")  # attributes that a policy may have
 FUNCTION = "python:"  # start of the name of a policy that is a Python function: python:MODULE.NAME
 
 

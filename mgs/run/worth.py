@@ -53,8 +53,8 @@ def _criterion(
     if relaxation is None or not views:
         return None
     report(Stage.SCORE, 0, 1)
-    criterion: Criterion | None = relaxation(scene, state, views)
-    return criterion if criterion and criterion.gain(range(len(views))) > 0 else None
+    criterion: Criterion = relaxation(scene, state, views)
+    return criterion if criterion.gain(range(len(views))) > 0 else None
 
 
 def planned_certificate(
