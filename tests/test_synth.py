@@ -1,6 +1,7 @@
 """The synthetic dataset: what is on disk agrees with the true rock, to the pixel."""
 
 from types import SimpleNamespace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from mgs.seeds import generator
 from mgs.synth.orbit import evaluation_cameras, rock_cameras
 from mgs.synth.rendering import ROCK_EXPOSURE, PoseNoise, RenderPreset, _meter, synth_orbit
 from mgs.synth.rock import make_rock
-from mgs.synth.scene_file import ORBITS, Arena, Orbit, Rock, SceneFile, load_scene_file
+from mgs.synth.scene_file import Arena, Orbit, OrbitKind, Rock, SceneFile, load_scene_file
 
 TINY = RenderPreset(width=64, height=48, frames=5, spp=2)
 ONE = RenderPreset(width=32, height=24, frames=1, spp=1)
@@ -182,7 +183,7 @@ def test_every_scene_frames_its_rock_on_every_orbit(scene):
     seed = 11 if scene == "horseshoe" else 0  # rocks of some seeds do not fit; studies use 11
     rock = make_rock(settings.rock.model_copy(update={"detail": 0.06}), generator(seed, "rock"))
     above = rock.vertices[rock.vertices[:, 2] > 0]
-    for kind in ORBITS:
+    for kind in get_args(OrbitKind):
         orbit = settings.orbit.model_copy(update={"kind": kind})
         flown = settings.model_copy(update={"orbit": orbit})
         cameras = rock_cameras(flown, (640, 480), 36, rock)

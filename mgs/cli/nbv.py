@@ -146,7 +146,7 @@ def start_and_print(
     folder = run.settings.prior
     if settings.get("prior") is None and folder.parent == dataset.resolve():
         console.print(f"prior: {folder}", soft_wrap=True)
-    if run.settings.flight.no_fly or run.settings.flight.clearance is not None:
+    if run.settings.flight.limits_poses:
         may = allowed(scene_of(run), run.settings)
         where = f"of {len(may)} poses are ruled out by flight.no_fly and flight.clearance"
         console.print(f"{len(may) - may.sum()} {where}")

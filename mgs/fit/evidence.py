@@ -102,7 +102,7 @@ def worth(
 ) -> Worth:
     """Worth of parameters by the formulas of this module; 0 if the images say nothing of the kind.
     away: [N,P] distance of each from its start. precision: [N,P] diagonal of J^T J + lam over all
-    pixels. lam: [P]. sigma: noise of a pixel, linear RGB. of: columns by kind. phi: objective."""
+    pixels. lam: [P]. sigma: noise of a value as blended. of: columns by kind. phi: objective."""
     rise = 0.5 * precision * np.square(away)
     gain = rise / sigma**2 - 0.5 * np.log(precision / lam)
     gains, rises, unseen = {}, {}, np.ones(len(away), bool)

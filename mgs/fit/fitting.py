@@ -53,7 +53,7 @@ class Fit:
 
 
 # Above 0, where a colour is clamped and has no gradient; below half a step of an 8-bit sRGB image.
-COLOUR_MIN = 1e-4  # lower bound of colours of degree 0 after a step, linear RGB
+COLOUR_MIN = 1e-4  # lower bound of colours of degree 0 after a step, as the model blends them
 
 
 def _in_bounds(model: Gaussians) -> Gaussians:

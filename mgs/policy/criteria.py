@@ -21,6 +21,7 @@ PRIOR_STD = {"colour": 1.0, "scale": 0.125, "rotation": 0.0625, "opacity": 2.0}
 rotation (7 degrees) are small: with larger ones, Gaussians grow into needles (docs/fit.md)."""
 
 MEAN_STD = 0.5  # tau of learned means over the spacing of the samples; chosen
+BETTER = 1 + 1e-6  # least ratio of gains for a better plan: above rounding errors; chosen
 GAIN_UNIT = "½ nat per parameter"  # of `d_optimal`: 2/l times mutual information in nats
 
 

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from mgs.policy.criteria import Array
+from mgs.policy.criteria import BETTER, Array
 from mgs.policy.pool_gains import PoolGains
 
 Share = Callable[[Array, int], NDArray[np.float64]]
@@ -17,7 +17,6 @@ Pick = Callable[[list[int], NDArray[np.float64]], tuple[int, float]]
 """(stops, their costs) -> the next stop and its gain. It counts as taken from then on."""
 
 ROUNDING = 1e-9  # share of the limits, for metres that are summed in another order
-BETTER = 1 + 1e-6  # least ratio of gains for a replacement: above rounding errors; chosen
 WIDTHS = (1, 2, 3)  # numbers of neighbouring stops that are replaced together; chosen
 ARC_STEP = np.radians(15)  # largest angle between two corners of a leg around a cylinder; chosen
 

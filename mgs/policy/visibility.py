@@ -7,7 +7,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.memory import IMAGE_BYTES, kept_within
-from mgs.policy.criteria import Array
+from mgs.policy.criteria import BETTER, Array
 from mgs.policy.directional import Views, dome_cameras, of_points, squared_weights
 from mgs.policy.pool_gains import PoolGains
 from mgs.policy.poses import nearest_poses
@@ -22,7 +22,6 @@ FEW = 500  # about the number of Gaussians by which a flight is planned; chosen
 # about how many otherwise. Chosen constants (docs/speed-accuracy.md).
 MOST_PAIRS, COARSE_PAIRS = 1 << 24, 1 << 21
 MATRICES = 18  # 45 numbers of 16 bytes for a Gaussian, degree 2 (`PoolGains`), over 40 for a pair
-BETTER = 1 + 1e-6  # least ratio of gains for an exchange: above rounding errors; chosen
 WIDTH = 16  # paths that `planned_path` keeps at each step; chosen
 
 

@@ -182,7 +182,7 @@ def start_run(
             save_prior(unfinished / "prior", surface)
         _check_surface(surface, dataset, mission, where)
         mission = mission.with_spacing(surface.spacing, loose)
-        if mission.flies or mission.flight.no_fly or mission.flight.clearance is not None:
+        if mission.flies or mission.flight.limits_poses:
             check_seeds(Scene(dataset, surface, mission), mission)
         if automatic:
             mission = _automatic(Scene(dataset, surface, mission), mission, rule)
@@ -199,7 +199,7 @@ def start_run(
 
 def _seed_frames(dataset: Dataset, mission: NbvSettings) -> list[Frame]:
     """Frames of the seeds of a run from random points, the only ones whose masks exist by then."""
-    if mission.flies or mission.flight.no_fly or mission.flight.clearance is not None:
+    if mission.flies or mission.flight.limits_poses:
         raise InputError("nbv: limits of a flight need a surface, which a random start lacks")
     positions = np.stack([camera.position for camera in dataset.cameras])
     if mission.seeds == len(dataset):

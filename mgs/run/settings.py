@@ -41,6 +41,11 @@ class FlightLimits(Frozen):
     clearance: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     """Lowest height of a pose above the object's lowest point, metres."""
 
+    @property
+    def limits_poses(self) -> bool:
+        """Whether poses may be ruled out, and not the flight alone."""
+        return self.no_fly is not None or self.clearance is not None
+
 
 class SearchLimits(Frozen):
     """Limits of the search for a better set than the plan, which proves how good the plan is."""

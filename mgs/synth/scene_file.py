@@ -17,8 +17,6 @@ Elevation = Annotated[float, Field(ge=0, le=90)]
 
 OrbitKind = Literal["circle", "rings", "spiral", "hemisphere"]
 
-ORBITS: tuple[str, ...] = get_args(OrbitKind)
-
 Colour = tuple[Fraction, Fraction, Fraction]
 
 
