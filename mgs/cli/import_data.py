@@ -51,8 +51,8 @@ def import_data(
     Lens distortion is undone.
 
     Masks come from --masks, else from --mesh, the source's own mask files, or the images' alpha.
-    Partial alpha is kept in rock/, images of the rock alone. Points that came with the cameras are
-    kept in sparse.ply for `mgs prior`. The same command continues an interrupted import.
+    Partial alpha is kept in rock/, images of the object alone. Points that came with the cameras
+    are kept in sparse.ply for `mgs prior`. The same command continues an interrupted import.
 
     - source: A transforms.json or a folder with one, a COLMAP model (sparse/0), ROS bag, Metashape
       XML, a folder of TUM RGB-D, Open3D, RTAB-Map, OpenSfM or ODM, Bundler, LLFF, MVSNet or 3D
@@ -61,9 +61,9 @@ def import_data(
     - images: Folder of the images (default: SOURCE/images), or topic of a bag.
     - keyframes: Of a recording or video, import frames at least this time or distance apart: 0.5s
       or 0.2m; of a video the sharpest.
-    - masks: Folder of masks, named like the images; the rock is white.
-    - mesh: Mesh of the rock, world coordinates; masks are its projections. GLB is converted from +Y
-      up to +Z up.
+    - masks: Folder of masks, named like the images; the object is white.
+    - mesh: Mesh of the object, world coordinates; masks are its projections. GLB is converted from
+      +Y up to +Z up.
     - downscale K: Average blocks of K x K pixels; 4 suits 12 megapixels.
     - up: Up direction: X,Y,Z in the source's world, or auto: from how cameras were held.
     - unit: Metres per unit of length of the source. Default: as the source says, if it does.

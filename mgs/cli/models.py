@@ -33,9 +33,9 @@ def evaluate(
 
     Held-out views are frames of the dataset that the run did not take. A run's refitted and pruned
     models are measured, too. The metrics of a file are written beside it. Metrics and pictures that
-    are up to date are kept. The truth is the rock on black. PSNR and SSIM are over the full frame,
-    and masked to the pixels of the rock. metrics.json also has the errors of alpha and depth, where
-    the dataset has their truth.
+    are up to date are kept. The truth is the object on black. PSNR and SSIM are over the full
+    frame, and masked to the pixels of the object. metrics.json also has the errors of alpha and
+    depth, where the dataset has their truth.
 
     - subjects RUN|SPLATS...: Folders that `mgs nbv` wrote, or PLY, GLB, SPZ, MGS.
     - dataset: Dataset for a file. Default: that of the run whose folder holds it.

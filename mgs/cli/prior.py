@@ -92,9 +92,9 @@ def prior(
     seed: Seed = 0,
     force: bool = False,
 ) -> None:
-    """Build the prior: a mesh of the rock, and points sampled on it, where the Gaussians start.
+    """Build the prior: a mesh of the object, and points sampled on it, where the Gaussians start.
 
-    From depth images: fuse a cloud, find the ground plane and the rock above it, and reconstruct
+    From depth images: fuse a cloud, find the ground plane and the object above it, and reconstruct
     its surface (Poisson). From points that came with the cameras: reconstruct the surface of those
     inside the masks or above the ground. From a hull: take all that lies inside all masks. Then
     spread samples evenly over the faces that some frame sees. Writes mesh.ply, points.ply,
