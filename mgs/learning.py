@@ -10,7 +10,7 @@ from mgs.errors import InputError
 from mgs.fit.evidence import Images
 from mgs.fit.fitting import Fit
 from mgs.fit.objective import objective
-from mgs.fit.poses import INDEPENDENT, ROUND, ROUNDS, pose_steps, spread, tau
+from mgs.fit.poses import INDEPENDENT, ROUND, ROUNDS, motion_std, pose_steps, tau
 from mgs.fit.settings import PoseNoise, TrainSettings
 from mgs.fit.stopping import DivergedError, StopReason
 from mgs.gaussians import Gaussians
@@ -107,7 +107,7 @@ def refine_poses(scene: Scene, noise: PoseNoise) -> tuple[Frame, ...]:
         targets, weight = scene.targets(frames, gains), train.alpha_weight
         goal = objective(model, cameras, targets, cache=scene.cache, alpha_weight=weight)
         moved = pose_steps(goal, as_drjit(model), poses, variance / std**2)
-        std = spread(poses, moved, most)
+        std = motion_std(poses, moved, most)
         pairs = zip(frames, moved, strict=True)
         frames = tuple(replace(frame, camera=camera) for frame, camera in pairs)
     return frames

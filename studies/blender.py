@@ -29,7 +29,7 @@ from mgs.files import copy_file
 from mgs.fit.settings import TrainSettings
 from mgs.learning import fit_views
 from mgs.metrics import psnr
-from mgs.policy.poses import spread
+from mgs.policy.poses import farthest_order
 from mgs.run.nbv import FREE_TRAIN, LOOSE
 from mgs.run.policy_file import policy_of
 from mgs.run.settings import NbvSettings, validated
@@ -239,7 +239,7 @@ def choose_and_judge(
     count = round(last * len(data)) if last < 1 else int(last)
     if masked:
         positions = np.array([camera.position for camera in data.cameras])
-        far = spread(positions[1:], positions[:1], np.zeros(3))
+        far = farthest_order(positions[1:], positions[:1], np.zeros(3))
         seeds = [0, *(1 + k for k in far[: first - 1])]
         scene = scene_of(data, seeds, *model)
     else:

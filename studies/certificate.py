@@ -131,7 +131,7 @@ def planned(
         return [free.index(i) for i in POLICIES[name].plan(scene, state, free, k, None)]
 
     positions, seeds = scene.positions(state.frames), list(state.taken)
-    even = poses.spread(positions[free], positions[seeds], scene.centre)
+    even = poses.farthest_order(positions[free], positions[seeds], scene.centre)
     plans = []
     for name, one in made.items():
         for k in counts:

@@ -27,7 +27,7 @@ from mgs.reports.page_plots import curve_plot
 from mgs.run.checks import predicted_psnr
 from mgs.run.detectors import alarms
 from mgs.run.folder import open_run, text_of
-from mgs.run.records import Record, checked
+from mgs.run.records import Record, parse_record
 from mgs.view.layers import read_subject
 from studies.frame.output import write_csv
 
@@ -313,11 +313,11 @@ def replaced(data):
 
 def test_no_value_of_a_wrong_type_in_a_step_is_read():
     """Print, draw and continue whatever is read."""
-    read = len(checked(Record, json.dumps(RECORD))["steps"]) - 2
+    read = len(parse_record(Record, json.dumps(RECORD))["steps"]) - 2
     for data in replaced(RECORD):
         text = json.dumps(data, default=lambda _: "a")
         try:
-            steps = checked(Record, text)["steps"]
+            steps = parse_record(Record, text)["steps"]
         except ValueError:
             continue
         read += 1

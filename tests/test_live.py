@@ -53,7 +53,7 @@ class Flight:
     def __init__(self, root, poses, prior):
         self.out, self.dataset = root / "run", root / "run/dataset"
         self.prior = load_prior(prior)
-        live.begin(self.dataset, load_dataset(poses, to_capture=True), self.prior)
+        live.write_live_dataset(self.dataset, load_dataset(poses, to_capture=True), self.prior)
         tiny.start(self.out, load_dataset(self.dataset))
 
     def fly(self, deliver, **options):

@@ -171,7 +171,7 @@ def start(out: Path, dataset: Dataset, **values) -> NbvSettings:
     defaults = {"dataset": dataset.root, "prior": dataset.root, "budget": 5, "seeds": 3}
     defaults |= {"policy": "d-optimal"}
     settings = NbvSettings(**(defaults | values))
-    run_folder.start(out, settings, dataset)
+    run_folder.write_config(out, settings, dataset)
     return settings
 
 

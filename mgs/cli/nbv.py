@@ -83,7 +83,7 @@ def nbv(
     - capture_folder: Folder to which poses are written; pictures are awaited there."""
     console = Terminal()
     values = parse_settings(settings, nbv)
-    live = live_capture(capture_command, capture_folder, values.pop("capture", {}))
+    live = live_from(capture_command, capture_folder, values.pop("capture", {}))
     own = not_none(budget=budget, seeds=seeds, batch=batch, seed=seed)
     if resume is not None:
         others = not_none(dataset=dataset, out=out, prior=prior, gaussians=gaussians, source=source)
@@ -113,7 +113,7 @@ def nbv(
 PASSES_BETWEEN = 5  # passes of a fit to all images between two pictures of a test view
 
 
-def live_capture(command: str | None, folder: Path | None, values: dict[str, Any]) -> Live | None:
+def live_from(command: str | None, folder: Path | None, values: dict[str, Any]) -> Live | None:
     """`Live` of the options of a live capture, None without one. Raises InputError as `command`,
     and where options are wrong or do not go together."""
     from mgs.run import live

@@ -30,7 +30,7 @@ ROUND = {"passes": 3, "tolerance": 0.0, "density": "fixed", "loss": "squared"}
 # Pixels of an image that count as independent, whatever its size: errors of a model are alike over
 # large parts of it, and pull at its pose together. With more, exact poses move. A chosen constant.
 INDEPENDENT = 50
-LEAST = 1e-3  # least factor of `spread`. A chosen constant.
+LEAST = 1e-3  # least factor of `motion_std`. A chosen constant.
 
 
 def tau(noise: PoseNoise, cameras: Sequence[Camera], centre: np.ndarray) -> np.ndarray:
@@ -40,7 +40,7 @@ def tau(noise: PoseNoise, cameras: Sequence[Camera], centre: np.ndarray) -> np.n
     return np.hstack([turn, np.outer(noise.distance * distances, np.ones(3))])
 
 
-def spread(given: Sequence[Camera], cameras: Sequence[Camera], most: np.ndarray) -> np.ndarray:
+def motion_std(given: Sequence[Camera], cameras: Sequence[Camera], most: np.ndarray) -> np.ndarray:
     """Standard deviation [V,6] of motions as found: `most` [V,6] times the root mean square of
     motion / most, up to 1, of the turn of each view and of its shift. Under it in place of `most`,
     views that the images hardly pull come to rest where they were."""

@@ -30,7 +30,7 @@ def farthest_pose(candidates: Array, taken: Array, centre: Array) -> Array:
     return _rounded(distance.min(axis=1))
 
 
-def spread(candidates: Array, taken: Array, centre: Array) -> list[int]:
+def farthest_order(candidates: Array, taken: Array, centre: Array) -> list[int]:
     """Order in which `farthest_pose` takes all candidates [C,3] after the cameras taken [T,3]."""
     order, rest = list[int](), list(range(len(candidates)))
     while rest:

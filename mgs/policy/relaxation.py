@@ -279,8 +279,8 @@ def directional(
 
 
 def d_optimal(F: Array, H: Array, lam: Array) -> Relaxation:
-    """`mgs.policy.criteria.d_optimal` (Eq. 7) at a fixed model. F: [C,N,P]. Errors: `checked`."""
-    checked(F)
+    """`mgs.policy.criteria.d_optimal` (Eq. 7), fixed model. F: [C,N,P]. Errors: `check_seen`."""
+    check_seen(F)
     flat = F.reshape(len(F), -1)
 
     def vectors(some: slice) -> Floats:
@@ -290,7 +290,7 @@ def d_optimal(F: Array, H: Array, lam: Array) -> Relaxation:
     return Relaxation(len(F), vectors, base, scale=1 / base.size)
 
 
-def checked(per_view: Array) -> None:
+def check_seen(per_view: Array) -> None:
     """Raise InputError where candidates have no number, or none of them sees anything."""
     check_finite(per_view)
     if not len(per_view) or not np.any(per_view):

@@ -77,8 +77,8 @@ def read_poses(path: str | Path, site: Site) -> list[Named]:
     """Poses of a transforms.json, or of a CSV with the columns x, y, z, and optionally name, a
     target or a quaternion (COLUMNS). Intrinsics that a file lacks are those of `site.like`.
 
-    Raises InputError as `load_cameras`; for a CSV without rows, with unknown, missing or half of
-    the columns, or a number that is none; for more than MOST_POSES poses, or two of one name."""
+    Raises InputError as `load_cameras`, and for more than MOST_POSES poses or two of one name. Also
+    for a CSV without rows, with unknown, missing or half of the columns, or what is no number."""
     path = Path(path)
     if path.suffix.lower() == ".csv":
         poses = _read_csv(path, site)

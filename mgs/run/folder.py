@@ -27,7 +27,7 @@ from mgs.prior.build import Prior, load_prior
 from mgs.provenance import versions
 from mgs.run.ending import RunEnd
 from mgs.run.policy_file import label
-from mgs.run.records import Config, Metrics, Record, checked, read_checked
+from mgs.run.records import Config, Metrics, Record, parse_record, read_checked
 from mgs.run.settings import NbvSettings, validated
 from mgs.splat_places import to_source
 from mgs.splat_ply import read_ply, write_ply
@@ -268,7 +268,7 @@ def open_run(folder: str | PathLike[str]) -> Run:
     return Run(folder, settings)
 
 
-def start(out: Path, settings: NbvSettings, dataset: Dataset) -> None:
+def write_config(out: Path, settings: NbvSettings, dataset: Dataset) -> None:
     """Write config.json, the first file of a run."""
     frames = [frame.name for frame in dataset.frames]
     config = {"settings": settings.model_dump(mode="json"), "versions": versions()}
@@ -332,7 +332,7 @@ def read_record(out: Path) -> dict[str, Any] | None:
     with _checkpoint(out) as file:
         if file is None:
             return None
-        record = checked(Record, str(_member(file, "json", "U")[()]))
+        record = parse_record(Record, str(_member(file, "json", "U")[()]))
     frames = read_config(out)["frames"]
     if not all(0 <= frame < len(frames) for frame in record["taken"]):
         raise InputError(f"{out / CHECKPOINT}: takes frames that the run lacks; start the run anew")

@@ -158,7 +158,7 @@ class Live:
     distance: float | None = None
 
 
-def begin(folder: Path, poses: Dataset, prior: Prior) -> None:
+def write_live_dataset(folder: Path, poses: Dataset, prior: Prior) -> None:
     """Write the dataset of a live run: all poses, and the images that exist already."""
     data, records = read_records(poses.root / "transforms.json")
     for record in records:

@@ -37,10 +37,10 @@ from mgs.run.folder import (
     Run,
     holds_run,
     open_run,
-    start,
     up_of_prior,
+    write_config,
 )
-from mgs.run.live import Live, Transport, begin, live_capture
+from mgs.run.live import Live, Transport, live_capture, write_live_dataset
 from mgs.run.loop import first_views
 from mgs.run.policies import POLICIES, Policy
 from mgs.run.policy_file import code_of, in_file, is_function, label, name_of, policy_of
@@ -187,11 +187,11 @@ def start_run(
         if automatic:
             mission = _automatic(Scene(dataset, surface, mission), mission, rule)
         if live is not None:
-            begin(unfinished / DATASET, dataset, surface)
+            write_live_dataset(unfinished / DATASET, dataset, surface)
         if refine:
             frames = refine_poses(Scene(dataset, surface, mission), mission.pose_noise)
             write_refined(unfinished / DATASET, dataset, frames)
-        start(unfinished, mission, dataset)
+        write_config(unfinished, mission, dataset)
         if not isinstance(policy, str):
             (unfinished / POLICY_SOURCE).write_text(code_of(policy), encoding="utf-8")
     return Run(out, mission, dataset if images == root else None, stored, policy)

@@ -259,7 +259,7 @@ class Directional:
 
     def relaxation(self, scene: Scene, state: State, views: Sequence[int]) -> Relaxation:
         surface = scene.plan_surface(state)
-        relaxed.checked(surface.pool.of(views).seen)
+        relaxed.check_seen(surface.pool.of(views).seen)
         return surface.relaxation(state.taken, views, self.model)
 
 

@@ -153,7 +153,7 @@ class Metrics(_Strict):
     of: str = ""
 
 
-def checked(model: type[BaseModel], text: str) -> dict[str, Any]:
+def parse_record(model: type[BaseModel], text: str) -> dict[str, Any]:
     """Parse JSON of a model. Raises ValueError if it is not of this model."""
     try:
         model.model_validate_json(text)
@@ -170,6 +170,6 @@ def read_checked(model: type[BaseModel], path: Path, cure: str) -> dict[str, Any
     """Read a JSON file. Raises InputError with the cure if it is missing or not of this model."""
     text = read_text(path)
     try:
-        return checked(model, text)
+        return parse_record(model, text)
     except ValueError as error:
         raise InputError(f"{path}: is damaged ({error}); {cure}") from None

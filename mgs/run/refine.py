@@ -14,10 +14,10 @@ from mgs.run.flight import Flight, allowed
 from mgs.run.settings import Mission
 from mgs.scene import Scene, State
 
-NEAR = 0.1
+LARGEST_SHIFT = 0.1
 """Largest shift of a pose over its distance from the object. A chosen constant."""
 
-SHORTEST, MOST = NEAR / 32, 12
+SHORTEST, MOST = LARGEST_SHIFT / 32, 12
 """Step at which a climb ends, over the distance, and most steps of it. Chosen constants."""
 
 Information = Callable[[Camera], np.ndarray]
@@ -84,7 +84,7 @@ def _climb(
     halved until one raises the gain at a pose that `may` be. `centre` [3] keeps its place in the
     image. slope(camera): derivative of the gain by the pose [6], times any factor."""
     best, value, reach = camera, gain(camera), float(np.linalg.norm(centre - camera.position))
-    step = NEAR / 2 * reach
+    step = LARGEST_SHIFT / 2 * reach
     for _ in range(MOST):
         by_turn, by_shift = slope(best).reshape(2, 3)
         # A shift t turns the camera by -(c x t) / |c|^2, with c the centre in its axes.
@@ -96,7 +96,7 @@ def _climb(
         while best is start and step > SHORTEST * reach:
             for way in ways:
                 there = displaced(start, step * np.r_[way @ turns, way])
-                near = np.linalg.norm(there.position - camera.position) <= NEAR * reach
+                near = np.linalg.norm(there.position - camera.position) <= LARGEST_SHIFT * reach
                 if near and may(there) and gain(there) > value:
                     best, value = there, gain(there)
                     break

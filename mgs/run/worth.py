@@ -7,7 +7,7 @@ import numpy as np
 
 from mgs.errors import InputError
 from mgs.policy.certificate import Certificate, certify, curve, greedy
-from mgs.policy.poses import spread
+from mgs.policy.poses import farthest_order
 from mgs.policy.relaxation import Criterion
 from mgs.progress import Stage, report
 from mgs.run.choosing import plan_flight, planned_flight
@@ -41,7 +41,7 @@ def certificate(
     if criterion.pairs > CURVE_PAIRS:
         return worth
     positions = scene.positions(state.frames)
-    even = spread(positions[list(views)], positions[list(state.taken)], scene.centre)
+    even = farthest_order(positions[list(views)], positions[list(state.taken)], scene.centre)
     return replace(worth, curve=curve(criterion, indices, even))
 
 
