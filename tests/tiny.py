@@ -10,7 +10,9 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from synthetic import pinhole, sphere
@@ -189,7 +191,12 @@ def go(out: Path, settings: NbvSettings, dataset: Dataset, *, on_step=None, **pa
     """Run or resume in a folder by these settings. parts: as in `scene`, and `measure`."""
     measure = parts.pop("measure", lambda gaussians, taken: {"psnr": float(len(taken))})
     made, on_step = scene(dataset, settings, **parts), on_step or (lambda _: None)
-    return recording.run(out, settings, made, on_step=on_step, measure=measure, checked=False)
+    unchecked = SimpleNamespace(entries=lambda *_: {})
+    with (
+        patch.object(recording, "psnr_measure", lambda *_: measure),
+        patch.object(recording, "Checks", lambda *_: unchecked),
+    ):
+        return recording.run(out, settings, made, on_step=on_step)
 
 
 def write_prior(out: Path) -> Path:

@@ -1,7 +1,7 @@
 """Run the loop in a folder: checkpoints, times, warnings and evaluation around `select_views`."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ from mgs.errors import InputError
 from mgs.evaluation import psnr_measure
 from mgs.files import remove_file, working_in
 from mgs.fit.stopping import DivergedError
-from mgs.gaussians import Gaussians
 from mgs.learning import captured
 from mgs.policy import criteria
 from mgs.progress import Progress, Stage, listening, report
@@ -32,9 +31,6 @@ from mgs.scene import Choice, Scene, State
 from mgs.splat_places import to_source
 from mgs.splat_ply import write_ply
 
-Measure = Callable[[Gaussians, Sequence[int]], dict[str, float]]
-"""(model, views taken) -> entries of steps.jsonl (`mgs.evaluation.psnr_measure`)."""
-
 
 def run(
     out: Path,
@@ -45,21 +41,17 @@ def run(
     on_step: Callable[[Checkpoint], None] = lambda state: None,
     progress: Progress | None = None,
     retry: bool = False,
-    measure: Measure | None = None,
-    checked: bool = True,
 ) -> Checkpoint:
     """Run or resume the loop in `out`, which has its config.json, to its end; give the last state.
 
     - on_step(checkpoint): called after every step, or batch of steps, that is on disk.
     - policy: in place of that of the settings.
     - retry: ask again for poses that were given up, if the run has no model yet or no pose left.
-    - measure: evaluation of steps, by default PSNR. checked: whether renders are compared with the
-      images (`mgs.run.checks`).
 
     Killed at any moment and called again, it takes the same views as an uninterrupted run. Raises
-    InputError as `check_settings`; where another process works on the folder; where the prior, a
-    pose or a file of a frame taken has changed; where a frame it takes cannot be read or has an
-    empty mask; and where a fit diverged. The steps before are kept."""
+    InputError as `check_settings`, where another process works on the folder, and where a fit
+    diverged. Also where the prior, a pose or a file of a frame taken has changed. Also where a
+    frame that it takes cannot be read or has an empty mask. The steps before are kept."""
     check_settings(settings, len(scene.dataset))
     with working_in(out), listening(progress) as outer, listening(stopwatch := Stopwatch(outer)):
         checkpoint = read_checkpoint(out)
@@ -70,7 +62,7 @@ def run(
         if retry and (checkpoint is None or ended.get("reason") == RunEnd.FLIGHT):
             scene = replace(scene, dataset=asked_again(scene.dataset))
         policy = policy or policy_of(settings.policy)
-        recorder = Recorder(scene, settings, policy, stopwatch, measure, checked)
+        recorder = Recorder(scene, settings, policy, stopwatch)
         state = None
         if checkpoint is not None:
             state = resumed(scene, settings, checkpoint)
@@ -185,18 +177,11 @@ class Recorder:
     """Turns states of the loop into lines of steps.jsonl, with warnings and evaluation."""
 
     def __init__(
-        self,
-        scene: Scene,
-        settings: NbvSettings,
-        policy: Policy,
-        stopwatch: Stopwatch,
-        measure: Measure | None = None,
-        checked: bool = True,
+        self, scene: Scene, settings: NbvSettings, policy: Policy, stopwatch: Stopwatch
     ) -> None:
         self.scene, self.settings, self.policy = scene, settings, policy
-        self.stopwatch = stopwatch
-        self.measure = measure or psnr_measure(scene.dataset, scene.cache, settings.exposure)
-        self.checks = Checks(scene, settings, policy) if checked else None
+        self.stopwatch, self.checks = stopwatch, Checks(scene, settings, policy)
+        self.measure = psnr_measure(scene.dataset, scene.cache, settings.exposure)
         self.made_from = {
             "prior": inputs.prior_digest(scene.prior),
             "cameras": {f.name: inputs.camera_digest(f.camera) for f in scene.frames},
@@ -220,10 +205,9 @@ class Recorder:
         if state.exposure is not None:
             names = [state.frames[i].name for i in state.taken]
             line["exposure"] = dict(zip(names, state.exposure.tolist(), strict=True))
-        if self.checks:
-            report(Stage.CHECK, 0, 1)
-            model = before.gaussians if before else None
-            line |= self.checks.entries(state, model, new, [*steps, *lines])
+        report(Stage.CHECK, 0, 1)
+        model = before.gaussians if before else None
+        line |= self.checks.entries(state, model, new, [*steps, *lines])
         every, first, step = self.settings.evaluate_every, len(steps), line["step"]
         if every and any(k % every == 0 for k in range(first, step + 1)):
             report(Stage.EVALUATE, 0, 1)
