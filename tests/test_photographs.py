@@ -513,7 +513,9 @@ def test_photographs_without_masks_are_fitted_whole_from_their_points(
     capsys.readouterr()
     fitted = ["fit", tmp_path / "d", "--passes", "2", "--exposure"]
     command(*fitted, "--gaussians", "400", "--out", tmp_path / "whole")
-    assert "start: 364 points of the cameras and 36 random ones" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "start: 364 points of the cameras and 36 random ones" in printed
+    assert f"prior: built in the run; not used: {tmp_path / 'd/prior'}" in printed
     prior, cloud = load_prior(tmp_path / "whole/prior"), read_cloud(tmp_path / "d/sparse.ply")
     own = prior.world.leave(prior.points[:364])
     assert cKDTree(cloud.points).query(own)[0].max() < 1e-5

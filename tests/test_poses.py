@@ -10,10 +10,10 @@ from splat.scenes import calm, make_camera, make_clamped, relative_error
 
 from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
 from mgs.data.dataset import load_dataset, write_transforms
+from mgs.data.structure import write_refined
 from mgs.fit import poses
 from mgs.fit.objective import objective
 from mgs.run.folder import open_run
-from mgs.run.nbv import write_refined
 from mgs.splat import as_drjit, reference, render
 
 EYES = [(2.0, 0.4, 1.1), (-0.5, 2.1, 0.9), (-1.8, -1.1, 1.0), (0.6, -2.0, 1.3)]

@@ -189,8 +189,8 @@ def _run(source: Path, scratch: Path, settings: dict[str, Any]) -> Run:
             if settings[name] is not None:
                 raise InputError(f"suggest: {source} is a run with its model; leave out `{name}`")
         return open_run(source)
-    count = len(load_dataset(source))
-    run = start_run(source, scratch, seeds=count, budget=0, **not_none(**settings))
+    data = load_dataset(source)
+    run = start_run(data, scratch, seeds=len(data), budget=0, **not_none(**settings))
     return resume_nbv(run)
 
 

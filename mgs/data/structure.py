@@ -14,10 +14,10 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud
-from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, write_transforms
+from mgs.data.dataset import FILES, TEST_FOLDER, Dataset, load_dataset, write_transforms
 from mgs.data.frames import Frame, moves
 from mgs.data.lens import Lens
-from mgs.files import read_json, write_json
+from mgs.files import copy_file, read_json, write_json
 from mgs.images import exif_orientation, unlimited_headers
 from mgs.progress import report
 
@@ -26,6 +26,7 @@ FEATURES = 4096  # most features of a picture
 PICTURES_AT_ONCE, PAIRS_AT_ONCE = 8, 64  # of one call of pycolmap, then progress is reported
 ALIKE = 16  # pictures that each is matched with where poses are known: the most alike by pose
 CLOUD = "sparse.ply"  # file of a dataset with its triangulated points
+POSES = "poses.json"  # in the dataset of a run that refined poses: how far each moved
 LEAST_POINTS = 100  # fewest triangulated points from which a fit can start
 POSITION_STD = 0.0025  # standard deviation of a given position, over the distance to what is seen
 ADJUSTMENTS = 2  # bundle adjustments of given poses, each after another triangulation
@@ -304,3 +305,21 @@ def refined(
         write_transforms(dataset.root / TEST_FOLDER, there[count:], world)
     write_transforms(dataset.root, there[:count], world)
     return load_dataset(dataset.root), cloud, moves(frames, there)
+
+
+def write_refined(folder: Path, given: Dataset, frames: Sequence[Frame]) -> None:
+    """Write a dataset of frames with refined poses, of the same files as the given one, and
+    poses.json: how far each moved, degrees and length. Points and test views stay as given."""
+
+    def elsewhere(frame: Frame) -> Frame:
+        paths = {key: path.resolve() for key in FILES if (path := getattr(frame, key))}
+        return replace(frame, **paths)
+
+    tests = given.test_views()
+    if tests is not None:
+        write_transforms(folder / TEST_FOLDER, [*map(elsewhere, tests.frames)], given.world)
+    if (given.root / CLOUD).is_file():
+        copy_file(given.root / CLOUD, folder / CLOUD)
+    moved = {"dataset": str(given.root.resolve()), "moved": moves(given.frames, frames)}
+    write_json(folder / POSES, moved)
+    write_transforms(folder, [*map(elsewhere, frames)], given.world)

@@ -17,6 +17,7 @@ import numpy as np
 
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame
+from mgs.data.structure import POSES
 from mgs.data.world import PLUS_Z, Vector, unit_up
 from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, parsing, read_json, reading, write_json, write_text
@@ -57,9 +58,6 @@ class Checkpoint:
     steps: list[dict[str, Any]] = field(default_factory=list)
     inputs: dict[str, Any] = field(default_factory=dict)
     upright: bool = True
-
-
-POSES = "poses.json"  # in the dataset of a run that refined poses: how far each moved
 
 
 class Run:

@@ -1,7 +1,7 @@
 """`mgs nbv` for programs: start a run, resume it, or both. Prints nothing."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,14 +10,13 @@ from scipy.spatial import cKDTree
 
 from mgs import runtime
 from mgs.camera import extent_of
-from mgs.data.dataset import FILES as PATHS
-from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, write_transforms
-from mgs.data.frames import Frame, has_masks, moves
-from mgs.data.structure import CLOUD
+from mgs.data.dataset import Dataset, load_dataset
+from mgs.data.frames import Frame, has_masks
+from mgs.data.structure import CLOUD, write_refined
 from mgs.errors import InputError
-from mgs.files import THERE, Ours, atomic_folder, copy_file, reading, write_json
+from mgs.files import THERE, Ours, atomic_folder, reading
 from mgs.fit.density import GROWTH, split_times
-from mgs.fit.settings import MOST_OF_FIT, ModelSettings, as_3dgs
+from mgs.fit.settings import ALPHA_WEIGHT, MOST_OF_FIT, ModelSettings, TrainSettings, as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE, Gaussians
 from mgs.learning import information, refine_poses, surface_information
 from mgs.memory import VIEW_BYTES
@@ -32,7 +31,6 @@ from mgs.run.folder import (
     DATASET,
     FILES,
     POLICY_SOURCE,
-    POSES,
     Checkpoint,
     Run,
     holds_run,
@@ -44,14 +42,7 @@ from mgs.run.live import Live, Transport, live_capture, write_live_dataset
 from mgs.run.loop import first_views
 from mgs.run.policies import POLICIES, Policy
 from mgs.run.policy_file import code_of, in_file, is_function, label, name_of, policy_of
-from mgs.run.settings import (
-    ALPHA_WEIGHT,
-    ENOUGH,
-    NbvSettings,
-    check_settings,
-    validated,
-    with_defaults,
-)
+from mgs.run.settings import ENOUGH, NbvSettings, check_settings, validated
 from mgs.run.worth import enough_views
 from mgs.scene import Scene, State
 from mgs.splat.constants import NEAR
@@ -142,59 +133,70 @@ def start_run(
     if holds_run(out) and not force:
         raise InputError(f"{out}: a run {THERE}; `mgs nbv --resume {out}` continues it")
     root = dataset.root if isinstance(dataset, Dataset) else Path(dataset)
-    if prior is not None and (gaussians is not None or source is not None):
-        name = "source" if gaussians is None else "gaussians"
-        raise InputError(f"nbv: `{name}` builds a prior; leave it out, or leave out `prior`")
-    if (prior, gaussians, source) == (None,) * 3 and (root / "prior/prior.json").is_file():
-        prior = root / "prior"
-    folder = Path(prior) if isinstance(prior, str | Path) else None
+    prior, folder = _prior_of(root, prior, gaussians, source)
     up = up_of_prior(folder) if folder else None
     if not isinstance(dataset, Dataset) or (up and not np.allclose(up, dataset.world.up)):
         dataset = load_dataset(root, to_capture=live is not None, up=up)
-    if live is not None and not dataset.on_demand:
-        raise InputError(f"{root}: all its images exist; leave out live capture")
+    _check_images(dataset, live is not None, settings)
     refine = bool(settings.get("refine_poses"))
-    if refine and dataset.on_demand:
-        raise InputError(f"{root}: has poses without images, which cannot be refined")
-    automatic = settings.get("budget") == "auto"
-    if automatic and live is not None:
-        raise InputError("budget auto: needs the images of the seeds; give a number")
     images = root if live is None and not refine else out / DATASET
     where = folder or out / "prior"
     if source == "random":
         settings["train"] = {"means": "free"} | dict(settings.get("train", {}))
         loose = LOOSE["random"]
-    stored = load_prior(folder) if folder else None
-    given: Any = stored or prior
-    random = "random" in (source, getattr(given, "kind", None))
+    random = source == "random" or (prior is not None and prior.kind == "random")
     policy = settings.get("policy") or (WITHOUT_SURFACE if random else next(iter(POLICIES)))
     paths = {"dataset": images.resolve(), "prior": where.resolve()}
     mission = _settings(dataset, policy, settings | paths)
     rule = policy_of(policy)  # a user's policy fails here, before there is a folder
     check_settings(mission, len(dataset))
-    inputs = [path for path in (root, folder) if path]
-    ours = Ours(FILES, inputs) if force else None
+    ours = Ours(FILES, [path for path in (root, folder) if path]) if force else None
     with atomic_folder(out, ours) as unfinished, listening(progress):
         how = PriorSettings(gaussians=gaussians, seed=mission.seed, parts=parts)
         shown = _seed_frames(dataset, mission) if source == "random" else None
-        surface = given or build_prior(dataset.survey(), how, source=source, shown=shown)
+        prior = prior or build_prior(dataset.survey(), how, source=source, shown=shown)
         if folder is None:
-            save_prior(unfinished / "prior", surface)
-        _check_surface(surface, dataset, mission, where)
-        mission = mission.with_spacing(surface.spacing, loose)
+            save_prior(unfinished / "prior", prior)
+        _check_surface(prior, dataset, mission, where)
+        mission = mission.with_spacing(prior.spacing, loose)
         if mission.flies or mission.flight.limits_poses:
-            check_seeds(Scene(dataset, surface, mission), mission)
-        if automatic:
-            mission = _automatic(Scene(dataset, surface, mission), mission, rule)
+            check_seeds(Scene(dataset, prior, mission), mission)
+        if settings.get("budget") == "auto":
+            mission = _automatic(Scene(dataset, prior, mission), mission, rule)
         if live is not None:
-            write_live_dataset(unfinished / DATASET, dataset, surface)
+            write_live_dataset(unfinished / DATASET, dataset, prior)
         if refine:
-            frames = refine_poses(Scene(dataset, surface, mission), mission.pose_noise)
+            frames = refine_poses(Scene(dataset, prior, mission), mission.pose_noise)
             write_refined(unfinished / DATASET, dataset, frames)
         write_config(unfinished, mission, dataset)
         if not isinstance(policy, str):
             (unfinished / POLICY_SOURCE).write_text(code_of(policy), encoding="utf-8")
-    return Run(out, mission, dataset if images == root else None, stored, policy)
+    return Run(out, mission, dataset if images == root else None, prior if folder else None, policy)
+
+
+def _prior_of(
+    root: Path, prior: str | Path | Prior | None, gaussians: Any, source: str | None = None
+) -> tuple[Prior | None, Path | None]:
+    """Prior given, else DATASET/prior, and its folder; None where it is to be built. Raises
+    InputError as `load_prior`, and where one is given and another to be built."""
+    builds = [key for key, one in (("gaussians", gaussians), ("source", source)) if one is not None]
+    if prior is not None and builds:
+        raise InputError(f"nbv: `{builds[0]}` builds a prior; leave it out, or leave out `prior`")
+    if prior is None and not builds and (root / "prior/prior.json").is_file():
+        prior = root / "prior"
+    if prior is None or isinstance(prior, Prior):
+        return prior, None
+    return load_prior(Path(prior)), Path(prior)
+
+
+def _check_images(dataset: Dataset, live: bool, settings: dict[str, Any]) -> None:
+    """Raises InputError where images lack that a run needs first, or none is to be captured."""
+    if live and not dataset.on_demand:
+        raise InputError(f"{dataset.root}: all its images exist; leave out live capture")
+    if settings.get("refine_poses") and dataset.on_demand:
+        raise InputError(f"{dataset.root}: has poses without images, which cannot be refined")
+    if settings.get("budget") == "auto" and live:
+        raise InputError("budget auto: needs the images of the seeds; give a number")
 
 
 def _seed_frames(dataset: Dataset, mission: NbvSettings) -> list[Frame]:
@@ -208,16 +210,36 @@ def _seed_frames(dataset: Dataset, mission: NbvSettings) -> list[Frame]:
     return [dataset.frames[i] for i in seeds]
 
 
+@dataclass(frozen=True)
+class FitStart:
+    """What decides the start of a fit to all images, as arguments of `start_run`."""
+
+    source: str | None
+    train: dict[str, Any]
+    sh: int
+    loose: float = 1.0
+    parts: float = 1.0
+
+
 def start_fit(
     dataset: str | Path,
     out: str | Path,
     *,
-    prior: str | Path | None = None,
+    prior: str | Path | Prior | None = None,
     gaussians: int | Literal["auto"] | None = None,
     progress: Progress | None = None,
     **settings: Any,
 ) -> Run:
-    """`start_run` of a run that takes all images at once and chooses none.
+    """`start_run` of a run that takes all images at once and chooses none, from `start_of_fit`.
+    Arguments and errors as `start_run`."""
+    data = load_dataset(dataset)
+    start = start_of_fit(data, prior, gaussians, dict(settings.pop("train", {})))
+    every = vars(start) | settings | {"seeds": len(data), "budget": 0}
+    return start_run(data, out, prior=prior, gaussians=gaussians, progress=progress, **every)
+
+
+def start_of_fit(data: Dataset, prior: Any, gaussians: Any, train: dict[str, Any]) -> FitStart:
+    """Start of a fit to all images. train: settings given. Others, and errors, as `start_fit`.
 
     By default means are free where the prior comes from photographs (`LOOSE`), with FREE_TRAIN,
     colours of degree FREE_SH and a looser prior, else frozen. With adaptive density, settings and
@@ -225,55 +247,29 @@ def start_fit(
     from the points that came with the cameras and random ones, unless a prior is given: a surface
     of the object cannot explain what is around it. Gaussians of a prior from photographs that is
     built in the run are split where images need more: those of a whole scene unless their number is
-    given, those of an object into that number. Arguments and errors as `start_run`."""
-    root, train = Path(dataset), dict(settings.pop("train", {}))
-    data, folder = load_dataset(root), Path(prior) if prior is not None else root / "prior"
-    ready = gaussians is None and (prior is not None or (folder / "prior.json").is_file())
-    kind = load_prior(folder).kind if ready else choose_source(data.survey())
-    bare = prior is None and kind == "points" and not has_masks(data.frames)
-    whole = "random" if bare and train.get("means", "free") == "free" else None
-    kind = whole or kind
+    given, those of an object into that number."""
+    existing, _ = _prior_of(data.root, prior, gaussians)
+    kind, sh, parts = existing.kind if existing else choose_source(data.survey()), 0, 1.0
+    whole = prior is None and kind == "points" and not has_masks(data.frames)
+    source = "random" if whole and train.get("means", "free") == "free" else None
+    kind = source or kind
     if train.get("density") == "adaptive":
         recipe = as_3dgs(extent_of([frame.camera for frame in data.frames]))
         rates = recipe["rates"] | train.get("rates", {})
-        train = {"passes": FREE_PASSES} | recipe | train | {"rates": rates}
-        settings.setdefault("sh", MAX_SH_DEGREE)
+        train, sh = {"passes": FREE_PASSES} | recipe | train | {"rates": rates}, MAX_SH_DEGREE
     train.setdefault("means", "free" if kind in LOOSE else "frozen")
-    loose, parts = 1.0, 1.0
-    few = (data.root / CLOUD).is_file() and not isinstance(gaussians, int)
-    of_object = kind in LOOSE and kind != "random" and not ready and prior is None
-    if train["means"] == "free" and (of_object or (kind == "random" and few)):
+    if train["means"] != "free" or kind not in LOOSE:
+        return FitStart(source, train, sh)
+    train, of_object = FREE_TRAIN | train, kind != "random" and existing is None
+    few = kind == "random" and (data.root / CLOUD).is_file() and not isinstance(gaussians, int)
+    if of_object or few:
         train.setdefault("density", "split")
-        if of_object and train["density"] == "split":
-            passes = train.get("passes", FREE_PASSES)
-            parts = (1 + GROWTH) ** len(split_times(passes)) if isinstance(passes, int) else 1.0
-            if isinstance(gaussians, int):
-                train.setdefault("most_gaussians", min(gaussians, MOST_OF_FIT))
-    if train["means"] == "free" and kind in LOOSE:
-        loose = LOOSE[kind]
-        train = FREE_TRAIN | train
-        settings.setdefault("sh", FREE_SH[kind])
-    every = {"seeds": len(data), "budget": 0, "train": train, "loose": loose, "parts": parts}
-    start: dict[str, Any] = {"prior": prior, "gaussians": gaussians, "source": whole}
-    return start_run(root, out, progress=progress, **start, **settings | every)
-
-
-def write_refined(folder: Path, given: Dataset, frames: Sequence[Frame]) -> None:
-    """Write a dataset of frames with refined poses, of the same files as the given one, and
-    poses.json: how far each moved, degrees and length. Points and test views stay as given."""
-
-    def elsewhere(frame: Frame) -> Frame:
-        paths = {key: path.resolve() for key in PATHS if (path := getattr(frame, key))}
-        return replace(frame, **paths)
-
-    tests = given.test_views()
-    if tests is not None:
-        write_transforms(folder / TEST_FOLDER, [*map(elsewhere, tests.frames)], given.world)
-    if (given.root / CLOUD).is_file():
-        copy_file(given.root / CLOUD, folder / CLOUD)
-    moved = {"dataset": str(given.root.resolve()), "moved": moves(given.frames, frames)}
-    write_json(folder / POSES, moved)
-    write_transforms(folder, [*map(elsewhere, frames)], given.world)
+    if of_object and train["density"] == "split":
+        if isinstance(train["passes"], int):  # otherwise `validated` refuses it
+            parts = (1 + GROWTH) ** len(split_times(train["passes"]))
+        if isinstance(gaussians, int):
+            train.setdefault("most_gaussians", min(gaussians, MOST_OF_FIT))
+    return FitStart(source, train, sh or FREE_SH[kind], LOOSE[kind], parts)
 
 
 def _settings(dataset: Dataset, policy: Any, values: dict[str, Any]) -> NbvSettings:
@@ -282,8 +278,12 @@ def _settings(dataset: Dataset, policy: Any, values: dict[str, Any]) -> NbvSetti
     values = values | {"policy": name_of(policy) if known else policy}
     if values.get("budget") == "auto":
         values["budget"] = 1
-    weight = ALPHA_WEIGHT if dataset.outlined else 0.0
-    settings = validated(NbvSettings, with_defaults(values, weight))
+    train = values.get("train", {})
+    train = train.model_dump(exclude_unset=True) if isinstance(train, TrainSettings) else train
+    if isinstance(train, Mapping):  # otherwise `validated` refuses it
+        weight = ALPHA_WEIGHT if dataset.outlined else 0.0
+        values["train"] = {"alpha_weight": weight, **train}
+    settings = validated(NbvSettings, values)
     resolved: dict[str, Any] = {}
     if "seed" not in settings.train.model_fields_set:
         resolved["train"] = settings.train.model_copy(update={"seed": settings.seed})

@@ -1,6 +1,5 @@
 """Settings of a run, validated once. The docstring of a field is the help of its option."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from reprlib import repr
 from typing import Annotated, Any, TypeVar
@@ -10,14 +9,12 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from mgs.errors import InputError, row_named
 from mgs.files import read_json, read_toml
 from mgs.fit.settings import (
-    ALPHA_WEIGHT,
     MEAN_RATE,
     Frozen,
     ModelSettings,
     PoseNoise,
     Positive,
     Scale,
-    TrainSettings,
 )
 from mgs.policy.criteria import MEAN_STD, PRIOR_STD
 from mgs.run.policy_file import check_policy
@@ -138,15 +135,6 @@ class NbvSettings(ModelSettings, Mission):
         for kind, std in self.prior_std.items():
             prior_std[kind] = loose * std if std == PRIOR_STD.get(kind) else std
         return self.model_copy(update={"train": train, "prior_std": prior_std})
-
-
-def with_defaults(values: Mapping[str, Any], alpha_weight: float = ALPHA_WEIGHT) -> dict[str, Any]:
-    """Add this alpha_weight to fields of NbvSettings that lack it."""
-    train = values.get("train", {})
-    fields = train.model_dump(exclude_unset=True) if isinstance(train, TrainSettings) else train
-    if not isinstance(fields, Mapping):
-        return dict(values)  # `validated` reports it
-    return {**values, "train": {"alpha_weight": alpha_weight, **fields}}
 
 
 Model = TypeVar("Model", bound=BaseModel)
