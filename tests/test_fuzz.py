@@ -281,6 +281,7 @@ ROBOTS = (
     ("Bundler", "bundler/list.txt"),
     ("LLFF", "llff/poses_bounds.npy"),
     ("MVSNet", "mvsnet/cams/kf_0000_cam.txt"),
+    ("openMVG benchmark", "benchmark/gt_dense_cameras/kf_0000.png.camera"),
     ("3D Gaussian Splatting", "splats/cameras.json"),
 )
 """Recordings of robots, scanners and other programs, and files of theirs."""

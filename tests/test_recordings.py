@@ -316,6 +316,16 @@ def write_mvsnet(root: Path, dataset) -> Path:
     return root
 
 
+def write_benchmark(root: Path, dataset) -> Path:
+    (root / "gt_dense_cameras").mkdir(parents=True)
+    for name, pose, camera in peer_parts(root, dataset):
+        back, size = np.linalg.inv(pose), (camera.width, camera.height)
+        parts = *camera.K, (0, 0, 0), *back[:3, :3], back[:3, 3], size
+        text = "\n".join(" ".join(repr(float(number)) for number in row) for row in parts)
+        (root / f"gt_dense_cameras/{name}.camera").write_text(text)
+    return root
+
+
 def write_splatting(root: Path, dataset) -> Path:
     rows = []
     for name, pose, camera in peer_parts(root, dataset):
@@ -341,11 +351,12 @@ WRITERS = {
     "Bundler": lambda root, data: write_bundler(root / "bundler", data),
     "LLFF": lambda root, data: write_llff(root / "llff", data),
     "MVSNet": lambda root, data: write_mvsnet(root / "mvsnet", data),
+    "openMVG benchmark": lambda root, data: write_benchmark(root / "benchmark", data),
     "3D Gaussian Splatting": lambda root, data: write_splatting(root / "splats", data),
 }
 OPTIONS = {
     "ROS bag MCAP": ("--pose", "/slam/pose"),
-    **dict.fromkeys([*WRITERS][-4:], ("--unit", 1, "--up", "0,0,1")),
+    **dict.fromkeys([*WRITERS][-5:], ("--unit", 1, "--up", "0,0,1")),
 }
 """Options for facts that the files of these programs lack."""
 
@@ -541,6 +552,7 @@ def pickled(path: Path) -> None:
         ("LLFF", "poses_bounds.npy", pickled, "allow_pickle=False"),
         ("MVSNet", "kf_0000_cam.txt", halved, "not a readable file of MVSNet"),
         ("MVSNet", "kf_0000_cam.txt", skewed, "has skew, 9; resample the images"),
+        ("openMVG benchmark", "kf_0000.png.camera", halved, "not a readable file of openMVG"),
         ("3D Gaussian Splatting", "cameras.json", nonsense, "not valid JSON"),
     ],
 )

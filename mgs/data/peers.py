@@ -1,5 +1,5 @@
 """Cameras of other programs: Metashape, OpenSfM and ODM, Bundler, LLFF, MVSNet, 3D Gaussian
-Splatting.
+Splatting, and of openMVG's benchmark.
 
 Each reader turns the program's axes into those of `Camera`: x right, y down, z forward."""
 
@@ -214,11 +214,31 @@ def _mvsnet(path: Path, folders: list[Path]) -> Contents:
                 (words.index("intrinsic") + 1, 3),
             )
         )
-        if K[0, 1]:
-            raise InputError(f"{file}: has skew, {K[0, 1]:g}; resample the images without it")
-        focal, centre = (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2])
-        views.append(View(file.name.removesuffix("_cam.txt"), pose, focal, None, centre))
+        views.append(View(file.name.removesuffix("_cam.txt"), pose, *_pinhole(file, K)))
     return Contents(views)
+
+
+def _benchmark(path: Path, folders: list[Path]) -> Contents:
+    """openMVG's SfM_quality_evaluation: gt_dense_cameras/IMAGE.camera with K [3,3], three numbers
+    of distortion, camera-to-world rotation [3,3], position, width and height."""
+    views = []
+    for file in sorted(path.glob("*.camera")):
+        numbers = np.array(read_text(file).split(), float)
+        K, lens, R, eye, size = np.split(numbers, (9, 12, 21, 24))
+        if lens.any():
+            raise InputError(f"{file}: has distortion; undistort the images")
+        pose = np.linalg.inv(_matrix(R, eye))
+        focal, _, centre = _pinhole(file, K.reshape(3, 3))
+        name = file.name.removesuffix(".camera")
+        views.append(View(name, pose, focal, (size[0], size[1]), centre))
+    return Contents(views)
+
+
+def _pinhole(file: Path, K: np.ndarray) -> tuple[Any, ...]:
+    """Fields of `View` from `focal` to `centre`, of an image of unknown size."""
+    if K[0, 1]:
+        raise InputError(f"{file}: has skew, {K[0, 1]:g}; resample the images without it")
+    return (K[0, 0], K[1, 1]), None, (K[0, 2], K[1, 2])
 
 
 def _splatting(path: Path, folders: list[Path]) -> Contents:
@@ -241,6 +261,7 @@ PEERS: dict[str, tuple[tuple[str, ...], Callable[[Path, list[Path]], Contents]]]
     "Bundler": (("bundle.out", "bundle/bundle.out"), _bundler),
     "LLFF": (("poses_bounds.npy",), _llff),
     "MVSNet": (("cams",), _mvsnet),
+    "openMVG benchmark": (("gt_dense_cameras",), _benchmark),
     "3D Gaussian Splatting": (("cameras.json",), _splatting),
 }
 """Kind of source -> (its file in a folder, or its folder of files; reader)."""
@@ -255,7 +276,9 @@ def _file_of(kind: str, source: Path) -> Path | None:
     if any(source.glob("transforms*.json")) or models_in(source):
         return None
     for path in (source / name for name in names):
-        if any(path.glob("*_cam.txt")) or (path.is_file() and not _is_object(path)):
+        if path.is_dir() and (any(path.glob("*_cam.txt")) or any(path.glob("*.camera"))):
+            return path
+        if path.is_file() and not _is_object(path):
             return path
     return None
 
