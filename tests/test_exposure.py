@@ -101,7 +101,7 @@ def rock(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("rock") / "dataset"
 
     def albedo(x: np.ndarray) -> np.ndarray:
-        return 0.3 + 0.2 * np.sin(6 * x[..., [1, 2, 0]] + np.array([0, 1, 2]))
+        return 0.3 + 0.15 * np.sin(6 * x[..., [1, 2, 0]] + np.array([0, 1, 2]))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "albedo", albedo)
