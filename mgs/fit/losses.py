@@ -1,6 +1,7 @@
 """Losses of a fit, by name: what each pixel value adds, given a render and an image."""
 
 from collections.abc import Callable
+from math import gcd
 from typing import Any
 
 import drjit as dr
@@ -15,7 +16,7 @@ HALF = SSIM_WINDOW // 2  # pixels of the window of SSIM on each side of its cent
 
 _window = np.exp(-0.5 * (np.arange(-HALF, HALF + 1) / SSIM_SIGMA) ** 2)
 WINDOW = (_window / _window.sum()).tolist()  # weights of the window of SSIM along an axis
-STRIP = 8  # values of an image that one lane makes
+STRIP, PACK = 8, 4  # values that one lane makes: of a line, in this many lines side by side
 Size = tuple[int, int, int]  # width, height and channels of an image
 
 Loss = Callable[[Any, Any, Any, Size, bool], Any]
@@ -86,26 +87,29 @@ class _Blur(dr.CustomOp):
 
 
 def _blurred(images: tuple[Any, ...], size: Size) -> tuple[Any, ...]:
-    """Images convolved with the window of SSIM, 0 beyond the border. A lane makes STRIP values of a
-    row or column, which share what they read."""
+    """Images convolved with the window of SSIM, 0 beyond the border. A lane makes STRIP values of
+    each of up to PACK neighbouring rows or columns: they share what they read, PACK at a time."""
     width, height, channels = size
     for length, stride in ((width, channels), (height, channels * width)):
         dr.eval(images)
-        lane = dr.arange(mi.Int32, -(-length // STRIP) * (width * height * channels // length))
-        line, first = lane % stride, lane // stride % -(-length // STRIP) * STRIP
-        line += lane // (stride * -(-length // STRIP)) * (stride * length)
+        pack, strips = gcd(stride, PACK), -(-length // STRIP)
+        packet = {1: mi.Float, 2: mi.Vector2f, 4: mi.Vector4f}[pack]
+        lines = stride // pack  # a step along a line, packets
+        lane = dr.arange(mi.Int32, strips * (width * height * channels // (length * pack)))
+        line, first = lane % lines, lane // lines % strips * STRIP
+        line += lane // (lines * strips) * (lines * length)
         blurred = tuple(dr.empty(mi.Float, len(image)) for image in images)
         for image, out in zip(images, blurred, strict=True):
             places = [first + k for k in range(-HALF, STRIP + HALF)]
             near = [
-                dr.gather(mi.Float, image, line + at * stride, (at >= 0) & (at < length))
+                dr.gather(packet, image, line + at * lines, (at >= 0) & (at < length))
                 for at in places
             ]
             for k in range(STRIP):
-                value, at = mi.Float(0), places[k + HALF]
+                value, at = packet(0), places[k + HALF]
                 for weight, part in zip(WINDOW, near[k:], strict=False):
                     value = dr.fma(part, weight, value)
-                where = line + at * stride
+                where = line + at * lines
                 dr.scatter(out, value, where, at < length, mode=dr.ReduceMode.NoConflicts)
             dr.eval(out)  # several images in one kernel are three times slower
         images = blurred
