@@ -42,8 +42,9 @@ STAGES = {
 
 QUICK = {name: (name, "--rocks", "1") for name in ("fits", "certificate")}
 
-ENOUGH = 0.01
-"""Largest difference of a number, in its unit: processors of another type round differently."""
+ENOUGH = 0.05
+"""Largest difference of a number, in its unit. Processors of another type round differently: with 8
+lanes (znver3) a PSNR is up to 0.03 dB from that of the rows, made with 16 (znver4)."""
 
 
 def run(out: Path, quick: bool) -> int:

@@ -45,4 +45,4 @@ def test_two_rows_of_the_pages_are_those_of_this_commit(tmp_path):
     }
     for cell in (cell for cell in chosen if cell.about):
         row = rows[cell.about["rock"], cell.about["pool"]]
-        assert results[cell.name]["test"] == pytest.approx(row["test"], abs=0.01)
+        assert results[cell.name]["test"] == pytest.approx(row["test"], abs=every.ENOUGH)
