@@ -29,7 +29,7 @@ STYLE: dict[str, Any] = {
     "lines.linewidth": 1.5,
     "lines.markersize": 4,
 }
-"""Settings for `matplotlib.rc_context`."""
+"""Settings for `styled`."""
 
 NO_GRID = STYLE | {"axes.grid": False}  # STYLE for images and maps
 DPI = 200  # pixels per inch of a figure
@@ -60,15 +60,25 @@ def save_figure(figure: "Figure", path: str | Path) -> None:
 
 
 @contextmanager
+def styled(style: dict[str, Any]) -> Iterator[None]:
+    """Context with these settings and matplotlib's defaults. A matplotlibrc does not count: one in
+    the current folder may be a stranger's, and have LaTeX set every text."""
+    import matplotlib
+
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(style)
+        yield
+
+
+@contextmanager
 def drawing(
     path: str | Path, width: float, height: float, style: dict[str, Any] = STYLE, dpi: int = DPI
 ) -> "Iterator[Figure]":
     """Context with an empty figure, which is written to `path` when the block ends without error.
 
     width, height: inches. style: settings while it is drawn. Raises as `save_figure`."""
-    import matplotlib
-
-    with matplotlib.rc_context(style):
+    with styled(style):
         figure = new_figure(width, height, dpi)
         yield figure
         save_figure(figure, path)

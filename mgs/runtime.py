@@ -144,6 +144,9 @@ def _set_variant(name: str) -> None:
     elif name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         raise InputError(f"{where}: Dr.Jit finds no NVIDIA GPU; unset it to use the processor")
     mi.set_variant(name)
+    resolver = mi.file_resolver()  # would find plugins/*.so of the current folder first
+    resolver.clear()
+    resolver.append(os.path.dirname(str(mi.__file__)))
 
 
 def _choose_libllvm() -> None:

@@ -8,7 +8,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import tiny
-from matplotlib import rc_context
 from PIL import Image
 from program import change_settings, change_steps, command, table_numbers
 from refusals import fails
@@ -67,7 +66,7 @@ def drawn(monkeypatch):
         save(figure, path)
 
     monkeypatch.setattr(plotting, "save_figure", keep)
-    with rc_context(plotting.STYLE):
+    with plotting.styled(plotting.STYLE):
         yield found
 
 

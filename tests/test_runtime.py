@@ -131,3 +131,15 @@ def test_a_call_sets_a_variant_or_keeps_a_usable_one_and_refuses_others():
     assert len(others) == 4
     assert all(line.startswith("scalar_rgb Mitsuba's variant scalar_rgb is set") for line in others)
     assert last == "llvm_ad_rgb"
+
+
+def test_nothing_in_the_current_folder_is_code_or_style(tmp_path):
+    """Mitsuba would load its plugins from there, and matplotlib have LaTeX set every text."""
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins/sphere.so").touch()
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True")
+    program = "from mgs import runtime\nruntime.start()\nimport mitsuba as mi\n"
+    program += "from mgs.plotting import drawing\nmi.load_dict({'type': 'sphere'})\n"
+    program += "with drawing('a.png', 2, 2) as figure:\n    figure.suptitle('a')"
+    done = python(program, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr

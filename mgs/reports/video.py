@@ -21,7 +21,7 @@ from mgs.gaussians import Gaussians
 from mgs.images import write_exr, write_png
 from mgs.learning import learn
 from mgs.metrics import psnr
-from mgs.plotting import NO_GRID, crop, new_figure, painted
+from mgs.plotting import NO_GRID, crop, new_figure, painted, styled
 from mgs.policy import criteria
 from mgs.policy.tour import flying_order, legs
 from mgs.progress import report
@@ -211,7 +211,6 @@ def _left(maps: dict[str, np.ndarray]) -> float:
 
 
 def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], view: Frame) -> np.ndarray:
-    import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     truth = srgb_from_linear(view.masked_rgb())
@@ -220,7 +219,7 @@ def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], view: Frame) -> 
     count, seeds = len(model.taken), run.settings.seeds
     why = f"one of {seeds} to begin with" if count <= seeds else f"chosen by {run.label}"
     title = f"image {count} of {len(run.state.taken)}: {why}"
-    with matplotlib.rc_context(NO_GRID | {"font.size": 11}):
+    with styled(NO_GRID | {"font.size": 11}):
         figure = new_figure(*SIZE, dpi=DPI)
         orbit, render, map_ = figure.subplots(1, 3, width_ratios=(1, 1, 1))
         figure.suptitle(title, fontsize=14, color=NEWEST)
