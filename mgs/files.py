@@ -73,11 +73,14 @@ def below(root: str | Path, *names: str | Path) -> Path:
 
 
 def remove_file(root: Path, path: Path) -> None:
-    """Remove a file below a folder, if it exists. Raises InputError if it is elsewhere."""
+    """Remove a file below a folder, if it exists. Raises InputError if it is elsewhere or stays."""
     if not path.is_relative_to(root):
         raise InputError(f"{path}: is not in {root}, and is not removed; correct its path")
     below(root, path.relative_to(root).parent)
-    path.unlink(missing_ok=True)
+    try:
+        path.unlink(missing_ok=True)
+    except (OSError, ValueError) as error:  # ValueError: no name of a file
+        raise not_writable(path, error) from None
 
 
 def remove_leftovers(folder: Path) -> None:
@@ -337,7 +340,7 @@ def atomic_folder(path: str | Path, ours: Ours | None = None) -> Iterator[Path]:
     path = check_new_folder(path, ours).resolve()
     temporary, replaced = (path.with_name(f".{path.name}.{end}") for end in ("part", "old"))
     for each in (temporary, replaced):
-        _check_leftover(each)
+        check_leftover(each)
     try:
         with folder_locked(temporary):
             try:
@@ -347,7 +350,7 @@ def atomic_folder(path: str | Path, ours: Ours | None = None) -> Iterator[Path]:
                     if any(check_new_folder(path, ours).glob("*")):
                         shutil.rmtree(replaced, ignore_errors=True)
                         if not _is_lock(path / LOCK):
-                            _lock(path / LOCK).close()  # the token of `_check_leftover`
+                            _lock(path / LOCK).close()  # the token of `check_leftover`
                         os.replace(path, replaced)
                     (path / LOCK).unlink(missing_ok=True)  # of a killed process
                     os.replace(temporary, path)
@@ -363,7 +366,7 @@ def atomic_folder(path: str | Path, ours: Ours | None = None) -> Iterator[Path]:
             temporary.rmdir()
 
 
-def _check_leftover(folder: Path) -> None:
+def check_leftover(folder: Path) -> None:
     """Raise InputError unless a folder is missing, empty, or left by a killed process."""
     if not os.path.lexists(folder):
         return
@@ -395,7 +398,7 @@ def scratch_folder(path: str | Path, resumable: bool = False) -> Iterator[Path]:
     block leaves it; one that refuses its input does not. Raises InputError if a folder of this name
     is there that mgs did not make, or that another process uses."""
     path = Path(path)
-    _check_leftover(path)
+    check_leftover(path)
     ended = True
     try:
         with folder_locked(path):

@@ -75,9 +75,11 @@ def check_pixels(path: Path, width: int, height: int, pixel_bytes: int = DECODED
 
 @contextmanager
 def unlimited_headers() -> Iterator[None]:
-    """Context manager in which Pillow opens images of any size, for `check_pixels` to judge."""
-    from PIL import Image
+    """Context manager in which Pillow opens images of any size, for `check_pixels` to judge. From
+    then on it reads no PostScript, which it would run, whatever the name of the file."""
+    from PIL import EpsImagePlugin, Image
 
+    EpsImagePlugin.gs_binary = False
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
     try:
         yield

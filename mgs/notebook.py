@@ -14,6 +14,7 @@ from mgs.colour import srgb_from_linear
 HEIGHT = 120  # height of a picture, pixels
 MOST_POINTS = 20_000  # most points of a picture; of more, every n-th is drawn
 MOST_FILES = 6  # most pictures of files
+FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")  # not PostScript, which Pillow would run
 
 
 def html(text: str, pictures: Sequence[Image.Image]) -> str:
@@ -36,7 +37,7 @@ def thumbnails(paths: Sequence[Path]) -> list[Image.Image]:
     pictures = []
     for i in indices:
         try:
-            with Image.open(files[i]) as image:
+            with Image.open(files[i], formats=FORMATS) as image:
                 small = image.convert("RGB")
         except OSError:
             continue

@@ -1,8 +1,9 @@
 """Damaged files in every loader: it succeeds or raises an InputError of one line, prints nothing,
 and takes little memory and time.
 
-`pytest -m fuzz` makes them at random. FUZZ_SECONDS: CPU time for each loader, by default 20. An
-input that fails is copied to the folder `corpus`, which the quick suite reads.
+`pytest -m fuzz` makes them at random. FUZZ_SECONDS: CPU time for each loader, by default 20;
+FUZZ_SEED: of the random numbers, by default 0. An input that fails is copied to the folder
+`corpus`, which the quick suite reads.
 """
 
 import faulthandler
@@ -31,24 +32,39 @@ from PIL import ExifTags, Image
 from test_recordings import WRITERS
 
 from mgs import InputError, evaluate_run, images, load_dataset, load_prior, open_run, write_page
+from mgs.camera import opengl_from_opencv
 from mgs.cli.app import CURES
 from mgs.compact import container
 from mgs.compact.columns import start_of
 from mgs.compact.encode import Encoder
 from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
+from mgs.data.dataset import load_cameras
+from mgs.data.frames import Frame, as_captured
 from mgs.data.meshes import load_mesh
 from mgs.data.photographs import _usable, sharpest_frames
 from mgs.data.shots import Spacing
 from mgs.data.sources import read_source
 from mgs.data.structure import Matcher
+from mgs.data.world import World
 from mgs.files import read_json, write_json
 from mgs.gaussians import ARRAYS
-from mgs.images import exif_exposure, image_size, read_mask, read_values, write_exr, write_png
+from mgs.images import (
+    exif_exposure,
+    image_size,
+    read_depth,
+    read_mask,
+    read_values,
+    write_exr,
+    write_png,
+)
 from mgs.reports.tables import compare_runs
 from mgs.run.candidates import Site, read_poses, refusals
+from mgs.run.live import _flown
+from mgs.run.settings import settings_in
 from mgs.splat_files import load_gaussians, write_gaussians
 from mgs.splat_ply import read_ply, write_compressed_ply, write_ply
-from mgs.synth.scene_file import load_scene_file
+from mgs.synth.capture import photographer_of
+from mgs.synth.scene_file import load_scene_file, sensor_of
 from mgs.view.layers import read_subject
 from studies.frame.sweep import Cell, result_of
 
@@ -89,6 +105,7 @@ def damaged(data: bytes, rng: np.random.Generator) -> bytes:
 
 CORPUS = Path(__file__).parent / "corpus"
 SECONDS = float(os.environ.get("FUZZ_SECONDS", "20"))
+SEED = int(os.environ.get("FUZZ_SEED", "0"))
 LONGEST = 60
 """Seconds after which reading a small file counts as endless, and ends the process."""
 MOST_GROWTH = 2 << 30
@@ -234,6 +251,42 @@ def of_photograph(path: Path) -> None:
         Matcher(usable, path.parent / "matches")._extract([0])
 
 
+def asked(path: Path) -> Frame:
+    """The frame of which a live capture wrote a file, with its picture."""
+    root = path.parent.parent
+    frame = Frame("a", tiny.orbit()[0], 0.0, root / "images/a.png", on_demand=True)
+    frame.image_path.parent.mkdir(exist_ok=True)
+    png(frame.image_path)
+    return frame
+
+
+def captured(path: Path) -> None:
+    camera = asked(path).camera
+    own = {"K": camera.K.tolist(), "width": 16, "height": 12}
+    own |= {"world_to_camera": camera.world_to_camera.tolist()}
+    write_json(path, {"camera": own, "depth": True})
+
+
+def flown(path: Path) -> None:
+    pose = opengl_from_opencv(asked(path).camera.world_to_camera)
+    write_json(path, {"transform_matrix": pose.tolist(), "w": 16, "h": 12, "k1": 0.1})
+
+
+def on_demand(path: Path) -> None:
+    scene = load_scene_file("boulder").model_dump(mode="json")
+    scene["rock"] |= {"detail": 0.1}
+    preset = {"width": 16, "height": 12, "frames": 3, "spp": 1}
+    about = {"scene": scene, "preset": preset, "seed": 0, "mesh": None, "denoise": False}
+    about |= {"pose_noise": None, "on_demand": {"mesh": None}}
+    write_json(path, about | {"exposure": 1.0, "samples_per_pixel": 1})
+
+
+def of_on_demand(path: Path) -> None:
+    """Read what a survey and a run read of it."""
+    sensor_of(path.parent)
+    photographer_of(path.parent)
+
+
 NO_SUMS = mock.patch.object(container, "zlib", SimpleNamespace(crc32=lambda _: 0))
 """Without checks of sums, so that damage reaches the decoder."""
 
@@ -300,6 +353,12 @@ LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]]
     },
     "JPEG": ("a.jpg", lambda path: Image.effect_noise((32, 24), 50).save(path), read_image),
     "depth": ("d.png", lambda path: Image.new("I;16", (32, 24), 9).save(path), read_values),
+    "TIFF": (
+        "d.tif",
+        lambda path: Image.effect_noise((32, 24), 50).convert("F").save(path),
+        read_depth,
+    ),
+    "WebP": ("a.webp", png, read_image),
     "EXR": ("a.exr", exr, images.read_exr),
     "PLY": ("a.ply", lambda path: write_ply(path, tiny.initial([])), read_ply),
     "compressed PLY": (
@@ -311,6 +370,11 @@ LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]]
     "MGS without sums": ("a.mgs", without_sums, NO_SUMS(load_gaussians)),
     "MGS masked": ("a.mgs", masked, of_masked),
     "SPZ": ("a.spz", spz, load_gaussians),
+    "splat GLB": (
+        "s.glb",
+        lambda path: write_gaussians(path, tiny.initial([]), "glb", np.eye(3)),
+        load_gaussians,
+    ),
     "cloud": ("cloud.ply", cloud, read_cloud),
     "GLB": ("a.glb", mesh, load_mesh),
     "OBJ": ("a.obj", trimesh.creation.icosphere(subdivisions=0).export, load_mesh),
@@ -325,11 +389,25 @@ LOADERS: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]]
         lambda path: write_page(path.parent.parent / "page.html", [path.parent]),
     ),
     "prior.json": ("prior/prior.json", run, read_all),
+    "prior mesh": ("prior/mesh.ply", run, read_all),
     "prior points": ("prior/points.ply", run, read_all),
     "study": ("cells/a/result.json", lambda path: write_json(path, CELL), result),
     "JSON": ("a.json", lambda path: path.write_text('{"a": [1, 2.5, "b"]}'), read_json),
     "transforms.json": ("transforms.json", TRANSFORMS, lambda path: load_dataset(path.parent)),
     "import": ("transforms.json", TRANSFORMS, SOURCE),
+    "cameras": ("transforms.json", TRANSFORMS, load_cameras),
+    "captured": ("captured/a.json", captured, lambda path: as_captured(asked(path))),
+    "flown": (
+        "answers/a.flown.json",
+        flown,
+        lambda path: _flown(path, asked(path), asked(path).image_path, World()),
+    ),
+    "on demand": ("config.json", on_demand, of_on_demand),
+    "settings": (
+        "a.toml",
+        lambda path: path.write_text("policy = 'paper'\nseeds = 2\n[train]\npasses = 3\n"),
+        settings_in,
+    ),
     "scene": ("a.toml", scene, load_scene_file),
     **{
         f"COLMAP {name}": (name, colmap(kind), SOURCE)
@@ -396,7 +474,7 @@ def test_damaged_files(name, request, capfd):
     write(folder / file)
     read(folder / file)
     sound, before = (folder / file).read_bytes(), begin_peak()
-    rng, end = np.random.default_rng(0), time.process_time() + SECONDS
+    rng, end = np.random.default_rng(SEED), time.process_time() + SECONDS
     while time.process_time() < end:
         data = damaged(sound, rng)
         (folder / file).write_bytes(data)

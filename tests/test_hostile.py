@@ -16,13 +16,16 @@ import numpy as np
 import pytest
 import synthetic
 import tiny
+from PIL import EpsImagePlugin
 from program import change_checkpoint, command, output
 from refusals import fails, listing, refused
 
 from mgs import InputError, files, load_dataset, write_ply
 from mgs.cli.terminal import step_lines
+from mgs.data.on_site import dataset_at
 from mgs.files import atomic_folder, atomic_path, below, folder_locked, locked, scratch_folder
-from mgs.images import image_size
+from mgs.images import image_size, read_rgba
+from mgs.notebook import thumbnails
 from mgs.reports.page_plots import curve_plot
 from mgs.run.checks import predicted_psnr
 from mgs.run.detectors import alarms
@@ -50,6 +53,20 @@ def test_an_image_is_measured_by_its_header(capsys, dataset, tmp_path, monkeypat
     monkeypatch.setattr("mgs.memory.MEMORY_FILE", tmp_path / "meminfo")
     (tmp_path / "meminfo").write_text("MemAvailable: 1000 kB")
     fails("GiB are free", image_size, bomb(tmp_path / "b.png", 11_000))
+
+
+def test_postscript_in_a_picture_is_not_run(tmp_path, monkeypatch):
+    """Pillow would give it to Ghostscript, whatever the name of the file."""
+    program, ran = tmp_path / "gs", tmp_path / "ran"
+    program.write_text(f"#!/bin/sh\ntouch {ran}")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)
+    header = "%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 24\n%%EndComments\n"
+    (tmp_path / "a.png").write_text(header)
+    fails("not a readable image", read_rgba, tmp_path / "a.png")
+    assert thumbnails([tmp_path / "a.png"]) == []
+    assert not ran.exists()
 
 
 def test_a_full_disk_behind_the_standard_output():
@@ -358,6 +375,27 @@ def outside(tmp_path):
     assert (folder / "a").read_text() == "mine"
 
 
+SITES = {
+    "no list of copies": lambda site, _: (site / "copies.json").write_text("5"),
+    "a copy elsewhere": lambda site, _: (site / "copies.json").write_text('["../../outside/a"]'),
+    "no name of a file": lambda site, _: (site / "copies.json").write_text('["a\\u0000"]'),
+    "a file for copies": lambda site, _: (site / "photographs").touch(),
+    "a link for copies": lambda site, outside: (site / "photographs").symlink_to(outside),
+    "a link for matches": lambda site, outside: (site / "matches").symlink_to(outside),
+    "another's folder": lambda site, _: (site / "copies.json").rename(site / "a"),
+}
+"""Damage of the folder beside photographs in which `mgs suggest` places them."""
+
+
+@pytest.mark.parametrize("damage", SITES)
+def test_the_site_of_a_stranger(outside, dataset, tmp_path, damage):
+    site = tmp_path / "images.site"
+    site.mkdir()
+    (site / "copies.json").write_text("[]")
+    SITES[damage](site, outside)
+    fails("", dataset_at, dataset / "images", site)
+
+
 def test_nothing_below_a_locked_folder_is_written_through_a_link(outside, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
@@ -367,8 +405,8 @@ def test_nothing_below_a_locked_folder_is_written_through_a_link(outside, tmp_pa
         for path in (run / "renders/a", run / "renders/new/a"):
             with pytest.raises(InputError, match="leads out of"), atomic_path(path):
                 pass
-        for path in (run / "renders/a", outside / "a"):
-            fails(r"leads out of|is not in", files.remove_file, run, path)
+        for path in (run / "renders/a", outside / "a", run / ".."):
+            fails("leads out of|is not in|cannot be written", files.remove_file, run, path)
         with atomic_path(run / "b") as temporary:  # the link itself is replaced
             temporary.write_text("ours")
         files.remove_leftovers(run)

@@ -14,11 +14,13 @@ from mgs.data.structure import WIDEST
 from mgs.files import (
     atomic_path,
     below,
+    check_leftover,
     folder_locked,
-    in_the_way,
+    not_writable,
     parsing,
     read_json,
     remove_file,
+    remove_leftovers,
     write_json,
 )
 from mgs.images import unlimited_headers
@@ -42,9 +44,10 @@ def dataset_at(folder: Path, site: Path) -> tuple[Dataset, Sequence[str]]:
     which a later call registers the photographs since then to the same model. Raises InputError as
     `read_source`, and if `site` was made by something else."""
     record = site / RECORD
-    if site.exists() and not record.is_file():
-        raise in_the_way(site)
+    if not record.is_file():
+        check_leftover(site)
     with folder_locked(site):
+        remove_leftovers(site)
         root, data = below(site, COPIES), below(site, DATASET)
         with parsing(record, "list of copies", f"delete {site}"):
             before = [str(name) for name in read_json(record)] if record.is_file() else []
@@ -67,8 +70,11 @@ def _copy_reduced(path: Path, copy: Path) -> None:
     no JPEG, or cannot be read."""
     if copy.exists() and copy.stat().st_mtime_ns >= path.stat().st_mtime_ns:
         return
-    copy.parent.mkdir(parents=True, exist_ok=True)
-    copy.unlink(missing_ok=True)
+    try:
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.unlink(missing_ok=True)
+    except OSError as error:
+        raise not_writable(copy, error) from None
     try:
         with unlimited_headers(), Image.open(path, formats=["JPEG"]) as image:
             image.draft("RGB", (WIDEST, WIDEST))

@@ -17,7 +17,7 @@ from mgs.data.clouds import SparseCloud
 from mgs.data.dataset import FILES, TEST_FOLDER, Dataset, load_dataset, write_transforms
 from mgs.data.frames import Frame, moves
 from mgs.data.lens import Lens
-from mgs.files import copy_file, read_json, write_json
+from mgs.files import below, copy_file, read_json, write_json
 from mgs.images import exif_orientation, unlimited_headers
 from mgs.progress import report
 
@@ -48,7 +48,8 @@ class Matcher:
         with suppress(ValueError, TypeError):  # else pycolmap prints its stack where it is stopped
             signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
         pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
-        self.folder, self.database = folder, folder / "database.db"
+        self.folder = below(folder.parent, folder.name)
+        self.database = folder / "database.db"
         lenses = [str(camera.todict()) for camera in cameras] or [""] * len(pictures)
         about = [
             [str(path.resolve()), path.stat().st_mtime_ns, lens]
@@ -56,7 +57,7 @@ class Matcher:
         ]
         record = folder / "pictures.json"
         before = read_json(record) if record.is_file() else []
-        if any(picture not in about for picture in before):
+        if not isinstance(before, list) or any(picture not in about for picture in before):
             before = []
         order = [*before, *(picture for picture in about if picture not in before)]
         # Names of any characters become plain ones.

@@ -3,19 +3,26 @@ this module is imported (`mgs.runtime.start`)."""
 
 import importlib.util
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame
 from mgs.errors import InputError
 from mgs.files import fingerprint, read_json, reading
 from mgs.synth.orbit import rock_cameras
-from mgs.synth.rendering import Photographer, RenderPreset, is_done, orbit_frames, rock_of
+from mgs.synth.rendering import (
+    Photographer,
+    RenderPreset,
+    check_cost,
+    is_done,
+    orbit_frames,
+    rock_of,
+)
 from mgs.synth.scene import MitsubaScene
 from mgs.synth.scene_file import SceneFile
 
@@ -55,23 +62,27 @@ def photographer_of(root: Path) -> tuple[Photographer, dict[str, Frame], bool]:
     config: Any = read_json(path)
     try:
         settings = SceneFile.model_validate(config["scene"])
-        preset = RenderPreset(**config["preset"])
+        preset = RenderPreset(**{key: int(n) for key, n in config["preset"].items()})
         seed, mesh = int(config["seed"]), config["on_demand"]["mesh"]
         denoise = bool(config["denoise"])
         exposure, spp = float(config["exposure"]), int(config["samples_per_pixel"])
         exact, made_of = config["pose_noise"] is None, config["mesh"]
-    except (KeyError, TypeError, ValueError, ValidationError):
+        mesh, up = (None, None) if mesh is None else (Path(mesh), str(made_of["up"]))
+        if min(*asdict(preset).values(), spp) < 1 or seed < 0 or not 0 < exposure < np.inf:
+            raise ValueError
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError):
         why = "is not of `mgs synth-orbit --on-demand`, or damaged"
         raise InputError(f"{path}: {why}; make the dataset again") from None
     if denoise and importlib.util.find_spec("pyoidn") is None:
         why = "its images are denoised by pyoidn, which is not installed"
         raise InputError(f'{path}: {why}; `pip install "mgs[denoise]"`')
+    check_cost(root, preset, 0, spp)
     if mesh is not None:
-        with reading(Path(mesh), f"mesh, of which {root} is made"):
-            if made_of != fingerprint(mesh) | {"up": made_of["up"]}:
+        with reading(mesh, f"mesh, of which {root} is made"):
+            if made_of != fingerprint(mesh) | {"up": up}:
                 cure = "restore it, or make the dataset again"
                 raise InputError(f"{mesh}: has changed since {root} was made of it; {cure}")
-    rock, _ = rock_of(settings, seed, mesh, made_of and made_of["up"])
+    rock, _ = rock_of(settings, seed, mesh, up)
     cameras = rock_cameras(settings, (preset.width, preset.height), preset.frames, rock)
     scene = MitsubaScene(settings, rock, cameras[0], seed)
     frames = {frame.name: frame for frame in orbit_frames(root, cameras)}

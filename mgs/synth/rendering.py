@@ -121,7 +121,7 @@ def synth_orbit(
         if resumes(out, "config.json", resolved) and (out / "transforms.json").is_file():
             say(f"{out}: is finished already; nothing is rendered")
             return load_dataset(out)
-        _check_cost(out, preset, test_views, spp)
+        check_cost(out, preset, test_views, spp)
         rock, scale = rock_of(settings, seed, mesh, mesh_up, say)
         size = preset.width, preset.height
         cameras = rock_cameras(settings, size, preset.frames, rock)
@@ -160,7 +160,7 @@ def synth_orbit(
         return load_dataset(out)
 
 
-def _check_cost(out: Path, preset: RenderPreset, test_views: int, spp: int) -> None:
+def check_cost(out: Path, preset: RenderPreset, test_views: int, spp: int) -> None:
     """Raise InputError if a frame has more samples than Mitsuba renders at once, or if memory or
     disk do not suffice."""
     views, pixels = preset.frames + test_views, preset.width * preset.height
@@ -277,7 +277,7 @@ def write_contact_sheet(path: str | Path, frames: list[Frame]) -> None:
     height = round(SHEET_WIDTH * frames[0].camera.height / frames[0].camera.width)
     pictures = []
     for i in np.unique(np.linspace(0, len(frames) - 1, count).astype(int)):
-        with Image.open(frames[i].image_path) as image:
+        with Image.open(frames[i].image_path, formats=["PNG"]) as image:
             small = image.convert("RGB").resize((SHEET_WIDTH, height), Image.Resampling.LANCZOS)
         pictures.append(np.asarray(small))
     write_sheet(Path(path), pictures, SHEET_COLUMNS)
