@@ -51,10 +51,13 @@ COMMANDS = {
     "photographs": "import {photographs} --out {out}",
     "video": "import {video} --keyframes 0.1s --out {out}",
     "export": "export {run} --to mgs --bytes 3000 --out {out} --force",
-    "prune": "simplify {out}",
-    "refit": "simplify {out} --method refit",
+    "prune": "simplify {out} --force",
+    "refit": "simplify {out} --method refit --force",
+    "site": "suggest {out} --gaussians 150",
 }
-"""Name -> arguments; those of simplify get a copy of {run} as {out}."""
+"""Name -> arguments."""
+COPIED = {"prune": "run", "refit": "run", "site": "photographs"}
+"""Command -> the place of which it gets a copy as {out}."""
 
 LOST = "works on it|is finished already|is there already"
 """Pattern of the loser's line."""
@@ -69,6 +72,7 @@ def _patient() -> None:
 @pytest.fixture(scope="module")
 def places(tmp_path_factory) -> dict[str, Path]:
     """A dataset of 8 frames, its prior, a scene, a finished run, and the folder to write."""
+    faulthandler.cancel_dump_traceback_later()
     root = tmp_path_factory.mktemp("kill")
     data = synthetic.write_dataset(root / "data", synthetic.orbit_cameras(8, 48, 36)).root
     paths = {"data": data, "prior": root / "prior", "run": root / "run"}
@@ -101,18 +105,21 @@ def cleared(name: str, places: dict[str, Path]) -> Path:
     work = places["out"].parent
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir()
-    if COMMANDS[name].startswith("simplify"):
-        shutil.copytree(places["run"], places["out"])
+    if name in COPIED:
+        shutil.copytree(places[COPIED[name]], places["out"])
     return work
 
 
 def contents(work: Path) -> dict[str, object]:
-    """Every file below a folder but its commit: bytes, or of checkpoints the arrays."""
+    """Every file below a folder but its commit: bytes, or of checkpoints the arrays. A database has
+    its rows in other pages after an interruption, and does not count."""
     found: dict[str, object] = {}
     for path in sorted(work.rglob("*")):
         key, data = str(path.relative_to(work)), path.read_bytes() if path.is_file() else b""
         if path.suffix in (".json", ".jsonl"):
             data = re.sub(UNEQUAL, b"", data)
+        if path.suffix == ".db":
+            continue
         if path.suffix == ".npz":
             with np.load(path) as arrays:
                 found[key] = [arrays[n].tobytes() for n in arrays.files if n != "json"]
