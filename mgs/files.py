@@ -391,12 +391,13 @@ def _is_lock(path: Path, or_empty: bool = False) -> bool:
 
 
 @contextmanager
-def scratch_folder(path: str | Path, resumable: bool = False) -> Iterator[Path]:
+def scratch_folder(path: str | Path, resumable: str = "") -> Iterator[Path]:
     """Context manager: a folder for temporary files, removed after the block with all its contents.
 
-    What a killed process left in it is removed first. resumable: it is not, and an interrupted
-    block leaves it; one that refuses its input does not. Raises InputError if a folder of this name
-    is there that mgs did not make, or that another process uses."""
+    What a killed process left in it is removed first. resumable: pattern of files for which it is
+    not. An interrupted block leaves it; one that refuses its input does if the folder has such a
+    file, or had anything before. Raises InputError if a folder of this name is there that mgs did
+    not make, or that another process uses."""
     path = Path(path)
     check_leftover(path)
     ended = True
@@ -404,10 +405,12 @@ def scratch_folder(path: str | Path, resumable: bool = False) -> Iterator[Path]:
         with folder_locked(path):
             if not resumable:
                 _clear(path)
+            before = any(entry.name != LOCK for entry in path.iterdir())
             try:
                 yield path
             except BaseException as error:
-                ended = not resumable or isinstance(error, InputError)
+                worth = not isinstance(error, InputError) or before
+                ended = not (resumable and (worth or any(path.glob(resumable))))
                 raise
             finally:
                 if ended:

@@ -3,9 +3,9 @@
 import shutil
 import subprocess
 import sys
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import cv2
 import numpy as np
@@ -13,13 +13,15 @@ import pycolmap
 import pytest
 import synthetic
 from PIL import ExifTags, Image
-from program import command, exit_code, python, said, stop_at
+from program import command, exit_code, output, python, said, stop_at
 from refusals import fails, refused
 from scipy.ndimage import map_coordinates
 
 from mgs import Camera, Frame, InputError, build_prior
 from mgs.cli.suggest import _place
+from mgs.data import photographs
 from mgs.data.clouds import read_cloud
+from mgs.data.colmap import image_count
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.importers import import_source
 from mgs.data.photographs import sharpest_frames
@@ -31,6 +33,7 @@ from mgs.files import read_json
 from mgs.fit.poses import displaced, motion_between
 from mgs.images import write_png
 from mgs.prior.photographs import check_photographs
+from mgs.progress import listening
 
 WIDTH, HEIGHT = 320, 240
 
@@ -259,7 +262,9 @@ def test_a_video_gives_the_sharpest_frames_up_to_where_it_ends(tmp_path):
     assert "not a readable video" in done.stderr
 
 
-def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, monkeypatch):
+def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, capsys, monkeypatch):
+    """So does one that is refused then, and one that is refused after the photographs are placed. A
+    finished one places none again. Large images are named before they are written."""
     root = frames[0].image_path.parent
     out, matches = tmp_path / "d", tmp_path / "d.unpacked/matches/database.db"
     with monkeypatch.context() as patched:
@@ -268,9 +273,55 @@ def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, monkeypatch):
     written = matches.stat().st_size
     assert written > 100_000
     monkeypatch.setattr("pycolmap.extract_features", stop_at())
+    for wrong in (["--exclude", "other"], ["--distance", "view 00,other,2"]):
+        assert exit_code("import", root, "--out", out, *wrong) == 2
+        assert "other" in said(capsys)[1]
+    monkeypatch.setattr("pycolmap.incremental_mapping", stop_at())
+    with monkeypatch.context() as patched:
+        patched.setattr("mgs.cli.import_data.MANY_PIXELS", WIDTH * HEIGHT // 3)
+        patched.setattr("mgs.data.importers.import_shot", stop_at())
+        assert exit_code("import", root, "--out", out) == 130
+        assert "take long to fit; --downscale 2" in said(capsys)[1]
     command("import", root, "--out", out)
     assert len(load_dataset(out)) == len(frames)
     assert not (tmp_path / "d.unpacked").exists()
+    assert output(capsys, "import", root, "--out", out) == f"{out} is finished already"
+
+
+def test_placing_continues_from_its_largest_whole_state(frames, tmp_path, monkeypatch):
+    """Unless it is of under half the photographs."""
+    monkeypatch.setattr(photographs, "STEP", 2)
+    matcher = Matcher([frame.image_path for frame in frames], tmp_path / "m")
+    matcher.match(combinations(range(9), 2))
+    states = tmp_path / "m" / photographs.STATES
+
+    def placing(count, stop=99):
+        """Numbers of photographs placed that are reported until `stop`, and models."""
+        seen, models = [], []
+
+        def listen(stage, done, total):
+            seen.append(done)
+            if done == stop:
+                raise KeyboardInterrupt
+
+        with suppress(KeyboardInterrupt), listening(listen):
+            models = photographs._models(matcher, count)
+        return seen, [model.num_reg_images() for model in models]
+
+    assert placing(9, stop=8)[0][0] == 0
+    *_, less, most = sorted(states.iterdir())
+    points = most / "points3D.bin"
+    points.write_bytes(points.read_bytes()[:-5])
+    whole = image_count(less)
+    seen, models = placing(9)
+    assert seen[0] == whole > 2
+    assert models == [9]
+    assert not states.exists()
+    shutil.rmtree(tmp_path / "m/models")
+    placing(30, stop=8)
+    again, models = placing(30)
+    assert again.count(0) == 1 < again.index(0)
+    assert models == [9]
 
 
 def test_photographs_added_later_are_taken_with_the_same_camera(frames, tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,7 +15,7 @@ import typer
 from mgs.cli.options import parse_up
 from mgs.cli.terminal import Terminal, progress_bar
 from mgs.errors import InputError
-from mgs.files import Ours, clear_folder, scratch_folder
+from mgs.files import Ours, clear_folder, read_json, scratch_folder, write_json
 
 if TYPE_CHECKING:
     from mgs.data.clouds import SparseCloud
@@ -79,12 +81,14 @@ def import_data(
     from mgs.data.agreement import agreement
     from mgs.data.bags import is_bag
     from mgs.data.clouds import write_cloud
-    from mgs.data.importers import import_source
+    from mgs.data.importers import RECORD, import_source
     from mgs.data.meshes import GLTF
     from mgs.data.photographs import KIND as PHOTOGRAPHS
+    from mgs.data.photographs import PLACED, photographs_in
     from mgs.data.sources import read_source
     from mgs.data.structure import CLOUD, Matcher, lacks_points, refined
 
+    options = {name: str(value) for name, value in locals().items() if name != "force"}
     console, notes = Terminal(), Terminal(stderr=True)
     if masks is not None and mesh is not None:
         raise InputError("import: --masks and --mesh both give masks; give one of them")
@@ -92,9 +96,14 @@ def import_data(
         raise InputError("import: --unit and --distance both give the scale; give one of them")
     if test_split is not None and test_every is not None:
         raise InputError("import: --test-split and --test-every both choose test views; give one")
+    files = [*photographs_in(images or source), *(path for path in (source, mesh) if path)]
+    request = _request(options, files)
+    if not force and request == _requested(out):
+        console.print(f"{out} is finished already", soft_wrap=True)
+        return
     unpacked = out.with_name(f"{out.name}.unpacked")
     with (
-        scratch_folder(unpacked, resumable=not is_bag(source)) as scratch,
+        scratch_folder(unpacked, "" if is_bag(source) else f"*/{PLACED}") as scratch,
         progress_bar("reading", console),
     ):
         shots = read_source(
@@ -114,9 +123,17 @@ def import_data(
             clear_folder(out, Ours(FILES, [path for path in (source, images, masks, mesh) if path]))
         finished = os.path.isfile(out / "transforms.json")  # else the import refuses what is there
         source_shots, tests = shots.set_apart(test_every)
+        camera = shots.shots[0].camera
+        least = int(np.ceil(np.sqrt(camera.width * camera.height / MANY_PIXELS)))
+        if downscale < least and not finished:  # before, since to write them takes long, too
+            size = f"{camera.width // downscale}x{camera.height // downscale}"
+            cure = f"--downscale {least} makes them smaller"
+            notes.print(f"mgs: images of {size} take long to fit; {cure}", soft_wrap=True)
         result = import_source(
             source_shots, out, masks=masks, mesh=mesh, downscale=downscale, up=upward, tests=tests
         )
+        if shots.kind == PHOTOGRAPHS:  # to place them again would take long
+            write_json(out / RECORD, read_json(out / RECORD) | {"request": request})
         poses, cloud = shots.fit, shots.sparse
         if shots.kind != PHOTOGRAPHS:
             matcher = Matcher.of_frames(result.frames, scratch / "matches")
@@ -146,6 +163,22 @@ def import_data(
     world = f"up {_numbers(upward)}, {reason}"
     _print_summary(console, shots, tests, result, f"{fits}; {world}")
     console.print(f"{out} is finished already" if finished else f"wrote {out}", soft_wrap=True)
+
+
+def _request(options: dict[str, str], files: Sequence[Path]) -> str:
+    """SHA-256 of an import's options and of its files' paths and times of modification."""
+    about = [(str(path.resolve()), path.stat().st_mtime_ns) for path in files if path.exists()]
+    return hashlib.sha256(json.dumps([options, about]).encode()).hexdigest()
+
+
+def _requested(out: Path) -> str | None:
+    """`_request` of the finished import of photographs in a folder; None where there is none."""
+    from mgs.data.importers import RECORD
+
+    if not all((out / name).is_file() for name in (RECORD, "transforms.json")):
+        return None
+    record = read_json(out / RECORD)
+    return record.get("request") if isinstance(record, dict) else None
 
 
 def _triangulated(
@@ -198,10 +231,6 @@ def _advice(source: Source, result: Dataset) -> Iterator[str]:
         most = f"by up to {max(stops) - min(stops):.1f} stops between photographs"
         cure = "`mgs fit --exposure` estimates a gain for each"
         yield f"by their EXIF, exposure differs {most}; {cure}"
-    camera = result.frames[0].camera
-    if camera.width * camera.height > MANY_PIXELS:
-        size = f"{camera.width}x{camera.height}"
-        yield f"images of {size} take long to fit; --downscale 2 or more makes them smaller"
 
 
 def _print_summary(

@@ -60,6 +60,11 @@ def _is_whole(path: Path) -> bool:
     return True
 
 
+def is_whole_model(folder: Path) -> bool:
+    """Whether a folder holds all binary files of a model, none of which is cut off."""
+    return all((folder / name).is_file() and _is_whole(folder / name) for name in RECORDS)
+
+
 @cache
 def _parameters(model: int) -> int:
     """Number of parameters of a camera model. Raises KeyError if there is no such model."""
@@ -88,7 +93,7 @@ def read_colmap(source: Path, models: list[Path], images: Path) -> Source:
     """The largest of the models in a folder: images sorted by name, and points. images: folder of
     the images. Raises InputError if the model is damaged, its text has lost lines, or a lens is not
     supported."""
-    sizes = {model: _image_count(model) for model in models}
+    sizes = {model: image_count(model) for model in models}
     model = max(models, key=lambda one: sizes[one])
     notes = []
     if len(models) > 1:
@@ -136,7 +141,8 @@ def _observed(image: Any, reconstruction: Any) -> tuple[Camera, np.ndarray, np.n
     return Camera(K, *size, pose), np.reshape(points, (-1, 3)), K[0, 0] * np.reshape(rays, (-1, 2))
 
 
-def _image_count(model: Path) -> int:
+def image_count(model: Path) -> int:
+    """Number of images that a model places."""
     path = model / "images.bin"
     if not path.is_file():
         return len(_names_in_text(model / "images.txt"))

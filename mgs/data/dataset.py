@@ -312,5 +312,6 @@ def target_of(frame: Frame, with_alpha: bool = False) -> np.ndarray:
         cure = f"correct it, or remove frame {frame.name}"
         raise InputError(f"{frame.mask_path}: its rock mask is empty; {cure}")
     rgba, weight = frame.target()
-    alpha = [rgba[..., 3]] if with_alpha else []
-    return padded(np.dstack([rgba[..., :3], weight, *alpha]))
+    image = np.dstack([rgba, rgba[..., 3]]) if with_alpha else rgba
+    image[..., 3] = weight
+    return padded(image)

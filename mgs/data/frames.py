@@ -103,8 +103,12 @@ class Frame:
         if self.rock_path is not None:
             rgba = read_rock_image(self._existing(self.rock_path))
             return rgba, np.ones(rgba.shape[:2], np.float32)
+        one = np.ones((self.camera.height, self.camera.width), np.float32)
+        rgba = np.dstack([self.rgb(), one])
+        if self.mask_path is None:
+            return rgba, one
         mask = self.mask()
-        rgba = np.dstack([self.rgb(), np.ones(mask.shape, np.float32)]) * mask[..., None]
+        rgba *= mask[..., None]
         return rgba, (~boundary(mask)).astype(np.float32)
 
     def masked_rgb(self) -> np.ndarray:

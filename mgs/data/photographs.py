@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mgs.data.colmap import source_of
+from mgs.data.colmap import image_count, is_whole_model, source_of
 from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, Spacing, frame_name, natural
 from mgs.data.structure import Matcher
 from mgs.data.world import PLUS_Z
@@ -34,6 +34,9 @@ LEAST_FEATURES = 100  # fewest features of a photograph that is neither blurred 
 LEAST_MATCHES = 15  # matches that one epipolar geometry explains, for two photographs to overlap
 GPS_ERROR = 0.1  # largest median distance of cameras from GPS, over the extent, to scale by GPS
 UNREAD = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw")  # left out with a line
+PLACED = "models/*/images.bin"  # files of a folder of matches where photographs are placed
+STATES = "states"  # its folder of models that are not finished, from which another call continues
+STEP = 100  # photographs that are placed from one state to the next
 NAMED = 10  # most photographs that a line names
 
 
@@ -127,37 +130,57 @@ def _pairs(count: int) -> list[tuple[int, int]]:
 
 def _models(matcher: Matcher, count: int) -> list[Any]:
     """Reconstructions of the photographs, the largest first; those of a call before, if any. Where
-    that had fewer photographs and one model, the others are registered to it."""
+    that had fewer photographs and one model, the others are registered to it. Where it was
+    interrupted, the largest of its states is continued, unless it is of under half the photographs,
+    since another model may be larger."""
     import pycolmap
 
-    folder = matcher.folder / "models"
+    folder, states = matcher.folder / "models", matcher.folder / STATES
     done = folder / "done.json"
     if not done.is_file() or read_json(done) != count:
         before = [path for path in folder.glob("*") if path.is_dir()]
-        first = before[0] if done.is_file() and len(before) == 1 else None
-        if first is None:
+        if done.is_file() and len(before) == 1:
+            _map(matcher, count, before[0], before[0])
+        else:
             shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir()
-        options = pycolmap.IncrementalPipelineOptions(
-            min_model_size=FEWEST, extract_colors=False, random_seed=0
-        )
-        options.mapper.random_seed = options.triangulation.random_seed = 0
-        placed = iter(range(2, count * options.max_num_models))
-        report("placing photographs", 0, count)
-        pycolmap.incremental_mapping(
-            matcher.database,
-            matcher.folder,
-            first or folder,
-            options=options,
-            input_path=first or "",
-            next_image_callback=lambda: report(
-                "placing photographs", min(next(placed), count), count
-            ),
-        )
+            (folder / "0").mkdir(parents=True)
+            whole = [path for path in states.glob("*") if is_whole_model(path)]
+            state = max(whole, key=image_count, default=None)
+            if state is None or 2 * _map(matcher, count, folder / "0", state) < count:
+                shutil.rmtree(states, ignore_errors=True)
+                shutil.rmtree(folder)
+                folder.mkdir()
+                _map(matcher, count, folder)
         write_json(done, count)
+        shutil.rmtree(states, ignore_errors=True)
     models = [pycolmap.Reconstruction(path) for path in sorted(folder.iterdir()) if path.is_dir()]
     models = [model for model in models if model.num_reg_images() >= FEWEST]
     return sorted(models, key=lambda model: -model.num_reg_images())
+
+
+def _map(matcher: Matcher, count: int, out: Path, first: Path | None = None) -> int:
+    """Reconstruct photographs, or register them to the model `first`, and return how many the
+    largest model has. out: folder of the model, or without `first` of the models."""
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions(
+        min_model_size=FEWEST, extract_colors=False, random_seed=0
+    )
+    options.mapper.random_seed = options.triangulation.random_seed = 0
+    options.snapshot_path, options.snapshot_frames_freq = matcher.folder / STATES, STEP
+    options.snapshot_path.mkdir(exist_ok=True)
+    start = image_count(first) if first else 0
+    placed = iter(range(start + 2, count * options.max_num_models))
+    report("placing photographs", start, count)
+    models = pycolmap.incremental_mapping(
+        matcher.database,
+        matcher.folder,
+        out,
+        options=options,
+        input_path=first or "",
+        next_image_callback=lambda: report("placing photographs", min(next(placed), count), count),
+    )
+    return max((model.num_reg_images() for model in models.values()), default=0)
 
 
 def _reasons(
