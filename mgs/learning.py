@@ -59,12 +59,14 @@ def learn(
     before: State | None = None,
     frames: tuple[Frame, ...] | None = None,
     choices: Sequence[Choice] = (),
+    surface: np.ndarray | None = None,
 ) -> State:
     """Capture the views that are new in `taken`, fit to all of `taken`, and sum their information.
 
     before: the last state, where the fit starts; by default it starts at the prior, and all of
     `taken` are seeds. frames: those of `before`, by default, or as they are before any capture.
-    choices: recorded in the result. Raises DivergedError, and InputError if a frame cannot be read.
+    choices: recorded in the result. surface: `State.surface` after the views in `taken`, if it was
+    measured when they were chosen. Raises DivergedError, and InputError if a frame cannot be read.
     """
     taken = tuple(taken)
     seeds = before.seeds if before else len(taken)
@@ -72,14 +74,16 @@ def learn(
         frames = before.frames if before else scene.frames
     new = taken[len(before.taken) :] if before else taken
     frames = captured(scene, frames, new)
+    read = scene.image if scene.settings.exposure else scene.target
     for i in new:
-        scene.image(frames[i])
+        read(frames[i])
     fit, exposure = fit_views(scene, frames, taken, before)
     if fit.stop_reason == StopReason.DIVERGED:
         raise DivergedError(len(taken) - seeds, fit.losses)
     H = information(scene, fit.gaussians, [frames[i] for i in taken])
     state = State(frames, taken, seeds, fit.gaussians, H, H, fit=fit, exposure=exposure)
-    surface = surface_information(scene, state, new, before)
+    if surface is None or before is None or state.moved != before.moved:
+        surface = surface_information(scene, state, new, before)
     return replace(state, surface=surface, choices=tuple(choices))
 
 
@@ -126,7 +130,8 @@ def surface_information(
     scene: Scene, state: State, new: Sequence[int], before: State | None = None
 ) -> np.ndarray:
     """`State.surface` after new views; it depends on poses and the prior alone."""
-    of_views = [scene.surface(state).information(i) for i in new]
+    surface = scene.surface(state)
+    of_views = (surface.exact(surface.cameras[i]) for i in new)  # not kept: used once
     if before is None:
         return np.zeros((len(scene.prior.points), len(scene.surface_lam))) + sum(of_views)
     return sum(of_views, before.surface)

@@ -13,6 +13,7 @@ from mgs.data.dataset import Dataset, target_of
 from mgs.data.frames import Frame, as_asked
 from mgs.errors import InputError
 from mgs.fit.fitting import Fit, fit_gaussians
+from mgs.fit.objective import Target, as_target
 from mgs.fit.settings import ALPHA_WEIGHT, ModelSettings, TrainSettings
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, KEPT_BYTES, Deferred, kept_within, release
@@ -211,6 +212,14 @@ class Scene:
         return self.start(tuple(state.frames[i] for i in state.taken[: state.seeds]))
 
     @cached_property
+    def target(self) -> Callable[[Frame], Target]:
+        """target(frame) -> target of the scene's fits for the kernels, without a gain."""
+        train = self.settings.train
+        how = train.space == "linear", train.alpha_weight
+        make = lambda frame: as_target(target_of(frame, how[1] > 0), *how)  # noqa: E731
+        return kept_within(IMAGE_BYTES, make, lambda target: target.nbytes)
+
+    @cached_property
     def image(self) -> Callable[[Frame], np.ndarray]:
         """image(frame) -> target of a fit [H,W,4 or 5] (`mgs.data.dataset.target_of`)."""
         alpha = self.settings.train.alpha_weight > 0
@@ -244,7 +253,13 @@ class Scene:
             report(Stage.FIT, done, most)
             self.on_pass(done, most, passing)
 
-        targets, start = self.targets(frames, gains), self.start(tuple(frames))
+        targets: Sequence[Any] = self.targets(frames, gains)
+        own = self.settings.train
+        same = model.linear == (own.space == "linear") and train.alpha_weight == own.alpha_weight
+        if same and gains is None:
+            targets = Deferred(range(len(frames)), lambda k: self.target(frames[k]))
+        start = self.start(tuple(frames))
+        self.memo.pop("views", None)  # they are about the model before
         release(KEPT_BYTES)  # what scores took, and then what the fit took
         fit_ = fit_gaussians(model, cameras, targets, train, on_pass, self.cache, start, lam)
         release(KEPT_BYTES)

@@ -130,13 +130,13 @@ def test_a_prior_need_not_be_better_than_a_pixel_of_the_farthest_views():
 def test_an_exposure_shifts_all_pixels_and_a_highlight_some():
     rng = np.random.default_rng(0)
     model = rng.uniform(0.1, 0.5, (30, 40, 1)) * np.ones(3)
-    whole, weight = np.ones((30, 40), bool), np.ones((30, 40, 1))
+    whole = np.ones((30, 40), bool)
 
     def exposure(factor):
         """Indicator of five views with noise of 10 %, the last one times a factor."""
         images = [model * np.exp(0.1 * rng.normal(size=(30, 40, 1))) for _ in range(5)]
         images[-1] = images[-1] * factor
-        views = [view_indicators(np.dstack([i, weight]), whole, model, FITS) for i in images]
+        views = [view_indicators(i.reshape(-1, 3), whole, model, FITS) for i in images]
         return indicators(views)["exposure"]
 
     limit, highlight = DETECTORS["exposure"].limit, np.ones((30, 40, 1))
@@ -163,15 +163,15 @@ def test_the_margin_is_a_pixel_and_the_size_of_a_gaussian():
 
 def test_a_perfect_render_explains_all_and_a_single_colour_nothing():
     truth = np.random.default_rng(0).uniform(0.2, 0.8, (6, 8, 3)).astype(np.float32)
-    target, mask = np.dstack([truth, np.ones((6, 8), np.float32)]), np.ones((6, 8), bool)
-    flat = view_indicators(target, mask, np.broadcast_to(truth.mean((0, 1)), truth.shape), FITS)
+    colours, mask = truth.reshape(-1, 3), np.ones((6, 8), bool)
+    flat = view_indicators(colours, mask, np.broadcast_to(truth.mean((0, 1)), truth.shape), FITS)
     assert flat.unexplained == pytest.approx(1, abs=1e-6)
     assert flat.error == pytest.approx(truth.std(axis=(0, 1)).mean(), rel=0.05)
     unlike = srgb_from_linear(truth) - srgb_from_linear(truth.mean((0, 1)))
     assert flat.srgb_error == pytest.approx(np.mean(unlike**2), rel=1e-5)
     perfect = ViewIndicators(FITS, 0.0, 0.0, pixels=48)
-    assert view_indicators(target, mask, truth, FITS) == perfect
-    assert view_indicators(target, ~mask, truth, FITS) == ViewIndicators(FITS, 0.0, 0.0)
+    assert view_indicators(colours, mask, truth, FITS) == perfect
+    assert view_indicators(colours[:0], ~mask, truth, FITS) == ViewIndicators(FITS, 0.0, 0.0)
 
 
 def test_drift_is_in_standard_deviations_of_the_prior():

@@ -348,6 +348,17 @@ def test_what_poses_see_is_measured_once(loaded, tmp_path, policy):
     assert not looked
 
 
+def test_the_surface_is_measured_once_in_each_view_taken(loaded, tmp_path):
+    looked = []
+
+    def exact(gaussians, camera):
+        looked.append(camera.key)
+        return tiny.fisher(gaussians, camera)
+
+    state = tiny.run(tmp_path / "run", loaded, parts={"exact": exact}, policy="uniform", batch=2)
+    assert looked == [loaded.frames[i].camera.key for i in state.taken]
+
+
 def flown(loaded, out, policy, **limits):
     """A run of four views: its scene, a function views -> state, its mission and chosen views."""
     taken = tiny.run(out, loaded, budget=4, policy=policy, **limits).taken

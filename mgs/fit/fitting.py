@@ -17,6 +17,7 @@ from mgs.fit.losses import LOSSES, Loss, loss_name
 from mgs.fit.objective import (
     Objective,
     ParameterPrior,
+    Target,
     View,
     filled,
     objective,
@@ -119,7 +120,7 @@ def _step(
 def fit_gaussians(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
-    targets: Sequence[np.ndarray],
+    targets: Sequence[np.ndarray | Target],
     settings: TrainSettings | None = None,
     on_pass: Callable[[int, int, Gaussians], None] | None = None,
     cache: ListCache | None = None,
@@ -134,7 +135,8 @@ def fit_gaussians(
     targets: one per camera (`mgs.data.dataset.target_of`): linear RGB [H,W,3], the rock in front of
         black; or [H,W,4] with a weight per pixel, 1 where its colour is known and 0 where not; or
         [H,W,5] with weight and alpha, required if `settings.alpha_weight` is not 0. They are
-        compared in the space in which the Gaussians are blended (`Gaussians.linear`).
+        compared in the space in which the Gaussians are blended (`Gaussians.linear`). A `Target`
+        made for that space and weight is not copied.
     on_pass(done, most, model): called after each pass, with a model of TensorXf fields.
     start: mean of the prior; by default the given Gaussians.
     lam: the prior's information about each kind of parameter (`mgs.gaussians.learned`), (pixel

@@ -15,7 +15,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mgs import runtime
 from mgs.camera import Camera
+from mgs.colour import srgb_from_linear
 from mgs.errors import InputError, row_named
 from mgs.fit.losses import LOSSES
 from mgs.gaussians import Gaussians, learned
@@ -45,6 +47,11 @@ class Target:
     def __len__(self) -> int:
         """H*W*C, the number of values that are compared."""
         return len(self.values) // self.stored * self.channels
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held, bytes."""
+        return 4 * len(self.values)
 
     @property
     def pixels(self) -> Any:
@@ -82,11 +89,6 @@ class Photo:
     def size(self) -> tuple[int, int, int]:
         """Width, height and number of channels."""
         return self.camera.width, self.camera.height, self.target.channels
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the target, bytes."""
-        return 4 * len(self.target.values)
 
 
 @dataclass
@@ -233,7 +235,7 @@ class Objective:
 def objective(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
-    targets: Sequence[np.ndarray],
+    targets: Sequence[np.ndarray | Target],
     start: Gaussians | None = None,
     lam: Mapping[str, float | np.ndarray] | None = None,
     cache: ListCache | None = None,
@@ -253,7 +255,8 @@ def objective(
     def photo(i: int) -> Photo:
         return _photo(gaussians, cameras[i], targets[i], alpha_weight)
 
-    photos = Deferred(range(len(cameras)), kept_within(IMAGE_BYTES, photo, lambda p: p.nbytes))
+    kept = kept_within(IMAGE_BYTES, photo, lambda p: p.target.nbytes)
+    photos = Deferred(range(len(cameras)), kept)
     start = gaussians if start is None else start
     if start.sh.shape != gaussians.sh.shape:
         raise InputError(
@@ -283,13 +286,24 @@ def filled(values: float | np.ndarray, shape: tuple[int, ...]) -> Any:
     return mi.Float(padded(np.broadcast_to(values, shape).astype(np.float32)).ravel())
 
 
-def _photo(gaussians: Gaussians, camera: Camera, target: np.ndarray, alpha_weight: float) -> Photo:
-    """A `Photo` from a target of a fit, in the space in which the Gaussians are blended."""
-    factor, target = None, np.asarray(target)
-    if target.ndim != 3 or target.shape[:2] != (camera.height, camera.width):
-        size = f"[{camera.height},{camera.width},3 to 5], that of its camera"
-        raise InputError(f"target: has shape {list(target.shape)}, expected {size}")
-    channels = target.shape[-1]
+def _photo(
+    gaussians: Gaussians, camera: Camera, target: np.ndarray | Target, alpha_weight: float
+) -> Photo:
+    """A `Photo` from a target of a fit."""
+    if not isinstance(target, Target):
+        target = np.asarray(target)
+        if target.ndim != 3 or target.shape[:2] != (camera.height, camera.width):
+            size = f"[{camera.height},{camera.width},3 to 5], that of its camera"
+            raise InputError(f"target: has shape {list(target.shape)}, expected {size}")
+        target = as_target(target, gaussians.linear, alpha_weight)
+    return Photo(camera, camera_array(camera), target)
+
+
+def as_target(target: np.ndarray, linear: bool, alpha_weight: float) -> Target:
+    """A target of a fit [H,W,3 to 5] for Gaussians that are blended as linear RGB, or as sRGB.
+    Raises InputError if alpha has a weight and is missing."""
+    runtime.start()
+    factor, channels = None, target.shape[-1]
     if alpha_weight:
         if channels < 5:
             raise InputError(
@@ -297,10 +311,9 @@ def _photo(gaussians: Gaussians, camera: Camera, target: np.ndarray, alpha_weigh
                 "alpha as the last"
             )
         factor = dr.opaque(mi.Float, float(np.sqrt(alpha_weight)))
-    if not gaussians.linear:
-        target = padded(np.dstack([gaussians.blended(target[..., :3]), target[..., 3:]]))
-    values = mi.Float(adopted(target).ravel())
-    return Photo(camera, camera_array(camera), Target(values, factor, channels))
+    if not linear:
+        target = padded(np.dstack([srgb_from_linear(target[..., :3]), target[..., 3:]]))
+    return Target(mi.Float(adopted(target).ravel()), factor, channels)
 
 
 @one_at_a_time

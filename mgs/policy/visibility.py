@@ -6,7 +6,7 @@ from functools import cache, cached_property
 import numpy as np
 
 from mgs.camera import Camera
-from mgs.memory import IMAGE_BYTES, kept_within
+from mgs.memory import VIEW_BYTES, kept_within
 from mgs.policy.criteria import BETTER, Array
 from mgs.policy.directional import Views, dome_cameras, of_points, squared_weights
 from mgs.policy.pool_gains import PoolGains
@@ -28,7 +28,8 @@ WIDTH = 16  # paths that `planned_path` keeps at each step; chosen
 class Visibility:
     """Visibility of the Gaussians on a surface from the cameras of a run and from a dome.
 
-    Each view is measured at its first use, and each result kept.
+    Each view is measured at its first use, and each result kept, that of `exact` only in
+    `information`.
 
     Arguments:
     - cameras: of the run.
@@ -39,7 +40,8 @@ class Visibility:
 
     Attributes:
     - positions: camera centres [V,3], metres.
-    - seen(frame): squared blending weights in one view [N]. information(frame): `exact` of it.
+    - colours(frame): information of one view about the colours of degree 0 [N,3]. seen(frame): its
+      squared blending weights [N]. information(frame): `exact` of it.
     - pool, dome: `Views` of all cameras of the run, and of a dome around the rock.
     - planned(taken, candidates, count, model): at most `count` views to take next, as a set
       (`planned_views`); all candidates where there are no `plan_gains`.
@@ -56,15 +58,17 @@ class Visibility:
         lam: float,
         stands_for: int = 1,
     ) -> None:
-        self.cameras, self.colour, self.stands_for = cameras, colour, stands_for
+        self.cameras, self.exact, self.colour = cameras, exact, colour
+        self.stands_for = stands_for
         self.points, self.centre, self.lam = points, centre, lam
         self.positions = np.array([camera.position for camera in cameras])
+        self.colours = cache(lambda frame: np.array(colour(cameras[frame])[:, :3]))
         self.seen = cache(lambda frame: squared_weights(colour(cameras[frame])))
         self.planned, self.path = cache(self._planned), cache(self._path)
         self.states: dict[Model, PoolGains] = {}
         # A copy, because the kernel returns part of a larger array.
         copied = lambda frame: np.array(exact(cameras[frame]))  # noqa: E731
-        self.information = kept_within(IMAGE_BYTES, copied, lambda F: F.nbytes)
+        self.information = kept_within(VIEW_BYTES, copied, lambda F: F.nbytes)
 
     def gains(self, taken: Sequence[int], candidates: Sequence[int], model: Model) -> Array:
         """Directional gain of each candidate after the views taken [C]. It is fast if the views

@@ -11,6 +11,7 @@ import numpy as np
 
 from mgs.data.frames import Frame
 from mgs.gaussians import Gaussians
+from mgs.prior.exposure import without_gain
 from mgs.run import detectors
 from mgs.run.flight import views_left
 from mgs.run.policies import DIRECTIONAL_D, Policy
@@ -56,15 +57,17 @@ class Checks:
     def views(
         self, model: Gaussians, state: State, some: Sequence[int]
     ) -> list[detectors.ViewIndicators]:
-        views, frames = [], [state.frames[i] for i in state.taken]
-        targets = self.scene.targets(frames, state.exposure)[-len(some) :]
-        for frame, target in zip(frames[-len(some) :], targets, strict=True):
+        views = []
+        for k, view in list(enumerate(state.taken))[-len(some) :]:
+            frame = state.frames[view]
             key = "before fit", state.taken[: state.seeds], frame
-            packed, before = self.scene.once(key, partial(self._before_fit, state, frame))
-            size = target.shape[0] * target.shape[1]
-            mask = np.unpackbits(packed, count=size).astype(bool).reshape(target.shape[:2])
+            packed, truth, before = self.scene.once(key, partial(self._before_fit, state, frame))
             rendered = self.scene.render(model, frame.camera)[0]
-            views.append(detectors.view_indicators(target, mask, rendered, before))
+            bits = np.unpackbits(packed, count=rendered[..., 0].size)
+            counted = bits.astype(bool).reshape(rendered.shape[:2])
+            if state.exposure is not None:
+                truth = without_gain(truth, state.exposure[k])
+            views.append(detectors.view_indicators(truth, counted, rendered, before))
         return views
 
     def prediction(
@@ -117,12 +120,17 @@ class Checks:
         alarms = detectors.alarms(indicators, before[-1] if before else None)
         return {"indicators": indicators} | ({"warnings": alarms} if alarms else {})
 
-    def _before_fit(self, state: State, frame: Frame) -> tuple[np.ndarray, detectors.Before]:
-        """Mask of a frame taken, one bit a pixel, and its indicators before any training."""
+    def _before_fit(
+        self, state: State, frame: Frame
+    ) -> tuple[np.ndarray, np.ndarray, detectors.Before]:
+        """Pixels of a frame taken that are compared, one bit each; their colours [M,3], linear RGB;
+        and the frame's indicators before any training."""
         start = self.scene.untrained(state)
         mask, margin = frame.mask(), detectors.outline_margin(start, frame.camera)
-        alpha = self.scene.render(start, frame.camera)[1]
-        return np.packbits(mask), detectors.before_fit(mask, alpha, margin)
+        alpha, (rgba, weight) = self.scene.render(start, frame.camera)[1], frame.target()
+        counted = mask & (weight > 0)
+        before = detectors.before_fit(mask, alpha, margin)
+        return np.packbits(counted), rgba[..., :3][counted], before
 
 
 def predicted_psnr(entries: Sequence[Mapping[str, float]]) -> float | None:

@@ -84,16 +84,15 @@ def outline_margin(start: Gaussians, camera: Camera) -> int:
 
 
 def view_indicators(
-    target: np.ndarray, mask: np.ndarray, rendered: np.ndarray, before: Before
+    truth: np.ndarray, counted: np.ndarray, rendered: np.ndarray, before: Before
 ) -> ViewIndicators:
     """Compare a fitted view with a render of the model.
 
-    target: [H,W,4 or more], colour and weight (`mgs.data.dataset.target_of`). mask: bool [H,W].
+    counted: bool [H,W], the M pixels that are compared. truth: their colours [M,3], linear RGB.
     rendered: [H,W,3] linear RGB."""
-    counted = mask & (target[..., 3] > 0)
     if not counted.any():
         return ViewIndicators(before, 0.0, 0.0)
-    truth, image = target[counted][:, :3].astype(np.float64), rendered[counted].astype(np.float64)
+    truth, image = truth.astype(np.float64), rendered[counted].astype(np.float64)
     squared, variance = float(np.mean((truth - image) ** 2)), float(truth.var(axis=0).mean())
     brightness = np.log(truth.mean(axis=1) + DARK) - np.log(image.mean(axis=1) + DARK)
     ratios = tuple(np.quantile(brightness, RATIO_QUANTILES).tolist())

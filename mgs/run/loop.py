@@ -40,7 +40,7 @@ def select_views(
         if any(frames[i].given_up for i in planned.taken):
             yield (state := replace(state, frames=frames))  # choose again without it
             continue
-        state = learn(scene, planned.taken, state, frames, choices)
+        state = learn(scene, planned.taken, state, frames, choices, planned.surface)
         yield state
 
 

@@ -126,13 +126,13 @@ class Coverage:
     needs_fit: ClassVar[bool] = False
 
     def __call__(self, scene: Scene, state: State, views: list[int]) -> np.ndarray:
-        F, H, lam = scene.surface(state).information, state.surface, scene.surface_lam
+        F, H, lam = scene.surface(state).colours, state.surface[:, :3], scene.surface_lam[:3]
         return each(views, lambda i: criteria.coverage_greedy(F(i), H, lam))
 
     def relaxation(self, scene: Scene, state: State, views: Sequence[int]) -> relaxed.Coverage:
         surface, lam = scene.surface(state), scene.surface_lam
         rest = ~criteria.observed(state.surface, lam)
-        F = np.stack([surface.information(i)[rest, :3] for i in views])
+        F = np.stack([surface.colours(i)[rest] for i in views])
         return relaxed.Coverage(F, state.surface[rest, :3], lam[:3])
 
 
