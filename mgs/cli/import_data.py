@@ -77,6 +77,7 @@ def import_data(
       points that pictures share; for poses that are a little wrong. Needs texture.
     - test_split: Split of NeRF-synthetic data that becomes the test views; publications take test.
     """
+    options = {name: str(value) for name, value in locals().items() if name != "force"}
     from mgs.cli.nbv import moves_in_words
     from mgs.data.agreement import agreement
     from mgs.data.bags import is_bag
@@ -88,7 +89,6 @@ def import_data(
     from mgs.data.sources import read_source
     from mgs.data.structure import CLOUD, Matcher, lacks_points, refined
 
-    options = {name: str(value) for name, value in locals().items() if name != "force"}
     console, notes = Terminal(), Terminal(stderr=True)
     if masks is not None and mesh is not None:
         raise InputError("import: --masks and --mesh both give masks; give one of them")
