@@ -249,10 +249,6 @@ class Scene:
         lam = self.settings.lam_by_kind(self.groups)
         cameras = [frame.camera for frame in frames]
 
-        def on_pass(done: int, most: int, passing: Gaussians) -> None:
-            report(Stage.FIT, done, most)
-            self.on_pass(done, most, passing)
-
         targets: Sequence[Any] = self.targets(frames, gains)
         own = self.settings.train
         same = model.linear == (own.space == "linear") and train.alpha_weight == own.alpha_weight
@@ -261,7 +257,11 @@ class Scene:
         start = self.start(tuple(frames))
         self.memo.pop("views", None)  # they are about the model before
         release(KEPT_BYTES)  # what scores took, and then what the fit took
-        fit_ = fit_gaussians(model, cameras, targets, train, on_pass, self.cache, start, lam)
+        steps = train.passes * len(frames)
+        fit_ = fit_gaussians(
+            *(model, cameras, targets, train, self.on_pass, self.cache, start, lam),
+            on_step=lambda done: report(Stage.FIT, done, steps),
+        )
         release(KEPT_BYTES)
         return fit_
 

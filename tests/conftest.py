@@ -152,9 +152,9 @@ def short_fits(monkeypatch):
 
     fit = scene.fit_gaussians
 
-    def short(gaussians, cameras, targets, train, *rest):
+    def short(gaussians, cameras, targets, train, *rest, **how):
         few = train.model_copy(update={"passes": min(train.passes, 2)})
-        return fit(gaussians, cameras, targets, few, *rest)
+        return fit(gaussians, cameras, targets, few, *rest, **how)
 
     monkeypatch.setattr(scene, "fit_gaussians", short)
 

@@ -58,7 +58,8 @@ def test_a_fit_shows_a_view_before_its_end(dataset, run, tmp_path, capsys, monke
     decibels = [float(number) for number in re.findall(r"pass \d of 5: ([\d.]+) dB", printed)]
     assert decibels[0] < decibels[1]
     assert (out / f"renders/{load_dataset(dataset).frames[0].name}.png").is_file()
-    assert "fitting: 3 of 5" in lines
+    assert "fitting: 7 of 50" in lines  # steps: within a pass, too
+    assert "fitting: 30 of 50" in lines
     command("dataset", "check", dataset)
     assert "reading: 3 of 10" in said(capsys)[1]
 
@@ -69,10 +70,10 @@ def test_interrupted_in_the_middle_of_a_step_then_resumed(
     """Between two passes of the fit of its third step."""
     out, fit, fits = tmp_path / "run", scene.fit_gaussians, []
 
-    def interrupted(gaussians, cameras, targets, settings, on_pass, *rest):
+    def interrupted(gaussians, cameras, targets, settings, on_pass, *rest, **how):
         fits.append(len(cameras))
         on_pass = stop_at(2) if len(fits) == 3 else on_pass
-        return fit(gaussians, cameras, targets, settings, on_pass, *rest)
+        return fit(gaussians, cameras, targets, settings, on_pass, *rest, **how)
 
     with monkeypatch.context() as patched:
         patched.setattr(scene, "fit_gaussians", interrupted)

@@ -99,9 +99,9 @@ def test_a_fit_does_not_hold_the_information_about_the_model_before(rock, monkey
     prior = build_prior(rock, PriorSettings(gaussians=300), source="hull")
     whole, held, fit = scene.Scene(rock, prior, keep=VIEW_BYTES), [], scene.fit_gaussians
 
-    def watched(*arguments):
+    def watched(*arguments, **how):
         held.append("views" in whole.memo)
-        return fit(*arguments)
+        return fit(*arguments, **how)
 
     monkeypatch.setattr(scene, "fit_gaussians", watched)
     state = mgs.learn(whole, whole.seeds(3))

@@ -128,6 +128,7 @@ def fit_gaussians(
     lam: Mapping[str, float | np.ndarray] | None = None,
     learns: Mapping[str, np.ndarray] | None = None,
     loss: Loss | None = None,
+    on_step: Callable[[int], None] = lambda done: None,
 ) -> Fit:
     """Fit Gaussians to images by lowering Phi (`mgs.fit.objective`). The result depends on the
     arguments alone, bitwise.
@@ -148,6 +149,7 @@ def fit_gaussians(
     loss: a function in place of `settings.loss` (`mgs.fit.losses.Loss`): loss(drawn, pixels,
         weights, size, linear) of Dr.Jit arrays, which differentiates it. It is recorded once, so it
         must depend on its arguments alone.
+    on_step(done): called after each step, of one image.
 
     Raises InputError if a parameter is not finite, optimiser or loss are unknown, `start` has
     another shape, means are to move without a rate, or a required alpha is missing.
@@ -195,7 +197,7 @@ def fit_gaussians(
         order = rng.permutation(len(goal.photos))
         learning = buffers, information, rates, slopes
         model, buffers, mean, slopes = _pass(
-            goal, settings.optimiser, model, order, *learning, done * len(order)
+            goal, settings.optimiser, model, order, *learning, done * len(order), on_step
         )
         if mean <= min(losses[1:], default=np.inf):  # false for NaN
             best = model
@@ -252,6 +254,7 @@ def _pass(
     rates: list[Any],
     slopes: list[Any],
     t: int,
+    on_step: Callable[[int], None],
 ) -> tuple[Gaussians, list[list[Any]], float, list[Any]]:
     """One step on each image in this order, after t steps. Returns the model, the buffers, the mean
     loss of the steps, NaN if a parameter is no longer finite, which cannot be rendered, and the
@@ -269,6 +272,7 @@ def _pass(
         arguments = view, buffers, rates, count, information, slopes
         model, buffers, loss, slopes = _step(optimiser, goal.error, model, goal.prior, *arguments)
         losses.append(loss)
+        on_step(t)
     finite = _is_finite(model)
     mean = float(np.mean([float(loss[0]) for loss in losses])) if finite else float("nan")
     return model, buffers, mean, slopes
