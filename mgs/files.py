@@ -218,6 +218,14 @@ def read_json(path: str | Path) -> Any:
     return _parsed(path, "JSON", lambda data: json.loads(data.decode(json.detect_encoding(data))))
 
 
+def read_leftover(path: Path) -> Any:
+    """Read JSON that a process left in a folder of its own. None where it is missing or damaged."""
+    try:
+        return read_json(path) if path.is_file() else None
+    except InputError:
+        return None
+
+
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Contents of a TOML file. Raises InputError if it is missing, unreadable or not valid TOML."""
 
@@ -394,10 +402,10 @@ def _is_lock(path: Path, or_empty: bool = False) -> bool:
 def scratch_folder(path: str | Path, resumable: str = "") -> Iterator[Path]:
     """Context manager: a folder for temporary files, removed after the block with all its contents.
 
-    What a killed process left in it is removed first. resumable: pattern of files for which it is
-    not. An interrupted block leaves it; one that refuses its input does if the folder has such a
-    file, or had anything before. Raises InputError if a folder of this name is there that mgs did
-    not make, or that another process uses."""
+    resumable: pattern of files worth keeping. Empty: the folder is cleared before and after. Else
+    an interruption keeps it, and a refused input does where it holds such a file or was not empty.
+    Raises InputError if a folder of this name is there that mgs did not make, or that another
+    process uses."""
     path = Path(path)
     check_leftover(path)
     ended = True

@@ -108,7 +108,7 @@ def refine_poses(scene: Scene, noise: PoseNoise) -> tuple[Frame, ...]:
         report("refining poses", k, ROUNDS)
         model, old = fit.gaussians, start
         cameras = [frame.camera for frame in frames]
-        targets, weight = scene.targets(frames, gains), train.alpha_weight
+        targets, weight = scene.targets_for(model, frames, gains, train), train.alpha_weight
         goal = objective(model, cameras, targets, cache=scene.cache, alpha_weight=weight)
         moved = pose_steps(goal, as_drjit(model), poses, variance / std**2)
         std = motion_std(poses, moved, most)

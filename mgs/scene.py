@@ -235,6 +235,20 @@ class Scene:
 
         return Deferred(range(len(frames)), target)
 
+    def targets_for(
+        self,
+        model: Gaussians,
+        frames: Sequence[Frame],
+        gains: np.ndarray | None,
+        train: TrainSettings,
+    ) -> Sequence[np.ndarray | Target]:
+        """`targets` as the kernels take them, which are kept, where all fits can share them."""
+        own = self.settings.train
+        same = model.linear == (own.space == "linear") and train.alpha_weight == own.alpha_weight
+        if gains is not None or not same:
+            return self.targets(frames, gains)
+        return Deferred(range(len(frames)), lambda k: self.target(frames[k]))
+
     def fitted(
         self,
         model: Gaussians,
@@ -249,11 +263,7 @@ class Scene:
         lam = self.settings.lam_by_kind(self.groups)
         cameras = [frame.camera for frame in frames]
 
-        targets: Sequence[Any] = self.targets(frames, gains)
-        own = self.settings.train
-        same = model.linear == (own.space == "linear") and train.alpha_weight == own.alpha_weight
-        if same and gains is None:
-            targets = Deferred(range(len(frames)), lambda k: self.target(frames[k]))
+        targets = self.targets_for(model, frames, gains, train)
         start = self.start(tuple(frames))
         self.memo.pop("views", None)  # they are about the model before
         release(KEPT_BYTES)  # what scores took, and then what the fit took

@@ -19,7 +19,16 @@ from refusals import fails
 from mgs import InputError, files
 from mgs.colour import linear_from_srgb
 from mgs.data.meshes import load_mesh
-from mgs.files import TOKEN, atomic_folder, atomic_path, copy_file, locked, read_json, write_json
+from mgs.files import (
+    TOKEN,
+    atomic_folder,
+    atomic_path,
+    copy_file,
+    locked,
+    read_json,
+    read_leftover,
+    write_json,
+)
 from mgs.images import read_exr, read_mask, read_png, read_rgba, read_values, write_exr, write_png
 from studies.frame.output import write_csv
 
@@ -102,6 +111,13 @@ def test_what_is_no_json_is_not_written(tmp_path, value):
         write_json(tmp_path / "a.json", {"a": [value]})
     assert read_json(tmp_path / "a.json") == {"a": 1}
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_damaged_leftover_counts_as_none(tmp_path):
+    assert read_leftover(tmp_path / "a.json") is None
+    for text, found in (("{", None), ("[1]", [1])):
+        (tmp_path / "a.json").write_text(text)
+        assert read_leftover(tmp_path / "a.json") == found
 
 
 @pytest.mark.parametrize("there", [False, True])

@@ -376,24 +376,26 @@ def outside(tmp_path):
 
 
 SITES = {
-    "no list of copies": lambda site, _: (site / "copies.json").write_text("5"),
-    "a copy elsewhere": lambda site, _: (site / "copies.json").write_text('["../../outside/a"]'),
-    "no name of a file": lambda site, _: (site / "copies.json").write_text('["a\\u0000"]'),
-    "a file for copies": lambda site, _: (site / "photographs").touch(),
-    "a link for copies": lambda site, outside: (site / "photographs").symlink_to(outside),
-    "a link for matches": lambda site, outside: (site / "matches").symlink_to(outside),
-    "another's folder": lambda site, _: (site / "copies.json").rename(site / "a"),
+    "not a readable list": lambda site, _: (site / "copies.json").write_text("5"),
+    "is not in|leads out of": lambda site, _: (site / "copies.json").write_text(
+        '["../../outside/a"]'
+    ),
+    "cannot be written.*null": lambda site, _: (site / "copies.json").write_text('["a\\u0000"]'),
+    "cannot be written": lambda site, _: (site / "photographs").touch(),
+    "photographs: leads out of": lambda site, outside: (site / "photographs").symlink_to(outside),
+    "matches: leads out of": lambda site, outside: (site / "matches").symlink_to(outside),
+    "is in the way": lambda site, _: (site / "copies.json").rename(site / "a"),
 }
-"""Damage of the folder beside photographs in which `mgs suggest` places them."""
+"""Damage of the folder beside photographs in which `mgs suggest` places them, by its message."""
 
 
-@pytest.mark.parametrize("damage", SITES)
-def test_the_site_of_a_stranger(outside, dataset, tmp_path, damage):
+@pytest.mark.parametrize("words", SITES)
+def test_the_site_of_a_stranger(outside, dataset, tmp_path, words):
     site = tmp_path / "images.site"
     site.mkdir()
     (site / "copies.json").write_text("[]")
-    SITES[damage](site, outside)
-    fails("", dataset_at, dataset / "images", site)
+    SITES[words](site, outside)
+    fails(words, dataset_at, dataset / "images", site)
 
 
 def test_nothing_below_a_locked_folder_is_written_through_a_link(outside, tmp_path):

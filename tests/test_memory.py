@@ -19,6 +19,7 @@ from mgs.data.meshes import read_mesh
 from mgs.data.sources import read_source
 from mgs.fit import objective
 from mgs.memory import PADDING, VIEW_BYTES, adopted, kept_within, padded
+from mgs.run import checks
 
 
 def test_results_are_kept_within_the_budget():
@@ -70,25 +71,32 @@ def rock(tmp_path_factory):
 def test_a_run_holds_few_images_at_once_and_finds_the_same(rock, tmp_path, monkeypatch, exposure):
     """Without gains, which change at every fit, a run keeps targets alone, not their images."""
     live, target, target_of = Live(), Frame.target, scene.target_of
+    colours, compared = Live(), checks._compared
 
     def watched(frame):
         rgba, weight = target(frame)
         return live.watch(rgba), weight
 
+    def watched_colours(frame):
+        bits, truth = compared(frame)
+        return bits, colours.watch(truth)
+
     monkeypatch.setattr(Frame, "target", watched)
+    monkeypatch.setattr(checks, "_compared", watched_colours)
     monkeypatch.setattr(scene, "target_of", lambda *frame: live.watch(target_of(*frame)))
     found, most = [], []
     for name, budget in (("kept", 1 << 30), ("read again", 0)):
-        for module in (scene, objective, evaluation):
+        for module in (scene, objective, evaluation, checks):
             monkeypatch.setattr(module, "IMAGE_BYTES", budget)
         gc.collect()
-        live.now = live.most = 0
+        live.now = live.most = colours.now = colours.most = 0
         settings = {"policy": "uniform", "seeds": 6, "budget": 3, "evaluate_every": 1}
         settings |= {"exposure": exposure, "train": {"passes": 2}, "warm_passes": 1}
         found.append(run_nbv(rock.root, tmp_path / name, **settings).state)
         most.append(live.most)
     assert (most[0] >= 9) == exposure  # all images that were taken are counted
     assert max(most[exposure:]) <= 4
+    assert colours.most <= 2
     kept, again = found
     assert np.array_equal(kept.gaussians.sh, again.gaussians.sh)
     assert np.array_equal(kept.H, again.H)

@@ -210,7 +210,7 @@ def test_a_run_is_refitted_beside_its_model(run, capsys):
     assert found.lean.parameters == parameters
     assert found.before == 4400
     own, whole, lean = found.psnr
-    assert lean > whole - LEARN_LOSS - 0.25  # on processors of 8 lanes by 0.14
+    assert lean > whole - LEARN_LOSS - 0.15  # on processors of 8 lanes by 0.14
     assert f"{lean:.2f} dB, {whole:.2f} dB where all" in said
     assert f"own model {own:.2f} dB" in said
 

@@ -287,7 +287,7 @@ def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, capsys, monke
     assert not (tmp_path / "d.unpacked").exists()
     words = [sys.executable, "-m", "mgs", "import", root, "--out", out]  # also in another process
     done = subprocess.run(words, capture_output=True, text=True)
-    assert done.stdout == f"{out} is finished already\n"
+    assert done.stdout == f"{out} is finished already; --force makes it again\n"
 
 
 def test_placing_continues_from_its_largest_whole_state(frames, tmp_path, monkeypatch):

@@ -99,7 +99,7 @@ def import_data(
     files = [*photographs_in(images or source), *(path for path in (source, mesh) if path)]
     request = _request(options, files)
     if not force and request == _requested(out):
-        console.print(f"{out} is finished already", soft_wrap=True)
+        console.print(f"{out} is finished already; --force makes it again", soft_wrap=True)
         return
     unpacked = out.with_name(f"{out.name}.unpacked")
     with (
@@ -167,7 +167,7 @@ def import_data(
 
 def _request(options: dict[str, str], files: Sequence[Path]) -> str:
     """SHA-256 of an import's options and of its files' paths and times of modification."""
-    about = [(str(path.resolve()), path.stat().st_mtime_ns) for path in files if path.exists()]
+    about = [(str(path.resolve()), path.stat().st_mtime_ns) for path in files if path.is_file()]
     return hashlib.sha256(json.dumps([options, about]).encode()).hexdigest()
 
 

@@ -19,7 +19,7 @@ from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, Spacing, frame_name, 
 from mgs.data.structure import Matcher
 from mgs.data.world import PLUS_Z
 from mgs.errors import InputError, Notice
-from mgs.files import read_json, write_json
+from mgs.files import read_leftover, write_json
 from mgs.images import exif_orientation, read_rgba, write_png
 from mgs.progress import report
 
@@ -137,7 +137,7 @@ def _models(matcher: Matcher, count: int) -> list[Any]:
 
     folder, states = matcher.folder / "models", matcher.folder / STATES
     done = folder / "done.json"
-    if not done.is_file() or read_json(done) != count:
+    if read_leftover(done) != count:
         before = [path for path in folder.glob("*") if path.is_dir()]
         if done.is_file() and len(before) == 1:
             _map(matcher, count, before[0], before[0])
@@ -299,7 +299,7 @@ def sharpest_frames(video: Path, folder: Path, spacing: Spacing) -> list[Path]:
         raise InputError(f"{video}: a video has no distances; give keyframes in seconds, as 0.5s")
     about = [str(video.resolve()), video.stat().st_mtime_ns, spacing.least]
     record = folder / "video.json"
-    if record.is_file() and read_json(record) == about:
+    if read_leftover(record) == about:
         return sorted(folder.glob("*.png"))
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("*.png"):

@@ -17,7 +17,7 @@ from mgs.data.clouds import SparseCloud
 from mgs.data.dataset import FILES, TEST_FOLDER, Dataset, load_dataset, write_transforms
 from mgs.data.frames import Frame, moves
 from mgs.data.lens import Lens
-from mgs.files import below, copy_file, read_json, write_json
+from mgs.files import below, copy_file, read_leftover, write_json
 from mgs.images import exif_orientation, unlimited_headers
 from mgs.progress import report
 
@@ -56,7 +56,7 @@ class Matcher:
             for path, lens in zip(pictures, lenses, strict=True)
         ]
         record = folder / "pictures.json"
-        before = read_json(record) if record.is_file() else []
+        before = read_leftover(record)
         if not isinstance(before, list) or any(picture not in about for picture in before):
             before = []
         order = [*before, *(picture for picture in about if picture not in before)]

@@ -45,7 +45,7 @@ def solve_gains(colours: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def without_gain(target: np.ndarray, gain: np.ndarray) -> np.ndarray:
-    """A target [H,W,C] (`target_of`) with its colours divided by the gains [3]; float32."""
+    """A target [...,C] (`target_of`) with its colours divided by the gains [3]; float32."""
     return target / np.append(gain, np.ones(target.shape[-1] - 3)).astype(np.float32)
 
 

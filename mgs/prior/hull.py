@@ -75,7 +75,7 @@ def _carved(frames: Sequence[Frame]) -> Surface:
     views = [_view(frame) for frame in frames]
     lo, edge = _bounds(frames)
     cell, best = edge / (COARSE * 2**REFINEMENTS), -1.0
-    for wrong in (0.0, FEW):
+    for wrong in (0.0, FEW) if FEW * len(views) >= 1 else (0.0,):
         field = _field(views, lo, edge, wrong)
         if field.max() <= 0:
             what = "the masks share no point in space"

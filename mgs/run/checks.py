@@ -1,9 +1,9 @@
 """Entries of steps.jsonl that compare renders with images."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from mgs.data.frames import Frame
 from mgs.gaussians import Gaussians
+from mgs.memory import IMAGE_BYTES, kept_within
 from mgs.prior.exposure import without_gain
 from mgs.run import detectors
 from mgs.run.flight import views_left
@@ -61,7 +62,8 @@ class Checks:
         for k, view in list(enumerate(state.taken))[-len(some) :]:
             frame = state.frames[view]
             key = "before fit", state.taken[: state.seeds], frame
-            packed, truth, before = self.scene.once(key, partial(self._before_fit, state, frame))
+            before = self.scene.once(key, partial(self._before_fit, state, frame))
+            packed, truth = self.compared(frame)
             rendered = self.scene.render(model, frame.camera)[0]
             bits = np.unpackbits(packed, count=rendered[..., 0].size)
             counted = bits.astype(bool).reshape(rendered.shape[:2])
@@ -120,17 +122,25 @@ class Checks:
         alarms = detectors.alarms(indicators, before[-1] if before else None)
         return {"indicators": indicators} | ({"warnings": alarms} if alarms else {})
 
-    def _before_fit(
-        self, state: State, frame: Frame
-    ) -> tuple[np.ndarray, np.ndarray, detectors.Before]:
-        """Pixels of a frame taken that are compared, one bit each; their colours [M,3], linear RGB;
-        and the frame's indicators before any training."""
+    def _before_fit(self, state: State, frame: Frame) -> detectors.Before:
+        """Indicators of a frame taken before any training."""
         start = self.scene.untrained(state)
-        mask, margin = frame.mask(), detectors.outline_margin(start, frame.camera)
-        alpha, (rgba, weight) = self.scene.render(start, frame.camera)[1], frame.target()
-        counted = mask & (weight > 0)
-        before = detectors.before_fit(mask, alpha, margin)
-        return np.packbits(counted), rgba[..., :3][counted], before
+        margin = detectors.outline_margin(start, frame.camera)
+        alpha = self.scene.render(start, frame.camera)[1]
+        return detectors.before_fit(frame.mask(), alpha, margin)
+
+    @cached_property
+    def compared(self) -> Callable[[Frame], tuple[np.ndarray, np.ndarray]]:
+        """compared(frame) -> `_compared`, kept within IMAGE_BYTES."""
+        return kept_within(IMAGE_BYTES, _compared, lambda parts: sum(p.nbytes for p in parts))
+
+
+def _compared(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels of a frame taken that are compared, one bit each, and their colours [M,3], linear
+    RGB."""
+    rgba, weight = frame.target()
+    counted = frame.mask() & (weight > 0)
+    return np.packbits(counted), rgba[..., :3][counted]
 
 
 def predicted_psnr(entries: Sequence[Mapping[str, float]]) -> float | None:
