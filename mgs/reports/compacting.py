@@ -91,10 +91,9 @@ def refitting(run: Run) -> Callable[[Gaussians], Gaussians]:
 
     scene, frames = Scene(run.dataset, run.prior, run.settings), run.taken
     gains = scene.measured_exposure(frames) if run.settings.exposure else None
-    lam = run.settings.lam_by_kind(scene.groups)
+    targets, lam = scene.targets(frames, gains), run.settings.lam_by_kind(scene.groups)
     rates = {kind: AGAIN * rate for kind, rate in run.settings.train.rates.items()}
     train = run.settings.train.model_copy(update={"density": "fixed", "rates": rates})
-    targets = scene.targets_for(run.gaussians, frames, gains, train)
     given = [frame.camera for frame in frames], targets, train
     return lambda g: fit_gaussians(g, *given, cache=scene.cache, lam=lam).gaussians
 
