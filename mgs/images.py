@@ -75,8 +75,8 @@ def check_pixels(path: Path, width: int, height: int, pixel_bytes: int = DECODED
 
 @contextmanager
 def unlimited_headers() -> Iterator[None]:
-    """Context manager in which Pillow opens images of any size, for `check_pixels` to judge. From
-    then on it reads no PostScript, which it would run, whatever the name of the file."""
+    """Context manager in which Pillow opens images of any size, for `check_pixels` to judge. It
+    also switches off Ghostscript, to which Pillow would give a PostScript file of any name."""
     from PIL import EpsImagePlugin, Image
 
     EpsImagePlugin.gs_binary = False

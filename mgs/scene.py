@@ -242,7 +242,8 @@ class Scene:
         gains: np.ndarray | None,
         train: TrainSettings,
     ) -> Sequence[np.ndarray | Target]:
-        """`targets` as the kernels take them, which are kept, where all fits can share them."""
+        """`targets` of a fit of a model. Those of `target`, which fits share, where there are no
+        gains, and model and settings are blended and weighted as the scene's."""
         own = self.settings.train
         same = model.linear == (own.space == "linear") and train.alpha_weight == own.alpha_weight
         if gains is not None or not same:
