@@ -1,8 +1,9 @@
 """Every study of the pages, one after another: `python -m studies.all OUT` (`make results`).
 
-Each works in its own folder of OUT, and a rerun continues. What docs/results shows of a study is
-replaced when the study is done; pages take their tables from there when the site is built. With
---quick, two studies run for one rock, and their rows are compared with those of docs/results.
+Studies of a scale share a folder of OUT, so a dataset is made once, and a rerun continues. What
+docs/results shows of a study is replaced when the study is done; pages take their tables from there
+when the site is built. With --quick, two studies run for one rock, and their rows are compared with
+those of docs/results.
 """
 
 import shutil
@@ -51,15 +52,16 @@ def run(out: Path, quick: bool) -> int:
     """Run the stages; return the exit code of the first that fails, or of the comparison."""
     code = 0
     for name, (study, *arguments) in (QUICK if quick else STAGES).items():
-        command = [sys.executable, "-m", f"studies.{study}", str(out / name), *arguments]
-        print(f"python -m studies.{study} {out / name} {' '.join(arguments)}", flush=True)
+        folder = out / ("paper" if "paper" in arguments else "quick")
+        command = [sys.executable, "-m", f"studies.{study}", str(folder), *arguments]
+        print(f"python -m studies.{study} {folder} {' '.join(arguments)}", flush=True)
         if failed := subprocess.run(command, check=False).returncode:
             return failed
         if not quick:
             for path in sorted((RESULTS / name).iterdir()):
-                shutil.copyfile(out / name / path.name, path)  # only files that docs/results has
+                shutil.copyfile(folder / path.name, path)  # only files that docs/results has
             continue
-        rows, differences = compared(out / name / f"{study}.csv", RESULTS / name / f"{study}.csv")
+        rows, differences = compared(folder / f"{study}.csv", RESULTS / name / f"{study}.csv")
         print(f"{rows} rows in docs/results, largest difference {max(differences, default=0):.2g}")
         code |= not rows or max(differences, default=0) > ENOUGH
     return code

@@ -210,7 +210,8 @@ def cells_of(
         for policy in size.policies if policies is None else policies:
             shown = shown_as(policy)
             version = "".join(f"-{digest[:8]}" for digest in policy_record(policy).values())
-            where = f"{rock.name}/{name.replace(' ', '-')}-{size.width}x{size.height}"
+            shape = f"{size.images}x{size.width}x{size.height}"
+            where = f"{rock.name}/{name.replace(' ', '-')}-{shape}"
             about = {"rock": rock.name, "scene": rock.scene, "setup": name, "policy": shown}
             for draw in range(size.draws if policy == RANDOM else 1):
                 settings = common | {"policy": policy, "seed": rock.index + 1000 * draw}
