@@ -2,8 +2,8 @@
 
 Studies of a scale share a folder of OUT, so a dataset is made once, and a rerun continues. What
 docs/results shows of a study is replaced when the study is done; pages take their tables from there
-when the site is built. With --quick, two studies run for one rock, and their rows are compared with
-those of docs/results.
+when the site is built. With --quick, the studies of many rocks run for one, and their rows are
+compared with those of docs/results.
 """
 
 import shutil
@@ -11,6 +11,7 @@ import subprocess
 import sys
 from argparse import ArgumentParser
 from collections.abc import Sequence
+from math import inf
 from pathlib import Path
 
 from studies.frame.output import read_rows
@@ -41,7 +42,12 @@ STAGES = {
 """Studies and their arguments by folder. Three need programs or data of others and are run by hand:
 `studies.rate`, `studies.blender` and `studies.photographs`."""
 
-QUICK = {name: (name, "--rocks", "1") for name in ("fits", "certificate")}
+QUICK = {
+    name: (*arguments[: arguments.index("--rocks") + 1], "1")
+    for name, arguments in STAGES.items()
+    if "--rocks" in arguments and name not in ("setups-8", "oracle")
+}
+"""Each study of many rocks, for the first alone; setups-8 repeats setups with fewer images."""
 
 ENOUGH = 0.05
 """Largest difference of a number, in its unit. Processors of another type round differently: with 8
@@ -61,35 +67,37 @@ def run(out: Path, quick: bool) -> int:
             for path in sorted((RESULTS / name).iterdir()):
                 shutil.copyfile(folder / path.name, path)  # only files that docs/results has
             continue
-        rows, differences = compared(folder / f"{study}.csv", RESULTS / name / f"{study}.csv")
-        print(f"{rows} rows in docs/results, largest difference {max(differences, default=0):.2g}")
-        code |= not rows or max(differences, default=0) > ENOUGH
+        rows, usual = compared(folder / f"{study}.csv", RESULTS / name / f"{study}.csv")
+        differences = [difference(*pair) for pair in zip(rows, usual, strict=False)]
+        print(f"{len(rows)} of {len(usual)} rows, largest difference {max(differences):.2g}")
+        code |= len(rows) != len(usual) or max(differences) > ENOUGH
     return code
 
 
-def compared(path: Path, usual: Path) -> tuple[int, list[float]]:
-    """Count the rows that two files share (`words`); list the differences of their numbers."""
-    others = {words(row): row for row in read_rows(usual)}
-    pairs = [(row, others[words(row)]) for row in read_rows(path) if words(row) in others]
-    return len(pairs), [
-        abs(value - other[key])
-        for row, other in pairs
-        for key, value in row.items()
-        if isinstance(value, float) and other[key] is not None
-    ]
+def compared(path: Path, usual: Path) -> tuple[list[Row], list[Row]]:
+    """Rows of a file, and those of another that are of the same rocks."""
+    rows = read_rows(path)
+    rocks = {row["rock"] for row in rows}
+    return rows, [row for row in read_rows(usual) if row["rock"] in rocks]
 
 
-def words(row: Row) -> frozenset[tuple[str, object]]:
-    """Words and whole numbers of a row, which name it, without its origin."""
-    origin = ("command", "commit")
-    return frozenset((k, v) for k, v in row.items() if isinstance(v, str | int) and k not in origin)
+def difference(row: Row, usual: Row) -> float:
+    """Largest difference of two rows' numbers, without seconds; infinite where words differ."""
+    largest = 0.0
+    for key in (row.keys() | usual.keys()) - {"command", "commit", "seconds"}:
+        one, other = row.get(key), usual.get(key)
+        if isinstance(one, float) and isinstance(other, float):
+            largest = max(largest, abs(one - other))
+        elif one != other:
+            return inf
+    return largest
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the program; return its exit code."""
     parser = ArgumentParser(prog="python -m studies.all", description=__doc__)
     parser.add_argument("out", type=Path, help="Folder of all studies; run again to continue.")
-    parser.add_argument("--quick", action="store_true", help="One rock, compared; minutes.")
+    parser.add_argument("--quick", action="store_true", help="One rock, compared; half an hour.")
     options = parser.parse_args(arguments)
     return run(options.out, options.quick)
 
