@@ -13,7 +13,7 @@ from mgs.cli.terminal import Terminal
 from mgs.errors import InputError
 from mgs.files import check_new_folder, check_writable, read_json
 
-POLICIES = ("directional-i", "paper", "d-optimal", "cover", "random")
+POLICIES = ("directional-i", "paper", "random")
 
 TEST_VIEWS = 12
 
@@ -25,7 +25,7 @@ BUDGET = 8  # views beyond the four seeds, the same for every policy
 
 
 def demo(out: Annotated[Path, typer.Argument()] = Path("demo"), seed: Seed = 0) -> None:
-    """Run all steps in two minutes: render a rock orbit, build the prior, choose views by five
+    """Run all steps in a minute: render a rock orbit, build the prior, choose views by three
     policies, compare, draw. Every command is shown as it is run.
 
     - out: Folder for everything; the same command again continues or shows it."""
