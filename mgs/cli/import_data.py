@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -18,6 +18,8 @@ from mgs.errors import InputError
 from mgs.files import Ours, clear_folder, read_json, scratch_folder, write_json
 
 if TYPE_CHECKING:
+    from mgs.camera import Camera
+    from mgs.data.agreement import Agreement
     from mgs.data.clouds import SparseCloud
     from mgs.data.dataset import Dataset
     from mgs.data.shots import Shot, Source
@@ -77,30 +79,32 @@ def import_data(
       points that pictures share; for poses that are a little wrong. Needs texture.
     - test_split: Split of NeRF-synthetic data that becomes the test views; publications take test.
     """
-    options = {name: str(value) for name, value in locals().items() if name != "force"}
-    from mgs.cli.nbv import moves_in_words
-    from mgs.data.agreement import agreement
+    options = {key: str(value) for key, value in locals().items() if key not in ("out", "force")}
     from mgs.data.bags import is_bag
-    from mgs.data.clouds import write_cloud
     from mgs.data.importers import RECORD, import_source
     from mgs.data.meshes import GLTF
     from mgs.data.photographs import KIND as PHOTOGRAPHS
     from mgs.data.photographs import PLACED, photographs_in
     from mgs.data.sources import read_source
-    from mgs.data.structure import CLOUD, Matcher, lacks_points, refined
 
     console, notes = Terminal(), Terminal(stderr=True)
-    if masks is not None and mesh is not None:
-        raise InputError("import: --masks and --mesh both give masks; give one of them")
-    if unit is not None and distance is not None:
-        raise InputError("import: --unit and --distance both give the scale; give one of them")
-    if test_split is not None and test_every is not None:
-        raise InputError("import: --test-split and --test-every both choose test views; give one")
-    files = [*photographs_in(images or source), *(path for path in (source, mesh) if path)]
-    request = _request(options, files)
-    if not force and request == _requested(out):
-        console.print(f"{out} is finished already; --force makes it again", soft_wrap=True)
-        return
+    for one, other, what in (
+        (masks, mesh, "--masks and --mesh both give masks"),
+        (unit, distance, "--unit and --distance both give the scale"),
+        (test_split, test_every, "--test-split and --test-every both choose test views"),
+    ):
+        if one is not None and other is not None:
+            raise InputError(f"import: {what}; give one of them")
+    given = [path for path in (source, images, masks, mesh) if path]
+    request = _request(options, [*photographs_in(images or source), *given])
+    if not force and (before := _finished(out)):
+        if before["request"] != request:
+            changed = "its pictures or the options have changed since"
+            cure = "--force makes it again, or give another folder"
+            raise InputError(f"{out}: holds a finished import; {changed}; {cure}")
+        if before.get("kind") == PHOTOGRAPHS:  # to place them again would take long
+            console.print(f"{out} is finished already; --force makes it again", soft_wrap=True)
+            return
     unpacked = out.with_name(f"{out.name}.unpacked")
     with (
         scratch_folder(unpacked, "" if is_bag(source) else f"*/{PLACED}") as scratch,
@@ -120,49 +124,80 @@ def import_data(
         axis = parse_up(up)
         upward, reason = shots.up_or_estimate() if axis is None else (axis, "as --up says")
         if force:
-            clear_folder(out, Ours(FILES, [path for path in (source, images, masks, mesh) if path]))
+            clear_folder(out, Ours(FILES, given))
         finished = os.path.isfile(out / "transforms.json")  # else the import refuses what is there
-        source_shots, tests = shots.set_apart(test_every)
-        camera = shots.shots[0].camera
-        least = int(np.ceil(np.sqrt(camera.width * camera.height / MANY_PIXELS)))
-        if downscale < least and not finished:  # before, since to write them takes long, too
-            size = f"{camera.width // downscale}x{camera.height // downscale}"
-            cure = f"--downscale {least} makes them smaller"
-            notes.print(f"mgs: images of {size} take long to fit; {cure}", soft_wrap=True)
+        if not finished:
+            _advise_size(notes, shots.shots[0].camera, downscale)
+        trained, tests = shots.set_apart(test_every)
         result = import_source(
-            source_shots, out, masks=masks, mesh=mesh, downscale=downscale, up=upward, tests=tests
+            trained, out, masks=masks, mesh=mesh, downscale=downscale, up=upward, tests=tests
         )
-        if shots.kind == PHOTOGRAPHS:  # to place them again would take long
-            write_json(out / RECORD, read_json(out / RECORD) | {"request": request})
-        poses, cloud = shots.fit, shots.sparse
+        write_json(out / RECORD, read_json(out / RECORD) | {"request": request})
+        fit, cloud = shots.fit, shots.sparse
         if shots.kind != PHOTOGRAPHS:
-            matcher = Matcher.of_frames(result.frames, scratch / "matches")
-            compared = agreement(result.frames, matcher, masked=mesh is None)
-            poses = poses if compared is None or (poses and poses.problem) else compared
-            right = not (poses and poses.problem)
-            if refine_poses and right and not finished:
-                result, cloud, moves = refined(result, scratch / "every")
-                console.print(moves_in_words(moves, result.unit))
-            elif lacks_points(result) and right:
-                larger = source_shots.shots if downscale > 1 else []
-                cloud = _triangulated(result, matcher, larger, scratch / "source")
-            if cloud is not None:
-                write_cloud(out / CLOUD, cloud)
+            larger = trained.shots if downscale > 1 else []
+            refine = refine_poses and not finished
+            how = shots, larger, scratch, mesh is None, console if refine else None
+            result, fit, cloud = _checked(result, *how)
     if mesh is not None and mesh.suffix.lower() in GLTF:
         console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
     for note in [*shots.notes, *_advice(shots, result)]:
         notes.print(f"mgs: {note}", soft_wrap=True)
-    fits = "poses not compared with the pictures, which share too few points"
-    if poses:
-        error = "" if poses.error is None else f": reprojection error {poses.error:.2f} pixels"
-        fits = f"poses compared by {poses.evidence}{error}"
-        if poses.problem:
-            notes.print(f"mgs: the poses {poses.problem} ({fits})", soft_wrap=True)
-    if cloud is not None:
-        fits = f"{_points(cloud)}; {fits}"
-    world = f"up {_numbers(upward)}, {reason}"
-    _print_summary(console, shots, tests, result, f"{fits}; {world}")
+    if fit and fit.problem:
+        notes.print(f"mgs: the poses {fit.problem} ({_evidence(fit)})", soft_wrap=True)
+    world = f"{_evidence(fit, cloud)}; up {_numbers(upward)}, {reason}"
+    _print_summary(console, shots, tests, result, world)
     console.print(f"{out} is finished already" if finished else f"wrote {out}", soft_wrap=True)
+
+
+def _checked(
+    result: Dataset,
+    source: Source,
+    larger: Sequence[Shot],
+    scratch: Path,
+    masked: bool,
+    refining: Terminal | None,
+) -> tuple[Dataset, Agreement | None, SparseCloud | None]:
+    """Compare the poses of an import with its pictures. If they fit, refine them and print how far
+    they moved (`refining`), or triangulate points (`_triangulated`) where nothing tells where the
+    surfaces are; returns the dataset, the comparison and its points. masked: as in `agreement`."""
+    from mgs.cli.nbv import moves_in_words
+    from mgs.data.agreement import agreement
+    from mgs.data.clouds import write_cloud
+    from mgs.data.structure import CLOUD, Matcher, lacks_points, refined
+
+    matcher, fit, cloud = Matcher.of_frames(result.frames, scratch / "matches"), source.fit, None
+    compared = agreement(result.frames, matcher, masked=masked)
+    fit = fit if compared is None or (fit and fit.problem) else compared
+    if fit and fit.problem:
+        return result, fit, source.sparse
+    if refining:
+        result, cloud, moves = refined(result, scratch / "every")
+        refining.print(moves_in_words(moves, result.unit))
+    elif lacks_points(result):
+        cloud = _triangulated(result, matcher, larger, scratch / "source")
+    if cloud is None:
+        return result, fit, source.sparse
+    write_cloud(result.root / CLOUD, cloud)
+    return result, fit, cloud
+
+
+def _evidence(fit: Agreement | None, cloud: SparseCloud | None = None) -> str:
+    """How poses were compared with pictures, after the points."""
+    text = "poses not compared with the pictures, which share too few points"
+    if fit:
+        error = "" if fit.error is None else f": reprojection error {fit.error:.2f} pixels"
+        text = f"poses compared by {fit.evidence}{error}"
+    return text if cloud is None else f"{_points(cloud)}; {text}"
+
+
+def _advise_size(notes: Terminal, camera: Camera, downscale: int) -> None:
+    """Say where images will be large, before they are written, since that takes long, too."""
+    least = int(np.ceil(np.sqrt(camera.width * camera.height / MANY_PIXELS)))
+    if downscale < least:
+        size = f"{camera.width // downscale}x{camera.height // downscale}"
+        cure = f"--downscale {least} makes them smaller"
+        notes.print(f"mgs: images of {size} take long to fit; {cure}", soft_wrap=True)
 
 
 def _request(options: dict[str, str], files: Sequence[Path]) -> str:
@@ -171,14 +206,14 @@ def _request(options: dict[str, str], files: Sequence[Path]) -> str:
     return hashlib.sha256(json.dumps([options, about]).encode()).hexdigest()
 
 
-def _requested(out: Path) -> str | None:
-    """`_request` of the finished import of photographs in a folder; None where there is none."""
+def _finished(out: Path) -> dict[str, Any] | None:
+    """Record of the finished import in a folder; None where there is none, or it has no request."""
     from mgs.data.importers import RECORD
 
     if not all((out / name).is_file() for name in (RECORD, "transforms.json")):
         return None
     record = read_json(out / RECORD)
-    return record.get("request") if isinstance(record, dict) else None
+    return record if isinstance(record, dict) and "request" in record else None
 
 
 def _triangulated(
