@@ -262,6 +262,8 @@ def test_the_page_in_a_browser(browser, page, width, height, scheme):
             tab.locator(f"#{name}").scroll_into_view_if_needed()
             tab.wait_for_selector(f"#{name} .main-svg", state="attached")
         tab.wait_for_selector("#orbit-0 canvas")
+        tab.evaluate("dispatchEvent(new Event('beforeprint'))")  # figures below are printed, too
+        assert tab.locator(".plot:visible:not(:has(.main-svg))").count() == 0
         assert tab.locator("img:not([alt]), img[alt='']").count() == 0
         assert tab.locator(".plot:not([aria-label])").count() == 0
 

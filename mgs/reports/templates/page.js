@@ -51,6 +51,9 @@ const watcher = new IntersectionObserver(entries => {
   }
 }, {rootMargin: "300px"});
 for (const id of specs.keys()) watcher.observe(byId(id));
+addEventListener("beforeprint", () => {
+  for (const id of specs.keys()) if (byId(id).offsetParent) draw(id);
+});
 
 function redraw() { for (const id of drawn) draw(id); }
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
