@@ -1,5 +1,7 @@
 """Upper bounds and branch and bound against every set of few candidates, SciPy, and definitions."""
 
+import tracemalloc
+import weakref
 from itertools import combinations
 
 import numpy as np
@@ -93,6 +95,24 @@ def test_gradient_and_curvature_are_those_of_differences(kind):
     assert made.tangent(x)[1] @ d == pytest.approx((ahead[0] - behind[0]) / 2e-4, rel=1e-5)
     bend, expected = -made.curvature(x) @ d, (ahead[1] - behind[1]) / 2e-4
     assert bend == pytest.approx(expected, rel=1e-4, abs=1e-6 * abs(bend).max())
+
+
+def test_many_candidates_take_little_memory(monkeypatch):
+    """All products of 400 views for 400 Gaussians at once would take 500 MB; and a criterion goes
+    with its arrays as soon as nothing names it."""
+    F = np.random.default_rng(0).uniform(0, 3, (400, 400, 1))
+    made, x = relaxation.d_optimal(F, F[0], np.ones(1)), np.full(400, 0.1)
+    tracemalloc.start()
+    sums = made.curvature(x)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 150e6
+    monkeypatch.setattr(relaxation, "CURVATURE", 400**3)
+    assert made.curvature(x) == pytest.approx(sums, rel=1e-12)
+    assert made.coarse.gain([3]) > 0
+    gone = weakref.ref(made)
+    del made
+    assert gone() is None
 
 
 @pytest.mark.parametrize("k", [1, 3])

@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 COARSE = 1024  # about the number of Gaussians of `Relaxation.coarse`; chosen
 TOLERANCE = 1e-3  # gap at which `upper_bound` stops, as a share of the bound
 STEPS, EXCHANGES, CUTS = 30, 3000, 300  # Newton steps, exchanges in each, cuts at most; chosen
+CURVATURE = 1 << 21  # numbers [n,C,C] that a thread holds at once for the curvature
 SUFFICIENT = 1e-3  # least share of the predicted ascent that a step of the line search must reach
 
 
@@ -114,10 +115,10 @@ class Relaxation(Bounded):
     @cached_property
     def coarse(self) -> "Relaxation":
         """The same for about COARSE of the Gaussians, which stand for all."""
-        step = max(len(self.base) // COARSE, 1)
+        step, fine = max(len(self.base) // COARSE, 1), self.vectors
 
-        def vectors(some: slice) -> Floats:
-            return self.vectors(slice(some.start * step, some.stop * step, step))
+        def vectors(some: slice) -> Floats:  # without `self`, whose arrays go as soon as it does
+            return fine(slice(some.start * step, some.stop * step, step))
 
         base, over = self.base[::step], None if self.over is None else self.over[::step]
         scale = self.scale * len(self.base) / len(base)
@@ -157,11 +158,17 @@ class Relaxation(Bounded):
     def curvature(self, x: Floats) -> Floats:
         """Minus the Hessian of f [C,C]."""
 
+        most = max(CURVATURE // self.candidates**2, 1)
+
         def part(some: slice) -> Floats:
             z, A = self._at(x, some)
             one, other = self._phi(A, some)[2]
-            across = z.transpose(0, 2, 1)
-            return np.asarray((((z @ one) @ across) * ((z @ other) @ across)).sum(0))
+            sums = []
+            for k in range(0, len(z), most):
+                Z, P, Q = (values[k : k + most] for values in (z, one, other))
+                across = Z.transpose(0, 2, 1)
+                sums.append((((Z @ P) @ across) * ((Z @ Q) @ across)).sum(0))
+            return np.asarray(sum(sums))
 
         return np.asarray(sum(in_parts(len(self.base), part)))
 
@@ -274,7 +281,12 @@ def directional(
         relaxation = replace(relaxation, over=information(means, dome, degree), scale=1.0)
     if 8 * base.shape[1] * candidates.seen.size > VIEW_BYTES:
         return relaxation
-    z = np.concatenate(in_parts(len(means), seen))
+    z = np.empty((len(means), len(candidates.positions), base.shape[1]))
+
+    def fill(some: slice) -> None:
+        z[some] = seen(some)
+
+    in_parts(len(means), fill)  # to join the parts would take their memory twice
     return replace(relaxation, vectors=lambda some: z[some])
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from mgs.errors import InputError
+from mgs.memory import release
 from mgs.policy.certificate import Certificate, certify, curve, greedy
 from mgs.policy.poses import farthest_order
 from mgs.policy.relaxation import Criterion
@@ -31,6 +32,8 @@ def certificate(
 ) -> Certificate | None:
     """Certify a plan of some of `views` by the policy's criterion. Returns None where the policy
     has no `relaxation`, the plan has no view or all of them, or no view adds anything."""
+    scene.cache.clear()  # of all views, which were measured for the plan: bounds need much room
+    release()
     criterion = _criterion(scene, state, policy, views) if 0 < len(plan) < len(views) else None
     if criterion is None:
         return None

@@ -72,6 +72,10 @@ class ListCache:
         """Memory held, bytes."""
         return sum(lists.nbytes for lists in self._lists.values())
 
+    def clear(self) -> None:
+        """Drop all lists."""
+        self._lists.clear()
+
     def get(self, camera: Camera, splats: Splats) -> tuple[BlockLists, Any]:
         """Lists for detached splats seen by the camera, cached or new, and the packed splats
         (`walking.pack`). Raises InputError if a parameter is not finite, a colour beyond SH_MAX, or
