@@ -24,7 +24,7 @@ from mgs.run.policies import Policy
 from mgs.run.settings import NbvSettings
 from mgs.seeds import generator
 from studies.faults import IMAGE_FAULTS, PRIOR_FAULTS, captured, pose_noise
-from studies.frame.case import ROCKS, judge
+from studies.frame.case import FRESH, ROCKS, judge
 from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
 from studies.frame.program import WORKERS, Study, Work, study_of
 from studies.frame.statistics import Row
@@ -69,8 +69,9 @@ WORDS |= {name: words for name, (_, words) in FIT_FAULTS.items()} | {ANOTHER: "{
 def cells_of(size: SetupSize) -> list[Cell]:
     """Cells of both parts on every rock, with datasets and priors."""
     cells: dict[str, Cell] = {}
-    cases = [case_of(rock, SETUPS["hemisphere"], size) for rock in size.rocks]
-    for k, case in enumerate(cases):
+    rocks = dict.fromkeys((*size.rocks, *FRESH))  # a prior of another rock, also for one rock
+    cases = [case_of(rock, SETUPS["hemisphere"], size) for rock in rocks]
+    for k, case in enumerate(cases[: len(size.rocks)]):
         others = [cases[(k + step) % len(cases)] for step in (1, 2, 3)]
         made = [one for other in others for one in other.cells()]
         wrong: dict[str, Any] = {"others": [other.prior for other in others]}

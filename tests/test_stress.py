@@ -1,5 +1,7 @@
 """Stress tests on small ellipsoids."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import synthetic
@@ -9,6 +11,7 @@ from mgs.prior.build import load_prior
 from mgs.run.detectors import DETECTORS
 from studies import faults, stress
 from studies.couplings import halved
+from studies.frame.case import FRESH
 
 FOLDERS = {"dataset": "dataset", "prior": "dataset/prior"}
 
@@ -43,6 +46,16 @@ def root(tmp_path_factory):
     cameras = synthetic.orbit_cameras(3, 48, 36, altitude=2.0)
     synthetic.write_dataset(folder / "dataset/test", cameras)
     return folder
+
+
+def test_the_wrong_prior_of_one_rock_is_of_the_same_rocks_as_that_of_eight():
+    def others(count):
+        size = replace(stress.SIZES["quick"], rocks=FRESH[:count])
+        cells = {cell.name: cell for cell in stress.cells_of(size)}
+        return cells[f"faults/{FRESH[0].name}"].arguments["others"]
+
+    assert others(1) == others(8)
+    assert len(set(others(1))) == 3
 
 
 def test_a_halved_frame_has_means_of_four_pixels_and_points_at_half_the_place(root):
