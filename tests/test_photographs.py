@@ -351,6 +351,24 @@ def test_up_is_found_in_a_turned_world_of_cameras_held_nearly_level(seed, altitu
     assert degrees_between(up_of_cameras(cameras), unit_up(up)) < 5
 
 
+@pytest.mark.parametrize("quarter", [1, 3])
+@pytest.mark.parametrize("arc", [3.0, 6.28])
+def test_up_of_pictures_that_lie_on_their_side(arc, quarter):
+    """As a phone's that was held upright, and whose EXIF is lost."""
+    rng = np.random.default_rng(0)
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    cameras = []
+    for angle, altitude in zip(np.linspace(0, arc, 20), rng.uniform(1, 2.5, 20), strict=True):
+        pose = look_at([3 * np.cos(angle), 3 * np.sin(angle), altitude], [0, 0, 0])
+        roll = np.radians(rng.normal(90 * quarter, 4))
+        c, s = np.cos(roll), np.sin(roll)
+        pose[:3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ pose[:3]
+        pose[:3, :3] = pose[:3, :3] @ turn.T
+        cameras.append(Camera(np.diag([50.0, 50.0, 1.0]), 64, 48, pose))
+    assert degrees_between(up_of_cameras(cameras), unit_up(turn @ [0, 0, 1])) < 5
+
+
 @pytest.mark.parametrize("lines", [2, 3])
 def test_a_survey_from_above_looks_down(lines):
     """Lines there and back: the axes that point up in the pictures cancel."""

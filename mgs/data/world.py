@@ -19,6 +19,9 @@ PLUS_Z: Vector = (0.0, 0.0, 1.0)
 
 # Below it cameras look one way, and the mean of their upward axes is taken.
 LEVEL = 0.1  # least second singular value of right-hand axes over the root of their number
+# Of pictures on their side: least residual of horizontal right-hand axes, largest one of horizontal
+# upward axes over it, least second singular value of these, least mean right-hand axis along up.
+TILTED, RATHER, AROUND, ALONG = 0.1, 0.5, 0.3, 0.5
 # Of cameras that survey from above in lines there and back.
 ONE_WAY, CANCELLED = 0.9, 0.5  # least mean viewing direction, largest mean upward axis, lengths
 
@@ -67,19 +70,32 @@ def up_of_cameras(cameras: Sequence[Camera]) -> Vector:
 
     A level camera has a horizontal right-hand axis, however steeply it looks down. The result is
     the last right singular vector of the stacked axes, on the side of the cameras' upward axes.
-    Cameras that look one way, but are held every way round, look down. Raises InputError if the
-    upward axes of others cancel."""
+    Cameras that look one way, but are held every way round, look down. Pictures that lie on their
+    side, as of a phone without EXIF, have horizontal upward axes instead, and look down as most do.
+    Raises InputError if the upward axes of others cancel."""
     forward = np.stack([camera.world_to_camera[2, :3] for camera in cameras]).mean(0)
     right = np.stack([camera.world_to_camera[0, :3] for camera in cameras])
     upward = -np.stack([camera.world_to_camera[1, :3] for camera in cameras]).mean(0)
     if np.linalg.norm(forward) > ONE_WAY and np.linalg.norm(upward) < CANCELLED:
         return unit_up(-forward)
     values, axes = np.linalg.svd(right)[1:]
+    if len(cameras) > 2 and (side := _side_up(cameras)) is not None:
+        return unit_up(-side * np.sign(side @ forward))
     common = axes[2] if len(cameras) > 2 and values[1] > LEVEL * np.sqrt(len(cameras)) else upward
     if np.linalg.norm(common) < 1e-6 or abs(common @ upward) < 1e-6:
         why = "the cameras are held every way round, and have no up in common"
         raise InputError(f"up: {why}; give `up` as X,Y,Z")
     return unit_up(common * np.sign(common @ upward) / np.linalg.norm(common))
+
+
+def _side_up(cameras: Sequence[Camera]) -> np.ndarray | None:
+    """Vertical of pictures that lie on their side, [3] of either sign, or None if they do not."""
+    right, down = (np.stack([camera.world_to_camera[k, :3] for camera in cameras]) for k in (0, 1))
+    tilted = np.linalg.svd(right)[1][2] / np.sqrt(len(cameras))
+    values, axes = np.linalg.svd(down)[1:]
+    _, around, least = values / np.sqrt(len(cameras))
+    rather = tilted > TILTED and least < RATHER * tilted and around > AROUND
+    return axes[2] if rather and abs(right.mean(0) @ axes[2]) > ALONG else None
 
 
 def unit_up(vector: Sequence[float] | np.ndarray) -> Vector:
