@@ -26,7 +26,7 @@ from mgs.data.check import check_dataset
 from mgs.data.clouds import SparseCloud, read_cloud, write_cloud
 from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.data.importers import import_source
-from mgs.data.lens import Lens, undistorter
+from mgs.data.lens import Lens, fitted, undistorter
 from mgs.data.sources import read_source
 from mgs.files import write_json
 from mgs.images import read_depth, write_png
@@ -308,17 +308,39 @@ def test_images_are_excluded_by_name(dataset, tmp_path, capsys):
     fails("exclude 'other'", read_source, dataset.root, exclude=["other"])
 
 
-def test_images_may_be_smaller_than_their_cameras(dataset, tmp_path):
+@pytest.mark.parametrize("kind", ["nerfstudio", "COLMAP"])
+def test_images_may_be_smaller_than_their_cameras(dataset, tmp_path, kind, capsys):
     for key in ("depth_file_path", "mask_path"):
         synthetic.edit(dataset.root, lambda data, key=key: [one.pop(key) for one in data["frames"]])
+    source = dataset.root
+    if kind == "COLMAP":
+        source = tmp_path / "colmap"
+        synthetic.write_colmap(dataset, source, True)
     for frame in dataset.frames:
         with Image.open(frame.image_path) as image:
             image.resize((image.width // 4, image.height // 4)).save(frame.image_path)
-    copy = _import(dataset.root, tmp_path / "c")
-    for one, other in zip(dataset.frames, copy.frames, strict=True):
+    command("import", source, "--out", tmp_path / "c")
+    assert f"{len(dataset)} images are smaller than their cameras" in said(capsys)[1]
+    for one, other in zip(dataset.frames, load_dataset(tmp_path / "c").frames, strict=True):
         point = one.camera.camera_to_world[:3] @ [0.1, 0.2, 1, 1]
         pixels = [frame.camera.project(point[None])[0] for frame in (one, other)]
         assert np.allclose(pixels[0], 4 * pixels[1])
+
+
+@pytest.mark.parametrize("own", [(34, 25), (33, 26)])
+def test_a_smaller_image_is_rounded_up_or_down_and_its_lens_scaled(tmp_path, own):
+    K = np.array([[120.0, 0, 66], [0, 121, 52], [0, 0, 1]])
+    camera = Camera(K, 133, 102, np.eye(4))
+    lens = Lens.of("lens", "OPENCV", K, {"k1": -0.1, "k2": 0.02})
+    write_png(tmp_path / "image.png", np.zeros((own[1], own[0], 3)))
+    small, scaled = fitted(camera, lens, tmp_path / "image.png")
+    assert lens
+    assert scaled
+    assert (small.width, small.height) == own
+    ray = np.array([[0.2, -0.1, 1]])
+    a, b = (one.camera(1, 1).img_from_cam(ray)[0] for one in (lens, scaled))
+    assert np.allclose(b, a * np.divide(own, (133, 102)))
+    assert np.allclose(scaled.parameters[:4], small.K[[0, 1, 0, 1], [0, 1, 2, 2]])
 
 
 def test_a_pixel_of_all_ones_is_no_depth(tmp_path):

@@ -25,6 +25,7 @@ GENERAL = {  # camera models that are cases of a more general one, which takes t
 }
 
 FARTHEST = np.tan(np.radians(60))  # largest tangent in an undistorted image; fisheyes are cut
+SMALLER = (2, 4, 8)  # factors by which images may be smaller than their cameras
 BLOCK = 1 << 20  # pixels that are mapped at once
 
 
@@ -61,6 +62,12 @@ class Lens:
         if model == "PINHOLE":
             return None
         return cls(model, tuple(float({**intrinsic, **values}.get(name, 0)) for name in names))
+
+    def scaled(self, across: float, down: float) -> Lens:
+        """Lens of an image that is resized by these factors."""
+        factors = {"f": across, "fx": across, "cx": across, "fy": down, "cy": down}
+        pairs = zip(parameter_names(self.model), self.parameters, strict=True)
+        return Lens(self.model, tuple(factors.get(name, 1.0) * value for name, value in pairs))
 
     def camera(self, width: int, height: int) -> Any:
         """The camera of pycolmap."""
@@ -157,6 +164,18 @@ def _is_sound(at: np.ndarray, lens: Lens, K: np.ndarray, size: tuple[int, int]) 
     focal = lens.camera(*size).mean_focal_length()
     alike = all(0.1 < value / focal < 10 for value in (K[0, 0], K[1, 1]))
     return bool(alike and inside and (determinant > 0).all())
+
+
+def fitted(camera: Camera, lens: Lens | None, image: Path) -> tuple[Camera, Lens | None]:
+    """Camera and lens of an image file: scaled where the file is smaller by a factor of SMALLER,
+    rounded up or down, else as they are."""
+    own, whole = image_size(image), (camera.width, camera.height)
+    sides = list(zip(whole, own, strict=True))
+    if not any(all(abs(side / k - one) < 1 for side, one in sides) for k in SMALLER):
+        return camera, lens
+    across, down = np.divide(own, whole).tolist()
+    K = camera.K * [[across, 1, across], [1, down, down], [1, 1, 1]]
+    return Camera(K, *own, camera.world_to_camera), lens and lens.scaled(across, down)
 
 
 def shrunk(

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from mgs.camera import Camera
 from mgs.data.agreement import Agreement
 from mgs.data.clouds import SparseCloud
-from mgs.data.lens import Lens
+from mgs.data.lens import Lens, fitted
 from mgs.data.world import PLUS_Z, Vector, degrees_between, up_of_cameras
 from mgs.errors import InputError
 from mgs.images import exif_orientation, image_size
@@ -97,6 +97,16 @@ class Source:
         if apart == 0:
             raise InputError(f"import: distance {text!r}: its cameras are in one place; correct it")
         return self.in_metres(metres / apart)
+
+    def fitted(self) -> Source:
+        """Source whose cameras are `mgs.data.lens.fitted` to their images."""
+        shots, count = list[Shot](), 0
+        for shot in self.shots:
+            camera, lens = fitted(shot.camera, shot.lens, shot.image)
+            count += camera is not shot.camera
+            shots.append(replace(shot, camera=camera, lens=lens))
+        note = f"{count} images are smaller than their cameras, which are scaled"
+        return replace(self, shots=shots, notes=(*self.notes, note)) if count else self
 
     def near_origin(self) -> Source:
         """Move the origin to the cameras, in whole units, if they are FAR from it."""

@@ -48,7 +48,6 @@ COEFFICIENTS = (  # keys of transforms.json that COLMAP's camera models name ali
 )
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists of images
-SHRUNK = (2, 4, 8)  # factors by which images may be smaller than transforms.json says
 
 Reader = Callable[[Path, Path | None, Spacing, Path, str | None], Source]
 """(path, images, spacing of keyframes, folder to unpack into, topic of poses) -> source. images:
@@ -105,7 +104,7 @@ def read_source(
         result = replace(result, notes=(f"{count} {ROUNDED}", *result.notes))
     if result.kind != PHOTOGRAPHS:
         result = result.without(exclude)
-    return turned_by_exif(result).near_origin()
+    return turned_by_exif(result.fitted()).near_origin()
 
 
 def _recognised(
@@ -177,7 +176,7 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
     scale = finite_number(str(path), key, data.get(key, 1e-3))
     of_floats = scale if key in data else 1.0
     tests, without = _splits(path, data, records)
-    left_out, shots, smaller = Counter[str](), [], 0
+    left_out, shots = Counter[str](), []
     for index, record in enumerate(records):
         image = _named(path.parent, images, record["file_path"])
         if record["file_path"] in without:
@@ -194,13 +193,10 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
         where = f"{path}: frame {index}"
         about = {**data, **record}
         camera, lens, mended = record_camera(where, about, image)
-        smaller += camera.width != float(about.get("w") or camera.width)
         time, name = timestamp_of(where, index, record), frame_name(record["file_path"])
         files = image, depth, scale, mask, rock
         shots.append(Shot(name, camera, lens, time, *files, of_floats, mended=mended))
     notes = []
-    if smaller:
-        notes.append(f"{smaller} images are smaller than w and h say; their cameras are scaled")
     listed = {frame_name(record["file_path"]) for record in records}
     if unknown := {frame_name(name) for name in tests} - listed:
         notes.append(f"{len(unknown)} test views are no frame, as {min(unknown)}")
@@ -243,19 +239,16 @@ def record_camera(
     """Camera and lens of a frame, and whether its rotation was NEARLY_RIGID. Missing intrinsics
     follow from the image."""
     record = {key: value for key, value in record.items() if value is not None}
-    model, own = record.get("camera_model", "OPENCV"), image_size(image)
+    model = record.get("camera_model", "OPENCV")
     try:
         if "w" in record and "h" in record:
             width, height = float(record["w"]), float(record["h"])
         else:
-            width, height = own
+            width, height = image_size(image)
         fl_x = _focal(record, "x", width)
         fl_y = _focal(record, "y", height) if {"fl_y", "camera_angle_y"} & set(record) else fl_x
         cx, cy = float(record.get("cx", width / 2)), float(record.get("cy", height / 2))
         K = np.array([[fl_x, 0, cx], [0, fl_y, cy], [0, 0, 1]])
-        # Smaller copies of the images beside a transforms.json of the whole ones.
-        if (times := width / own[0]) in SHRUNK and times == height / own[1]:
-            K, width, height = K / [[times, 1, times], [1, times, times], [1, 1, 1]], *own
         values = {key: float(record[key]) for key in COEFFICIENTS if key in record}
         pose = np.array(record["transform_matrix"], np.float64)
     except (KeyError, TypeError, ValueError, ArithmeticError):

@@ -26,7 +26,7 @@ from mgs.colour import srgb_from_linear
 from mgs.data.dataset import FILES, Dataset, intrinsics, load_dataset, read_records
 from mgs.data.frames import Frame, as_captured, capture_record
 from mgs.data.importers import Silhouette, import_shot, silhouette_of
-from mgs.data.lens import Lens
+from mgs.data.lens import Lens, fitted
 from mgs.data.shots import Shot
 from mgs.data.sources import record_camera
 from mgs.data.world import World
@@ -294,6 +294,7 @@ def _flown(path: Path, frame: Frame, image: Path, world: World) -> tuple[Camera,
     if not isinstance(record, dict) or "transform_matrix" not in record:
         raise InputError(f"{path}: has no transform_matrix")
     camera, lens, _ = record_camera(str(path), intrinsics(frame.camera) | record, image)
+    camera, lens = fitted(camera, lens, image)
     plan, camera = frame.camera, world.enter(camera)
     size = (camera.width, camera.height) == (plan.width, plan.height)
     pose = np.allclose(camera.world_to_camera, plan.world_to_camera, rtol=0, atol=SAME)
