@@ -55,6 +55,10 @@ def png(name: str, values: np.ndarray) -> Change:
     return lambda root: write_png(root / name, values)
 
 
+def without_images(root):
+    shutil.rmtree(root / "images")
+
+
 def corrupt_jpeg(root: Path) -> None:
     """The header is whole, the pixels are cut off."""
     jpeg = root / "images/kf_0000.jpg"
@@ -171,7 +175,7 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
         ("no such EXR", frame(0, depth_file_path="depth/none.exr")),
         ("depth_unit", header(depth_unit_scale_factor="mm")),
         ("up: must be three finite numbers", header(up="skyward")),
-        ("none of the 8 images", lambda root: shutil.rmtree(root / "images")),
+        ("none of the 8 images it lists exists, as images/kf_0000", without_images),
         ("kf_0000.jpg: not a readable image", corrupt_jpeg),
         ("points.ply: has values that are not finite", points_in_one_place),
     ],

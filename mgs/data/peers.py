@@ -25,6 +25,7 @@ from mgs.data.shots import (
     Source,
     find_image,
     frame_name,
+    none_exists,
     orthonormal,
 )
 from mgs.data.world import PLUS_Z
@@ -312,6 +313,8 @@ def read_peer(kind: str, source: Path, images: Path | None, *_: Any) -> Source:
                 left_out["whose file is missing"] += 1
                 continue
             shots.append(_shot(f"{path}: {view.name}", view, *at, FRAME_INTERVAL * len(shots)))
+        if contents.views and not shots:
+            raise none_exists(path, len(contents.views), contents.views[0].name)
         points = np.array(contents.points, np.float64).reshape(-1, 3)
         track = None if contents.track is None else np.array(contents.track, np.float64)
         if not np.isfinite(points).all():

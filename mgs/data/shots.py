@@ -193,14 +193,20 @@ def find_image(folder: Path, name: str, suffixes: Sequence[str] = SUFFIXES) -> P
     return next((path for path in paths if path.is_file()), None)
 
 
+def none_exists(path: Path, count: int, example: str = "") -> InputError:
+    """The error where none of the images that a file lists exists."""
+    why = f"none of the {count} images it lists exists" + (f", as {example}" if example else "")
+    return InputError(f"{path}: {why}; restore them, or give their folder as `images`")
+
+
 def checked(path: Path, source: Source) -> Source:
     """Source without the shots whose image does not exist. Raises InputError if none is left, if a
     name is listed twice, or cannot be that of a file."""
     there = [shot for shot in source.shots if shot.image.is_file()]
     left_out = source.left_out + Counter({"whose file is missing": len(source.shots) - len(there)})
     if not there:
-        why = f"none of the {source.left_out.total() + len(source.shots)} images it lists exists"
-        raise InputError(f"{path}: {why}; restore them or give images")
+        count = source.left_out.total() + len(source.shots)
+        raise none_exists(path, count, *(str(shot.image) for shot in source.shots[:1]))
     for name, count in Counter(shot.name for shot in there).items():
         if count > 1:
             raise InputError(f"{path}: lists {name} more than once; remove the duplicate frames")

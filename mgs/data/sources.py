@@ -35,6 +35,7 @@ from mgs.data.shots import (
     checked,
     find_image,
     frame_name,
+    none_exists,
     orthonormal,
     turned_by_exif,
 )
@@ -196,6 +197,8 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
         time, name = timestamp_of(where, index, record), frame_name(record["file_path"])
         files = image, depth, scale, mask, rock
         shots.append(Shot(name, camera, lens, time, *files, of_floats, mended=mended))
+    if not shots and left_out["whose file is missing"]:
+        raise none_exists(path, len(records), records[0]["file_path"])
     notes = []
     listed = {frame_name(record["file_path"]) for record in records}
     if unknown := {frame_name(name) for name in tests} - listed:
