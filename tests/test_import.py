@@ -105,6 +105,13 @@ def test_colmap_gives_cameras_and_points(dataset, tmp_path, binary):
     assert np.abs(points[~on_rock, 2]).max() < 1e-6
 
 
+def test_pictures_that_colmap_does_not_place_are_counted(dataset, tmp_path, capsys):
+    synthetic.write_colmap(replace(dataset, frames=dataset.frames[:-2]), tmp_path / "c", True)
+    said = output(capsys, "import", tmp_path / "c", "--out", tmp_path / "copy")
+    total = len(dataset)
+    assert f"{total - 2} frames of {total} images; left out 2 that the model does not place" in said
+
+
 def test_colmap_gives_the_distortion_of_its_lens(dataset, tmp_path):
     import pycolmap
 

@@ -2,6 +2,7 @@
 
 import codecs
 import struct
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -107,7 +108,12 @@ def read_colmap(source: Path, models: list[Path], images: Path) -> Source:
     for number, name in names.items():
         path = images / PureWindowsPath(name) if not (images / name).exists() else images / name
         files[number] = name, path
-    return replace(source_of(reconstruction, files, f"{model}: image"), notes=tuple(notes))
+    result = source_of(reconstruction, files, f"{model}: image")
+    placed = {shot.image for shot in result.shots}
+    kinds = {(path.parent, path.suffix) for path in placed if path.suffix and path.is_file()}
+    beside = {path for folder, suffix in kinds for path in folder.glob(f"*{suffix}")}
+    left_out = Counter({"that the model does not place": len(beside - placed)})
+    return replace(result, notes=tuple(notes), left_out=left_out)
 
 
 def source_of(
