@@ -218,7 +218,7 @@ def read_fitting(
     orientation = exif_orientation(path) if turned or real == size[::-1] != size else 1
     if size != (real[::-1] if orientation >= 5 else real):
         why = f"is {real[0]}x{real[1]}, but its camera is {camera.width}x{camera.height}"
-        raise InputError(f"{path}: {why}; resize it or correct w and h")
+        raise InputError(f"{path}: {why}; give the pictures of these cameras, or correct w and h")
     pixels = read(path)
     flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}.get(orientation, ())
     if orientation >= 5:
