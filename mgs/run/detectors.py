@@ -218,8 +218,9 @@ DETECTORS: dict[str, Detector] = {
     ),
     "residual": Detector(
         0.145,
-        "the fit leaves {share:.0f} % of the images' variance inside the masks unexplained in the "
-        "median view (limit {most:.1f} %); check poses, masks, and that the light stayed",
+        "the fit leaves {share:.0f} % of the images' variance, inside masks if there are any, "
+        "unexplained in the median view (limit {most:.1f} %); raise `train.passes`, check poses "
+        "and masks, and that the light stayed",
     ),
     "exposure": Detector(
         0.22,
