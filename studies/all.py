@@ -11,7 +11,7 @@ import subprocess
 import sys
 from argparse import ArgumentParser
 from collections.abc import Sequence
-from math import inf
+from math import inf, isnan
 from pathlib import Path
 
 from studies.frame.output import read_rows
@@ -39,15 +39,16 @@ STAGES = {
     "stress": ("stress", "--rocks", "8"),
     "table1-paper": ("table1", "--scale", "paper", "--batch", "5"),
 }
-"""Studies and their arguments by folder. Three need programs or data of others and are run by hand:
-`studies.rate`, `studies.blender` and `studies.photographs`."""
+"""Studies and their arguments by folder of docs/results. Three need programs or data of others and
+are run by hand: `studies.rate`, `studies.blender` and `studies.photographs`."""
 
 QUICK = {
     name: (*arguments[: arguments.index("--rocks") + 1], "1")
     for name, arguments in STAGES.items()
     if "--rocks" in arguments and name not in ("setups-8", "oracle")
 }
-"""Each study of many rocks, for the first alone; setups-8 repeats setups with fewer images."""
+"""Each study with --rocks, for the first; setups-8 repeats setups with fewer images, and oracle has
+one rock anyway."""
 
 ENOUGH = 0.05
 """Largest difference of a number, in its unit. Processors of another type round differently: with 8
@@ -68,9 +69,10 @@ def run(out: Path, quick: bool) -> int:
                 shutil.copyfile(folder / path.name, path)  # only files that docs/results has
             continue
         rows, usual = compared(folder / f"{study}.csv", RESULTS / name / f"{study}.csv")
-        differences = [difference(*pair) for pair in zip(rows, usual, strict=False)]
-        print(f"{len(rows)} of {len(usual)} rows, largest difference {max(differences):.2g}")
-        code |= len(rows) != len(usual) or max(differences) > ENOUGH
+        pairs = [difference(*pair) for pair in zip(rows, usual, strict=False)]
+        largest, where = max(pairs, default=(inf, "every row"))
+        print(f"{len(rows)} of {len(usual)} rows, largest difference {largest:.2g} {where}")
+        code |= len(rows) != len(usual) or largest > ENOUGH
     return code
 
 
@@ -81,16 +83,21 @@ def compared(path: Path, usual: Path) -> tuple[list[Row], list[Row]]:
     return rows, [row for row in read_rows(usual) if row["rock"] in rocks]
 
 
-def difference(row: Row, usual: Row) -> float:
-    """Largest difference of two rows' numbers, without seconds; infinite where words differ."""
-    largest = 0.0
-    for key in (row.keys() | usual.keys()) - {"command", "commit", "seconds"}:
+def difference(row: Row, usual: Row) -> tuple[float, str]:
+    """Largest difference of two rows' numbers, without seconds, and its column with the row's
+    words. Infinite where words differ, or a number is missing."""
+    origin, largest, column = ("command", "commit", "seconds"), 0.0, ""
+    for key in sorted((row.keys() | usual.keys()).difference(origin)):
         one, other = row.get(key), usual.get(key)
-        if isinstance(one, float) and isinstance(other, float):
-            largest = max(largest, abs(one - other))
-        elif one != other:
-            return inf
-    return largest
+        if one == other:
+            continue
+        apart = inf
+        if isinstance(one, int | float) and isinstance(other, int | float):
+            apart = abs(one - other)
+        if not apart <= largest:
+            largest, column = inf if isnan(apart) else apart, key
+    words = " ".join(row[key] for key in row if key not in origin and isinstance(row[key], str))
+    return largest, f"in {column} of {words}" if column else ""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

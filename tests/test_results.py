@@ -28,11 +28,15 @@ def test_rows_made_anew_are_compared_with_those_of_their_rock(tmp_path):
     rows = [row for row in read_rows(usual) if row["rock"] == "boulder-11"]
     one, other = every.compared(write_csv(tmp_path / "fits.csv", rows), usual)
     assert len(one) == 51
-    assert [every.difference(*pair) for pair in zip(one, other, strict=True)] == [0] * 51
+    assert [every.difference(*pair) for pair in zip(one, other, strict=True)] == [(0, "")] * 51
     changed = one[0] | {"test": one[0]["test"] + 0.25, "commit": "another"}
-    assert every.difference(changed, one[0]) == pytest.approx(0.25)
-    assert every.difference(one[0], one[1]) == float("inf")
-    assert every.difference({"gain": None}, {"gain": 1.0}) == float("inf")
+    apart, where = every.difference(changed, one[0])
+    assert apart == pytest.approx(0.25)
+    assert where == "in test of boulder-11 boulder hemisphere, 12 default"
+    assert every.difference(one[0], one[1])[0] == float("inf")
+    assert every.difference({"views": 3}, {"views": 4})[0] == 1
+    for wrong in (None, float("nan")):
+        assert every.difference({"gain": wrong}, {"gain": 1.0})[0] == float("inf")
 
 
 @pytest.mark.slow

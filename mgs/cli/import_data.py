@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -97,14 +97,9 @@ def import_data(
             raise InputError(f"import: {what}; give one of them")
     given = [path for path in (source, images, masks, mesh) if path]
     request = _request(options, [*photographs_in(images or source), *given])
-    if not force and (before := _finished(out)):
-        if before["request"] != request:
-            changed = "its pictures or the options have changed since"
-            cure = "--force makes it again, or give another folder"
-            raise InputError(f"{out}: holds a finished import; {changed}; {cure}")
-        if before.get("kind") == PHOTOGRAPHS:  # to place them again would take long
-            console.print(f"{out} is finished already; --force makes it again", soft_wrap=True)
-            return
+    if not force and request == _requested(out):
+        console.print(f"{out} is finished already; --force makes it again", soft_wrap=True)
+        return
     unpacked = out.with_name(f"{out.name}.unpacked")
     with (
         scratch_folder(unpacked, "" if is_bag(source) else f"*/{PLACED}") as scratch,
@@ -132,9 +127,10 @@ def import_data(
         result = import_source(
             trained, out, masks=masks, mesh=mesh, downscale=downscale, up=upward, tests=tests
         )
-        write_json(out / RECORD, read_json(out / RECORD) | {"request": request})
         fit, cloud = shots.fit, shots.sparse
-        if shots.kind != PHOTOGRAPHS:
+        if shots.kind == PHOTOGRAPHS:  # to place them again would take long
+            write_json(out / RECORD, read_json(out / RECORD) | {"request": request})
+        else:
             larger = trained.shots if downscale > 1 else []
             refine = refine_poses and not finished
             how = shots, larger, scratch, mesh is None, console if refine else None
@@ -206,14 +202,14 @@ def _request(options: dict[str, str], files: Sequence[Path]) -> str:
     return hashlib.sha256(json.dumps([options, about]).encode()).hexdigest()
 
 
-def _finished(out: Path) -> dict[str, Any] | None:
-    """Record of the finished import in a folder; None where there is none, or it has no request."""
+def _requested(out: Path) -> str | None:
+    """`_request` of the finished import of photographs in a folder; None where there is none."""
     from mgs.data.importers import RECORD
 
     if not all((out / name).is_file() for name in (RECORD, "transforms.json")):
         return None
     record = read_json(out / RECORD)
-    return record if isinstance(record, dict) and "request" in record else None
+    return record.get("request") if isinstance(record, dict) else None
 
 
 def _triangulated(

@@ -111,8 +111,9 @@ def read_colmap(source: Path, models: list[Path], images: Path) -> Source:
     result = source_of(reconstruction, files, f"{model}: image")
     placed = {shot.image for shot in result.shots}
     kinds = {(path.parent, path.suffix) for path in placed if path.suffix and path.is_file()}
-    beside = {path for folder, suffix in kinds for path in folder.glob(f"*{suffix}")}
-    left_out = Counter({"that the model does not place": len(beside - placed)})
+    beside = {path for folder, suffix in kinds for path in folder.glob(f"*{suffix}")} - placed
+    masks = {mask for one in placed | beside for mask in (one.name, f"{one.stem}_mask")}
+    left_out = Counter({"that the model does not place": sum(p.stem not in masks for p in beside)})
     return replace(result, notes=tuple(notes), left_out=left_out)
 
 

@@ -170,6 +170,8 @@ def fitted(camera: Camera, lens: Lens | None, image: Path) -> tuple[Camera, Lens
     """Camera and lens of an image file: scaled where the file is smaller by a factor of SMALLER,
     rounded up or down, else as they are."""
     own, whole = image_size(image), (camera.width, camera.height)
+    if (own[0] > own[1]) != (whole[0] > whole[1]) and exif_orientation(image) >= 5:
+        own = own[::-1]  # as it is looked at
     sides = list(zip(whole, own, strict=True))
     if not any(all(abs(side / k - one) < 1 for side, one in sides) for k in SMALLER):
         return camera, lens
@@ -218,7 +220,7 @@ def read_fitting(
     orientation = exif_orientation(path) if turned or real == size[::-1] != size else 1
     if size != (real[::-1] if orientation >= 5 else real):
         why = f"is {real[0]}x{real[1]}, but its camera is {camera.width}x{camera.height}"
-        raise InputError(f"{path}: {why}; give the pictures of these cameras, or correct w and h")
+        raise InputError(f"{path}: {why}; give pictures, masks and depth of their cameras' size")
     pixels = read(path)
     flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}.get(orientation, ())
     if orientation >= 5:

@@ -163,12 +163,12 @@ class Relaxation(Bounded):
         def part(some: slice) -> Floats:
             z, A = self._at(x, some)
             one, other = self._phi(A, some)[2]
-            sums = []
+            total = np.zeros((self.candidates, self.candidates))
             for k in range(0, len(z), most):
                 Z, P, Q = (values[k : k + most] for values in (z, one, other))
                 across = Z.transpose(0, 2, 1)
-                sums.append((((Z @ P) @ across) * ((Z @ Q) @ across)).sum(0))
-            return np.asarray(sum(sums))
+                total += (((Z @ P) @ across) * ((Z @ Q) @ across)).sum(0)
+            return total
 
         return np.asarray(sum(in_parts(len(self.base), part)))
 

@@ -32,8 +32,6 @@ def certificate(
 ) -> Certificate | None:
     """Certify a plan of some of `views` by the policy's criterion. Returns None where the policy
     has no `relaxation`, the plan has no view or all of them, or no view adds anything."""
-    scene.cache.clear()  # of all views, which were measured for the plan: bounds need much room
-    release()
     criterion = _criterion(scene, state, policy, views) if 0 < len(plan) < len(views) else None
     if criterion is None:
         return None
@@ -56,6 +54,8 @@ def _criterion(
     if relaxation is None or not views:
         return None
     report(Stage.SCORE, 0, 1)
+    scene.cache.clear()  # lists of all views, of the plan; the bounds need the memory
+    release()
     criterion: Criterion = relaxation(scene, state, views)
     return criterion if criterion.gain(range(len(views))) > 0 else None
 
