@@ -157,7 +157,7 @@ class TableRun:
         folders = self.cells()[-1].arguments
         options = " ".join(f"--set {key}={value}" for key, value in self.settings().items())
         where = f"{folders['dataset']} --prior {folders['prior']} --out RUN"
-        line = f"mgs nbv {where} --set train.alpha_weight=0 {options}"
+        line = f"mgs nbv {where} {options}"
         return line.replace(f"{HERE.parent}/", "")  # names no folder of this machine
 
 

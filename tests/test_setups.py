@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -245,6 +246,12 @@ def test_a_prior_is_built_once_and_whole(tmp_path, monkeypatch):
     monkeypatch.setattr("mgs.build_prior", None)
     assert case.make_prior(tmp_path, out, "dataset", gaussians=200) == found
     assert found["gaussians"] == 200
+
+
+def test_the_command_of_a_row_of_table_1_sets_what_its_run_does():
+    for run in table1.table_runs(table1.SIZES["paper"]).values():
+        given = re.findall(r"--set (\S+?)=", run.command())
+        assert given == ([] if run.policy in table1.ALL_3DGS else [*run.settings()])
 
 
 def test_a_run_and_3dgs_are_timed_alone_and_measured_on_all_views(tmp_path, monkeypatch):
