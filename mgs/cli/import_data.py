@@ -154,9 +154,10 @@ def _checked(
     masked: bool,
     refining: Terminal | None,
 ) -> tuple[Dataset, Agreement | None, SparseCloud | None]:
-    """Compare the poses of an import with its pictures. If they fit, refine them and print how far
-    they moved (`refining`), or triangulate points (`_triangulated`) where nothing tells where the
-    surfaces are; returns the dataset, the comparison and its points. masked: as in `agreement`."""
+    """Compare the poses of an import with its pictures. If they fit, refine them, or else
+    triangulate points where nothing tells where the surfaces are. Returns the dataset, the
+    comparison, and the points. larger: source pictures of `_triangulated`. masked: as in
+    `agreement`. refining: where to print how far poses moved; None: they are not refined."""
     from mgs.cli.nbv import moves_in_words
     from mgs.data.agreement import agreement
     from mgs.data.clouds import write_cloud

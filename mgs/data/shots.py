@@ -21,7 +21,7 @@ from mgs.data.world import PLUS_Z, Vector, degrees_between, up_of_cameras
 from mgs.errors import InputError
 from mgs.images import exif_orientation, image_size
 
-LEVELLED = 10.0  # angle from +Z, degrees, up to which cameras' common up vector counts as +Z
+LEVELLED = 10.0  # angle from +Z, degrees, up to which an estimated up counts as +Z
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 # Of a name without a suffix, as in NeRF-synthetic data: PNG first, which has alpha and is a mask.
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
@@ -164,8 +164,8 @@ class Source:
         estimate = up_of_cameras([_as_held(shot) for shot in self.shots])
         levelled = ("nerfstudio", "ROS bag", "TUM RGB-D", "RTAB-Map")
         if self.kind in levelled and degrees_between(estimate, PLUS_Z) < LEVELLED:
-            return PLUS_Z, f"the cameras' common up vector is within {LEVELLED:.0f} degrees of it"
-        return estimate, "the cameras' common up vector"
+            return PLUS_Z, f"as the cameras were held, to within {LEVELLED:.0f} degrees"
+        return estimate, "as the cameras were held"
 
 
 def _as_held(shot: Shot) -> Camera:

@@ -182,7 +182,7 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     others = "candidates"
     bar: dict[str, Any] = {"thickness": 12, "len": 0.6}
     if candidates and all(names[i] in prices for i in candidates):
-        price = {"title": {"text": "price: a<br>picture adds"}, **bar, "x": -0.1}
+        price = {"title": {"text": "price of a picture"}, **bar, "x": -0.1}
         colours = {"color": [prices[names[i]] for i in candidates], "colorscale": "Cividis"}
         circle = {"size": 5, **colours, "showscale": True, "colorbar": price}
         others = "candidates, by price"
