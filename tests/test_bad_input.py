@@ -180,6 +180,12 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
         ("points.ply: has values that are not finite", points_in_one_place),
     ],
     (synthetic.write_dataset, "import {d}/images --out {out}"): [("can be placed", nothing)],
+    (synthetic.write_dataset, "import {d}/images --out {d}/images/e/f"): [
+        ("images: the output would lie among its photographs", nothing)
+    ],
+    (synthetic.write_dataset, "import {d} --out {d}/images --force"): [
+        ("kf_0000.png is in it and is read", nothing)
+    ],
     (synthetic.write_dataset, "import {d} --out {out} --masks {d}/masks"): [
         ("no mask for image kf_0000.png", remove("masks/kf_0000.png")),
         ("kf_0000.png: is 32x24", png("masks/kf_0000.png", np.ones((24, 32), bool))),

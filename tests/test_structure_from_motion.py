@@ -1,5 +1,6 @@
 """Points triangulated at given poses, and poses of photographs alone, against the truth."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pycolmap
 import pytest
 import synthetic
 from PIL import ExifTags, Image
-from program import command, exit_code, python, said, stop_at
+from program import command, exit_code, output, python, said, stop_at
 from refusals import fails, refused
 from scipy.ndimage import map_coordinates
 
@@ -29,7 +30,7 @@ from mgs.data.shots import Spacing
 from mgs.data.sources import read_source
 from mgs.data.structure import Matcher
 from mgs.errors import Notice
-from mgs.files import read_json
+from mgs.files import read_json, write_json
 from mgs.fit.poses import displaced, motion_between
 from mgs.images import write_png
 from mgs.prior.photographs import check_photographs
@@ -84,15 +85,18 @@ def test_poses_without_points_get_them(downscale, frames, tmp_path, capsys):
     assert np.median(distances(points)) < 0.005
 
 
-def test_noisy_poses_are_adjusted_to_the_pictures(frames, tmp_path, capsys):
+def test_noisy_poses_are_adjusted_to_the_pictures(frames, tmp_path, capsys, monkeypatch):
     """Noise of 0.25 degrees and 6 mm about each axis: turns between neighbours become right."""
     rng, std = np.random.default_rng(0), [np.radians(0.25)] * 3 + [0.0065] * 3
     noisy = [replace(f, camera=displaced(f.camera, rng.normal(0, std))) for f in frames]
     root = frames[0].image_path.parent.parent
     write_transforms(root, noisy)
     options = ["--refine-poses", "--up", "0,0,1", "--test-every", "4"]
-    command("import", root, "--out", tmp_path / "d", *options)
-    assert "poses moved 0." in said(capsys)[0]
+    with monkeypatch.context() as patched:
+        patched.setattr("mgs.data.structure.refined", stop_at())
+        assert exit_code("import", root, "--out", tmp_path / "d", *options) == 130
+    for words in ("poses moved 0.", "is finished already"):
+        assert words in output(capsys, "import", root, "--out", tmp_path / "d", *options)
     data = load_dataset(tmp_path / "d")
     after = sorted([*data.frames, *data.test_views().frames], key=lambda frame: frame.name)
 
@@ -264,7 +268,8 @@ def test_a_video_gives_the_sharpest_frames_up_to_where_it_ends(tmp_path):
 
 def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, capsys, monkeypatch):
     """So does one that is refused then, and one that is refused after the photographs are placed. A
-    finished one places none again. Large images are named before they are written."""
+    finished one places none again, and names what differs. Large images are named before they are
+    written."""
     root = frames[0].image_path.parent
     out, matches = tmp_path / "d", tmp_path / "d.unpacked/matches/database.db"
     with monkeypatch.context() as patched:
@@ -278,16 +283,30 @@ def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, capsys, monke
         assert "other" in said(capsys)[1]
     monkeypatch.setattr("pycolmap.incremental_mapping", stop_at())
     with monkeypatch.context() as patched:
-        patched.setattr("mgs.cli.import_data.MANY_PIXELS", WIDTH * HEIGHT // 3)
-        patched.setattr("mgs.data.importers.import_shot", stop_at())
+        patched.setattr("mgs.data.importers.MANY_PIXELS", WIDTH * HEIGHT // 3)
+        patched.setattr("mgs.data.importers.write_png", stop_at())
+        unmasked = ["import", root, "--out", out, "--masks", matches.parent]
+        assert "no mask for image" in refused(capsys, unmasked)
         assert exit_code("import", root, "--out", out) == 130
-        assert "take long to fit; --downscale 2" in said(capsys)[1]
+        assert "take long to fit; downscale 2" in said(capsys)[1]
     command("import", root, "--out", out)
     assert len(load_dataset(out)) == len(frames)
     assert not (tmp_path / "d.unpacked").exists()
     words = [sys.executable, "-m", "mgs", "import", root, "--out", out]  # also in another process
     done = subprocess.run(words, capture_output=True, text=True)
     assert done.stdout == f"{out} is finished already; --force makes it again\n"
+    again = ["import", os.path.relpath(root), "--out", out, "--up", "auto"]
+    assert "is finished already" in output(capsys, *again)
+    options = ["--up", "0,0,1"], ["--masks", root], ["--refine-poses"], ["--exclude", "view 00"]
+    for words in options:
+        assert f"finished with another {words[0]};" in refused(capsys, [*again[:4], *words], out)
+    shutil.copytree(root, tmp_path / "other")
+    assert "another source" in refused(capsys, ["import", tmp_path / "other", *again[2:]], out)
+    record = read_json(out / "import.json")
+    write_json(out / "import.json", record | {"files": "other"})
+    assert "photographs, masks, mesh or model have changed" in refused(capsys, again, out)
+    write_json(out / "import.json", record | {"options": {}})  # of another version: unknown
+    assert "is finished already" in output(capsys, *again, "--up", "0,0,1")
 
 
 def test_placing_continues_from_its_largest_whole_state(frames, tmp_path, monkeypatch):

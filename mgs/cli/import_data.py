@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -18,14 +17,12 @@ from mgs.errors import InputError
 from mgs.files import Ours, clear_folder, read_json, scratch_folder, write_json
 
 if TYPE_CHECKING:
-    from mgs.camera import Camera
     from mgs.data.agreement import Agreement
     from mgs.data.clouds import SparseCloud
     from mgs.data.dataset import Dataset
     from mgs.data.shots import Shot, Source
     from mgs.data.structure import Matcher
 
-MANY_PIXELS = 2_000_000  # pixels of an image beyond which --downscale is recommended
 EXPOSURE_DIFFERS = 0.1  # stops by EXIF beyond which --exposure is recommended
 MOSTLY = 0.3  # share of empty masks beyond which a line says so
 
@@ -79,8 +76,9 @@ def import_data(
       points that pictures share; for poses that are a little wrong. Needs texture.
     - test_split: Split of NeRF-synthetic data that becomes the test views; publications take test.
     """
-    options = {key: str(value) for key, value in locals().items() if key not in ("out", "force")}
+    options = {key: value for key, value in locals().items() if key not in ("out", "force")}
     from mgs.data.bags import is_bag
+    from mgs.data.colmap import models_in
     from mgs.data.importers import RECORD, import_source
     from mgs.data.meshes import GLTF
     from mgs.data.photographs import KIND as PHOTOGRAPHS
@@ -95,9 +93,17 @@ def import_data(
     ):
         if one is not None and other is not None:
             raise InputError(f"import: {what}; give one of them")
+    axis = parse_up(up)
     given = [path for path in (source, images, masks, mesh) if path]
-    request = _request(options, [*photographs_in(images or source), *given])
-    if not force and request == _requested(out):
+    options = _resolved(options | {"up": axis})
+    pictures = [
+        path for folder in (images or source, masks) if folder for path in photographs_in(folder)
+    ]
+    model = [path for folder in models_in(source) for path in folder.iterdir()]
+    files = _stamp([*given, *pictures, *model, source / "transforms.json"])
+    record = {} if force else _finished(out)
+    _check_same(out, record, options, files if record.get("kind") == PHOTOGRAPHS else None)
+    if record.get("kind") == PHOTOGRAPHS and "files" in record:  # to place them again takes long
         console.print(f"{out} is finished already; --force makes it again", soft_wrap=True)
         return
     unpacked = out.with_name(f"{out.name}.unpacked")
@@ -116,25 +122,21 @@ def import_data(
         )
         shots = shots if unit is None else shots.in_metres(unit)
         shots = shots if distance is None else shots.with_distance(distance)
-        axis = parse_up(up)
         upward, reason = shots.up_or_estimate() if axis is None else (axis, "as --up says")
         if force:
-            clear_folder(out, Ours(FILES, given))
-        finished = os.path.isfile(out / "transforms.json")  # else the import refuses what is there
-        if not finished:
-            _advise_size(notes, shots.shots[0].camera, downscale)
+            read = [path for shot in shots.shots for path in shot.files]
+            clear_folder(out, Ours(FILES, [*given, *read]))
         trained, tests = shots.set_apart(test_every)
-        result = import_source(
-            trained, out, masks=masks, mesh=mesh, downscale=downscale, up=upward, tests=tests
-        )
+        how: Any = {"masks": masks, "mesh": mesh, "downscale": downscale, "up": upward}
+        result = import_source(trained, out, **how, tests=tests, options=options)
         fit, cloud = shots.fit, shots.sparse
-        if shots.kind == PHOTOGRAPHS:  # to place them again would take long
-            write_json(out / RECORD, read_json(out / RECORD) | {"request": request})
-        else:
+        if shots.kind != PHOTOGRAPHS:
             larger = trained.shots if downscale > 1 else []
-            refine = refine_poses and not finished
-            how = shots, larger, scratch, mesh is None, console if refine else None
-            result, fit, cloud = _checked(result, *how)
+            refine = refine_poses and not record
+            about = shots, larger, scratch, mesh is None, console if refine else None
+            result, fit, cloud = _checked(result, *about)
+        if not record:
+            write_json(out / RECORD, read_json(out / RECORD) | {"files": files})
     if mesh is not None and mesh.suffix.lower() in GLTF:
         console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
     for note in [*shots.notes, *_advice(shots, result)]:
@@ -143,7 +145,7 @@ def import_data(
         notes.print(f"mgs: the poses {fit.problem} ({_evidence(fit)})", soft_wrap=True)
     world = f"{_evidence(fit, cloud)}; up {_numbers(upward)}, {reason}"
     _print_summary(console, shots, tests, result, world)
-    console.print(f"{out} is finished already" if finished else f"wrote {out}", soft_wrap=True)
+    console.print(f"{out} is finished already" if record else f"wrote {out}", soft_wrap=True)
 
 
 def _checked(
@@ -188,29 +190,46 @@ def _evidence(fit: Agreement | None, cloud: SparseCloud | None = None) -> str:
     return text if cloud is None else f"{_points(cloud)}; {text}"
 
 
-def _advise_size(notes: Terminal, camera: Camera, downscale: int) -> None:
-    """Say where images will be large, before they are written, since that takes long, too."""
-    least = int(np.ceil(np.sqrt(camera.width * camera.height / MANY_PIXELS)))
-    if downscale < least:
-        size = f"{camera.width // downscale}x{camera.height // downscale}"
-        cure = f"--downscale {least} makes them smaller"
-        notes.print(f"mgs: images of {size} take long to fit; {cure}", soft_wrap=True)
+def _resolved(options: dict[str, Any]) -> dict[str, Any]:
+    """Options as values of JSON that are the same for other words of the same."""
+    paths = {key: str(value.resolve()) for key, value in options.items() if isinstance(value, Path)}
+    names = sorted(set(options["exclude"] or ()))
+    resolved: dict[str, Any] = json.loads(json.dumps(options | paths | {"exclude": names}))
+    return resolved
 
 
-def _request(options: dict[str, str], files: Sequence[Path]) -> str:
-    """SHA-256 of an import's options and of its files' paths and times of modification."""
-    about = [(str(path.resolve()), path.stat().st_mtime_ns) for path in files if path.is_file()]
-    return hashlib.sha256(json.dumps([options, about]).encode()).hexdigest()
+def _stamp(files: Sequence[Path]) -> str:
+    """SHA-256 of the paths and times of modification of the files that exist."""
+    about = sorted({(str(p.resolve()), p.stat().st_mtime_ns) for p in files if p.is_file()})
+    return hashlib.sha256(json.dumps(about).encode()).hexdigest()
 
 
-def _requested(out: Path) -> str | None:
-    """`_request` of the finished import of photographs in a folder; None where there is none."""
+def _finished(out: Path) -> dict[str, Any]:
+    """Record of the finished import in a folder. Empty where there is none. Records of earlier
+    versions have neither options nor files."""
     from mgs.data.importers import RECORD
 
     if not all((out / name).is_file() for name in (RECORD, "transforms.json")):
-        return None
-    record = read_json(out / RECORD)
-    return record.get("request") if isinstance(record, dict) else None
+        return {}
+    record: Any = read_json(out / RECORD)
+    whole = isinstance(record, dict) and ("files" in record or "options" not in record)
+    return dict(record) if whole else {}
+
+
+def _check_same(
+    out: Path, record: dict[str, Any], options: dict[str, Any], files: str | None
+) -> None:
+    """Raise InputError where a finished import has other options or files, as far as its record
+    says. files: `_stamp`; None: not compared."""
+    before: Any = record.get("options")
+    known: dict[str, Any] = before if isinstance(before, dict) else {}
+    for key, value in known.items():
+        if options.get(key, value) != value:
+            what = key if key == "source" else f"--{key.replace('_', '-')}"
+            raise InputError(f"{out}: is finished with another {what}; --force makes it again")
+    if files and record.get("files", files) != files:
+        why = "its photographs, masks, mesh or model have changed since"
+        raise InputError(f"{out}: is finished, and {why}; --force makes it again")
 
 
 def _triangulated(

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,12 +20,13 @@ from mgs.data.meshes import Mesh, read_mesh
 from mgs.data.shots import Shot, Source, find_image
 from mgs.data.world import PLUS_Z, Vector, World
 from mgs.errors import InputError, Notice
-from mgs.files import copy_file, fingerprint, folder_locked, remove_file, write_json
+from mgs.files import copy_file, fingerprint, folder_locked, read_leftover, remove_file, write_json
 from mgs.images import PNG_BIT_DEPTH, read_depth, read_mask, read_rgba, write_exr, write_png
 from mgs.progress import report
 
 Silhouette = Callable[[Camera], np.ndarray]  # mask of a camera, bool [H,W]
 
+MANY_PIXELS = 2_000_000  # pixels of an image beyond which downscale is recommended
 CHECKED = 4  # about the number of pictures that are checked before an import
 RECORD = "import.json"  # record of what is imported; an interrupted import of the same continues
 
@@ -39,6 +40,7 @@ def import_source(
     downscale: int = 1,
     up: Vector = PLUS_Z,
     tests: Source | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> Dataset:
     """Write a source as a dataset into `out`: new, empty, or left by an interrupted import of it.
 
@@ -48,7 +50,8 @@ def import_source(
     from an alpha with intermediate values that gives the mask; with `masks` or `mesh` there are
     none. Images, depth and masks are undistorted to a pinhole camera in which every pixel is valid,
     then reduced by blocks of `downscale` x `downscale`. up: as `World`. tests: shots of the same
-    world, which become the test views.
+    world, which become the test views. options: recorded, values of JSON; of others an interrupted
+    import is not continued.
 
     When an interrupted import continues, a finished frame is made again only if one of its files
     is newer; the result is the same bit for bit. A finished import is loaded as it is. Raises
@@ -64,7 +67,7 @@ def import_source(
 
         cameras, world = [shot.camera for shot in shots], World(origin=source.origin)
         silhouette = silhouette_of(mesh_in_sight(read_mesh(mesh), cameras, world, mesh))
-    record = {
+    record: dict[str, Any] = {
         "kind": source.kind,
         "frames": len(shots),
         "sha256_of_frames": _digest(shots),
@@ -73,12 +76,18 @@ def import_source(
         "test_views": None if tests is None else len(tests.shots),
     }
     with folder_locked(out):
+        before = read_leftover(out / RECORD)
+        if options and (
+            before is None or "options" in before
+        ):  # those of earlier versions lack them
+            record["options"] = options
         if resumes(out, RECORD, record) and (out / "transforms.json").is_file():
             return load_dataset(out)
 
         def begin() -> None:
             if not (out / RECORD).is_file():
                 write_json(out / RECORD, record)
+                _advise_size(shots[0].camera, downscale)
 
         _warn_of_bits(shots)
         frames = []
@@ -162,8 +171,7 @@ def import_shot(
         out / folder / f"{shot.name}.png" for folder in ("images", "masks", "rock")
     )
     depth_path = None if shot.depth is None else out / "depth" / f"{shot.name}.exr"
-    files = [path for path in (shot.image, shot.depth, shot.mask, shot.rock) if path]
-    newest = max(path.stat().st_mtime_ns for path in files if path.is_file())
+    newest = max(path.stat().st_mtime_ns for path in shot.files if path.is_file())
     if not image.is_file() or image.stat().st_mtime_ns < newest:
         rgba = read_fitting(read_rgba, shot.image, shot.camera, shot.turned)
         mask, rock = silhouette(camera) if silhouette else None, None
@@ -238,6 +246,15 @@ def _warn_of_bits(shots: Sequence[Shot]) -> None:
             f"{deep[0]}: its values use {bits} of 16 bits, so the pictures are nearly black; "
             f"multiply them by {2 ** (16 - bits)}"
         )
+        warnings.warn(Notice(text), stacklevel=2)
+
+
+def _advise_size(camera: Camera, downscale: int) -> None:
+    """Warn where images will be large, before they are written, since that takes long, too."""
+    least = int(np.ceil(np.sqrt(camera.width * camera.height / MANY_PIXELS)))
+    if downscale < least:
+        size = f"{camera.width // downscale}x{camera.height // downscale}"
+        text = f"images of {size} take long to fit; downscale {least} makes them smaller"
         warnings.warn(Notice(text), stacklevel=2)
 
 

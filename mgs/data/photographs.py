@@ -40,11 +40,15 @@ STEP = 100  # photographs that are placed from one state to the next
 NAMED = 10  # most photographs that a line names
 
 
+def pictures_of(source: Path) -> Path:
+    """Folder of the pictures of a folder of photographs: its folder `images`, or itself."""
+    return source / "images" if (source / "images").is_dir() else source
+
+
 def photographs_in(source: Path) -> list[Path]:
-    """Pictures in a folder and the folders in it, or in its folder `images`; none if it is none."""
-    root = source / "images" if (source / "images").is_dir() else source
+    """Pictures in `pictures_of` a folder and the folders in it; none if it is none."""
     endings = (*PICTURE_SUFFIXES, *UNREAD)
-    paths = [path for path in root.rglob("*") if path.suffix.lower() in endings]
+    paths = [path for path in pictures_of(source).rglob("*") if path.suffix.lower() in endings]
     return sorted((path for path in paths if path.is_file()), key=natural)
 
 

@@ -51,6 +51,10 @@ class Shot:
     turned: bool = False  # its files are turned by their EXIF orientation
     mended: bool = False  # its rotation was NEARLY_RIGID
 
+    @property
+    def files(self) -> list[Path]:
+        return [path for path in (self.image, self.depth, self.mask, self.rock) if path]
+
 
 @dataclass(frozen=True)
 class Source:

@@ -22,6 +22,7 @@ from mgs.data.photographs import (
     UNREAD,
     VIDEO_SUFFIXES,
     photographs_in,
+    pictures_of,
     read_photographs,
     sharpest_frames,
 )
@@ -140,6 +141,10 @@ def _recognised(
     if models := models_in(source):
         return read_colmap(source, models, images if images is not None else source / "images")
     if paths := photographs_in(images or source):
+        root = pictures_of(images or source)
+        if folder.resolve().is_relative_to(root.resolve()):
+            why = "the output would lie among its photographs, and its pictures be taken for some"
+            raise InputError(f"{root}: {why}; write it to a place outside")
         return read_photographs(images or source, paths, folder / "matches", exclude)
     raise InputError(
         f"{source}: holds no photographs (PNG, JPEG, TIFF, WebP), transforms.json, "
