@@ -319,8 +319,10 @@ def test_images_are_excluded_by_name(dataset, tmp_path, capsys):
 
 @pytest.mark.parametrize("kind", ["nerfstudio", "COLMAP"])
 def test_images_may_be_smaller_than_their_cameras(dataset, tmp_path, kind, capsys):
-    for key in ("depth_file_path", "mask_path"):
-        synthetic.edit(dataset.root, lambda data, key=key: [one.pop(key) for one in data["frames"]])
+    """Masks of the cameras' size are reduced, too."""
+    synthetic.edit(
+        dataset.root, lambda data: [one.pop("depth_file_path") for one in data["frames"]]
+    )
     source = dataset.root
     if kind == "COLMAP":
         source = tmp_path / "colmap"
@@ -328,16 +330,18 @@ def test_images_may_be_smaller_than_their_cameras(dataset, tmp_path, kind, capsy
     for frame in dataset.frames:
         with Image.open(frame.image_path) as image:
             image.resize((image.width // 4, image.height // 4)).save(frame.image_path)
-    command("import", source, "--out", tmp_path / "c")
+    masks = ["--masks", dataset.root / "masks"] if kind == "COLMAP" else []
+    command("import", source, "--out", tmp_path / "c", *masks)
     assert f"{len(dataset)} images are smaller than their cameras" in said(capsys)[1]
     for one, other in zip(dataset.frames, load_dataset(tmp_path / "c").frames, strict=True):
         point = one.camera.camera_to_world[:3] @ [0.1, 0.2, 1, 1]
         pixels = [frame.camera.project(point[None])[0] for frame in (one, other)]
         assert np.allclose(pixels[0], 4 * pixels[1])
+        assert (other.mask() == one.mask()[2::4, 2::4]).all()
 
 
-@pytest.mark.parametrize("own", [(34, 25), (33, 26)])
-def test_a_smaller_image_is_rounded_up_or_down_and_its_lens_scaled(tmp_path, own):
+@pytest.mark.parametrize("own", [(34, 25), (33, 26), (80, 61)])
+def test_a_smaller_image_of_any_factor_is_rounded_up_or_down_and_its_lens_scaled(tmp_path, own):
     K = np.array([[120.0, 0, 66], [0, 121, 52], [0, 0, 1]])
     camera = Camera(K, 133, 102, np.eye(4))
     lens = Lens.of("lens", "OPENCV", K, {"k1": -0.1, "k2": 0.02})

@@ -215,7 +215,7 @@ def _mask_and_rock(
         cutout = rgba
     rock = None if cutout is None else undo(premultiplied(cutout), True)
     if shot.mask is not None:
-        mask = read_fitting(read_mask, shot.mask, *about)
+        mask = read_fitting(read_mask, shot.mask, *about, reduced=True)
         return undo(mask.astype(np.uint8) * 255, True) >= 128, rock
     return undo(alpha, True) > full // 2 if alpha.min() < full else None, rock
 

@@ -25,7 +25,8 @@ GENERAL = {  # camera models that are cases of a more general one, which takes t
 }
 
 FARTHEST = np.tan(np.radians(60))  # largest tangent in an undistorted image; fisheyes are cut
-SMALLER = (2, 4, 8)  # factors by which images may be smaller than their cameras
+HALVED = (2, 4, 8)  # factors by which programs reduce pictures, each side rounded up or down
+REDUCED = 1.5  # least factor of smaller pictures: undistorted ones may be a little smaller, too
 BLOCK = 1 << 20  # pixels that are mapped at once
 
 
@@ -167,17 +168,25 @@ def _is_sound(at: np.ndarray, lens: Lens, K: np.ndarray, size: tuple[int, int]) 
 
 
 def fitted(camera: Camera, lens: Lens | None, image: Path) -> tuple[Camera, Lens | None]:
-    """Camera and lens of an image file: scaled where the file is smaller by a factor of SMALLER,
-    rounded up or down, else as they are."""
+    """Camera and lens of an image file: scaled where the file `is_reduced` by at least REDUCED,
+    else as they are."""
     own, whole = image_size(image), (camera.width, camera.height)
     if (own[0] > own[1]) != (whole[0] > whole[1]) and exif_orientation(image) >= 5:
         own = own[::-1]  # as it is looked at
-    sides = list(zip(whole, own, strict=True))
-    if not any(all(abs(side / k - one) < 1 for side, one in sides) for k in SMALLER):
+    if max(whole) < REDUCED * max(own) or not is_reduced(own, whole):
         return camera, lens
     across, down = np.divide(own, whole).tolist()
     K = camera.K * [[across, 1, across], [1, down, down], [1, 1, 1]]
     return Camera(K, *own, camera.world_to_camera), lens and lens.scaled(across, down)
+
+
+def is_reduced(size: tuple[int, int], whole: tuple[int, int]) -> bool:
+    """Whether a size is a larger one reduced by one factor, to a pixel."""
+    factors = max(whole) / max(size), *HALVED
+    sides = list(zip(whole, size, strict=True))
+    return size != whole and any(
+        k >= 1 and all(abs(side / k - one) < 1 for side, one in sides) for k in factors
+    )
 
 
 def shrunk(
@@ -212,17 +221,28 @@ def shrunk_to(camera: Camera, most: float) -> tuple[Camera, Undo]:
 
 
 def read_fitting(
-    read: Callable[[Path], np.ndarray], path: Path, camera: Camera, turned: bool = False
+    read: Callable[[Path], np.ndarray],
+    path: Path,
+    camera: Camera,
+    turned: bool = False,
+    reduced: bool = False,
 ) -> np.ndarray:
     """Pixels of an image file, turned by its EXIF orientation if `turned`, or if only that fits its
-    camera's size. Raises InputError, before anything is decoded, if neither size fits."""
+    camera's size. reduced: a larger one of the same proportions gives the nearest pixels. Raises
+    InputError, before anything is decoded, if neither size fits."""
     size, real = (camera.width, camera.height), image_size(path)
     orientation = exif_orientation(path) if turned or real == size[::-1] != size else 1
-    if size != (real[::-1] if orientation >= 5 else real):
+    whole = real[::-1] if orientation >= 5 else real
+    if size != whole and not (reduced and is_reduced(size, whole)):
         why = f"is {real[0]}x{real[1]}, but its camera is {camera.width}x{camera.height}"
         raise InputError(f"{path}: {why}; give pictures, masks and depth of their cameras' size")
     pixels = read(path)
     flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}.get(orientation, ())
     if orientation >= 5:
         pixels = pixels.swapaxes(0, 1)
-    return np.ascontiguousarray(np.flip(pixels, flips))
+    pixels = np.flip(pixels, flips)
+    if size != whole:
+        sides = zip(size, whole, strict=True)
+        columns, rows = ((2 * np.arange(one) + 1) * side // (2 * one) for one, side in sides)
+        pixels = pixels[rows[:, None], columns]
+    return np.ascontiguousarray(pixels)
