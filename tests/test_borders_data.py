@@ -123,6 +123,25 @@ def test_a_transforms_json_is_read_as_its_authors_mean_it(data):
     assert source.notes[0].startswith("12 rotations ")
 
 
+@pytest.mark.parametrize("windows", [True, False])
+def test_absolute_paths_give_names_of_what_differs(data, windows):
+    """Also of a folder that is elsewhere, whose pictures are found by their names' ends."""
+
+    def change(json):
+        for k, frame in enumerate(json["frames"]):
+            path = data.root / f"images/{'ab'[k % 2]}/{k}.png"
+            path.parent.mkdir(exist_ok=True)
+            shutil.move(data.root / frame["file_path"], path)
+            old = f"C:\\of\\a person\\{'ab'[k % 2]}\\{k}.png"
+            frame["file_path"] = old if windows else str(path)
+        json["test_filenames"] = [json["frames"][1]["file_path"]]
+
+    synthetic.edit(data.root, change)
+    source = read_source(data.root, data.root / "images" if windows else None)
+    assert [shot.name for shot in source.shots] == [f"{'ab'[k % 2]}_{k}" for k in range(12)]
+    assert source.tests == {"b_1"}
+
+
 FISHEYE = "OPENCV_FISHEYE"
 MODELS = {
     "SIMPLE_RADIAL": {"k1": 0.1},

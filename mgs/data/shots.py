@@ -3,12 +3,13 @@ time, and the choice of keyframes."""
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -184,11 +185,18 @@ def _as_held(shot: Shot) -> Camera:
 
 
 def frame_name(path: str) -> str:
-    """Flat name of an image path, which is no path: images/left/0001.png -> left_0001."""
-    parts = list(Path(path.replace("\\", "/")).parts)
+    """Flat name of an image path, which is no path: images/left/0001.png -> left_0001. An absolute
+    one only loses its suffix: what it has in common with others is for `checked` to remove."""
+    text = path.replace("\\", "/")
+    parts = list(Path(text.lstrip("/")).parts)
     if parts and Path(parts[-1]).suffix.lower() in PICTURE_SUFFIXES:
         parts[-1] = Path(parts[-1]).stem
-    return "_".join(part for part in parts if part not in (".", "..", "/", "images"))
+    absolute = text.startswith("/") or PureWindowsPath(path).drive
+    return "/".join(parts) if absolute else _flat(parts)
+
+
+def _flat(parts: Sequence[str]) -> str:
+    return "_".join(part for part in parts if part not in (".", "..", "images"))
 
 
 def find_image(folder: Path, name: str, suffixes: Sequence[str] = SUFFIXES) -> Path | None:
@@ -204,19 +212,26 @@ def none_exists(path: Path, count: int, example: str = "") -> InputError:
 
 
 def checked(path: Path, source: Source) -> Source:
-    """Source without the shots whose image does not exist. Raises InputError if none is left, if a
-    name is listed twice, or cannot be that of a file."""
+    """Source without the shots whose image does not exist. Absolute paths become
+    names of what their folders do not have in common. Raises InputError if none is left, if a name
+    is listed twice, or cannot be that of a file."""
     there = [shot for shot in source.shots if shot.image.is_file()]
     left_out = source.left_out + Counter({"whose file is missing": len(source.shots) - len(there)})
     if not there:
         count = source.left_out.total() + len(source.shots)
         raise none_exists(path, count, *(str(shot.image) for shot in source.shots[:1]))
+    absolute = {shot.name: Path(shot.name) for shot in there if "/" in shot.name}
+    above = [path.parent.parent for path in absolute.values()]
+    common = len(Path(os.path.commonpath(above)).parts) if above else 0
+    names = {name: _flat(path.parts[common:]) for name, path in absolute.items()}
+    there = [replace(shot, name=names.get(shot.name, shot.name)) for shot in there]
+    tests = frozenset(names.get(name, name) for name in source.tests)
     for name, count in Counter(shot.name for shot in there).items():
         if count > 1:
             raise InputError(f"{path}: lists {name} more than once; remove the duplicate frames")
         if not name or name != Path(name).name or not name.isprintable():
             raise InputError(f"{path}: {name!r} cannot be the name of a file; rename the image")
-    return replace(source, shots=there, left_out=+left_out)
+    return replace(source, shots=there, left_out=+left_out, tests=tests)
 
 
 def turned_by_exif(source: Source) -> Source:
