@@ -67,6 +67,17 @@ def corrupt_jpeg(root: Path) -> None:
     frame(0, file_path="images/kf_0000.jpg")(root)
 
 
+def model_without(*names: str) -> Change:
+    """Photographs beside a COLMAP model that lacks files."""
+
+    def apply(root: Path) -> None:
+        synthetic.write_colmap(synthetic.write_dataset(root, depth=False), root / "colmap", True)
+        for name in names:
+            remove(f"colmap/sparse/0/{name}.bin")(root)
+
+    return apply
+
+
 def points_in_one_place(root: Path) -> None:
     write_cloud(root / "points.ply", SparseCloud(np.ones((500, 3))))
     header(ply_file_path="points.ply")(root)
@@ -178,6 +189,10 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
         ("none of the 8 images it lists exists, as images/kf_0000", without_images),
         ("kf_0000.jpg: not a readable image", corrupt_jpeg),
         ("points.ply: has values that are not finite", points_in_one_place),
+    ],
+    (nothing, "import {d}/colmap --out {out}"): [
+        ("sparse/0: a COLMAP model without points3D.bin; restore it", model_without("points3D")),
+        ("without cameras.bin and images.bin", model_without("images", "cameras")),
     ],
     (synthetic.write_dataset, "import {d}/images --out {out}"): [("can be placed", nothing)],
     (synthetic.write_dataset, "import {d}/images --out {d}/images/e/f"): [

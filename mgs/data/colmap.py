@@ -84,10 +84,24 @@ def models_in(source: Path) -> list[Path]:
 
 
 def _is_model(folder: Path) -> bool:
-    return any(
-        all((folder / f"{name}.{kind}").is_file() for name in ("cameras", "images", "points3D"))
-        for kind in ("bin", "txt")
-    )
+    return any(not _missing(folder, kind) for kind in ("bin", "txt"))
+
+
+def _missing(folder: Path, kind: str) -> list[str]:
+    """Names of the files of a model that a folder lacks."""
+    names = (f"{name}.{kind}" for name in ("cameras", "images", "points3D"))
+    return [name for name in names if not (folder / name).is_file()]
+
+
+def check_no_part(source: Path) -> None:
+    """Raise InputError where a folder in which `models_in` finds none holds part of a model. Texts
+    of these names count in `sparse`."""
+    places = [*source.glob("sparse/*/"), source / "sparse", source]
+    for folder, kind in ((place, kind) for place in places for kind in ("bin", "txt")):
+        missing = _missing(folder, kind)
+        if len(missing) < 3 and (kind == "bin" or folder != source):
+            why = f"a COLMAP model without {' and '.join(missing)}"
+            raise InputError(f"{folder}: {why}; restore it, or move it away to place photographs")
 
 
 def read_colmap(source: Path, models: list[Path], images: Path) -> Source:

@@ -13,7 +13,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.data.bags import is_bag, read_bag
 from mgs.data.clouds import read_cloud
-from mgs.data.colmap import models_in, read_colmap
+from mgs.data.colmap import check_no_part, models_in, read_colmap
 from mgs.data.dataset import finite_number, posed_camera, read_records, timestamp_of, unit_of
 from mgs.data.lens import Lens
 from mgs.data.peers import PEERS, is_peer, read_peer
@@ -140,6 +140,7 @@ def _recognised(
         return _read_transforms(path if path.is_file() else split_path, images)
     if models := models_in(source):
         return read_colmap(source, models, images if images is not None else source / "images")
+    check_no_part(source)
     if paths := photographs_in(images or source):
         root = pictures_of(images or source)
         if folder.resolve().is_relative_to(root.resolve()):
