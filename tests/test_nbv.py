@@ -20,11 +20,11 @@ from program import change_settings, steps, timeless
 from refusals import fails
 from tiny import resume, run
 
-from mgs import load_dataset, read_ply
+from mgs import load_dataset, load_prior, read_ply
 from mgs.fit.stopping import StopReason
 from mgs.policy import criteria, poses
 from mgs.run import folder as run_folder
-from mgs.run import policies
+from mgs.run import nbv, policies
 
 OF_A_FIT = {"uncertainty", "iterations", "loss", "stop_reason"}
 
@@ -34,6 +34,17 @@ def uninterrupted(loaded, tmp_path_factory):
     """A whole run, its PLY and its steps."""
     out = tmp_path_factory.mktemp("whole") / "run"
     return run(out, loaded, seed=3), (out / "gaussians.ply").read_bytes(), steps(out)
+
+
+def test_a_fit_loads_its_prior_once_and_decides_its_own_start(
+    dataset, prior, tmp_path, monkeypatch
+):
+    loads = []
+    monkeypatch.setattr(nbv, "load_prior", lambda path: (loads.append(path), load_prior(path))[1])
+    started = nbv.start_fit(dataset, tmp_path / "run", prior=prior)
+    assert (loads, "prior" in vars(started)) == ([prior], True)
+    for name, value in {"source": "hull", "loose": 1.0, "parts": 2.0, "live": None}.items():
+        fails(f"fit: {name} is", nbv.start_fit, dataset, tmp_path / "other", **{name: value})
 
 
 def test_views_are_the_best_at_the_model_and_given_the_batch_so_far(loaded, tmp_path):

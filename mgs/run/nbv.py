@@ -14,7 +14,7 @@ from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame, has_masks
 from mgs.data.structure import CLOUD, write_refined
 from mgs.errors import InputError
-from mgs.files import THERE, Ours, atomic_folder, reading
+from mgs.files import THERE, Ours, atomic_folder, read_leftover, reading
 from mgs.fit.density import GROWTH, split_times
 from mgs.fit.settings import ALPHA_WEIGHT, MOST_OF_FIT, ModelSettings, TrainSettings, as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE, Gaussians
@@ -133,7 +133,9 @@ def start_run(
     if holds_run(out) and not force:
         raise InputError(f"{out}: a run {THERE}; `mgs nbv --resume {out}` continues it")
     root = dataset.root if isinstance(dataset, Dataset) else Path(dataset)
-    prior, folder = _prior_of(root, prior, gaussians, source)
+    prior = _place_of(root, prior, gaussians, source)
+    folder = prior if isinstance(prior, Path) else None
+    prior = load_prior(prior) if isinstance(prior, Path) else prior
     up = up_of_prior(folder) if folder else None
     if not isinstance(dataset, Dataset) or (up and not np.allclose(up, dataset.world.up)):
         dataset = load_dataset(root, to_capture=live is not None, up=up)
@@ -174,19 +176,17 @@ def start_run(
     return Run(out, mission, dataset if images == root else None, prior if folder else None, policy)
 
 
-def _prior_of(
+def _place_of(
     root: Path, prior: str | Path | Prior | None, gaussians: Any, source: str | None = None
-) -> tuple[Prior | None, Path | None]:
-    """Prior given, else DATASET/prior, and its folder; None where it is to be built. Raises
-    InputError as `load_prior`, and where one is given and another to be built."""
+) -> Prior | Path | None:
+    """Prior given, or its folder, else DATASET/prior; None where it is to be built. Raises
+    InputError where one is given and another to be built."""
     builds = [key for key, one in (("gaussians", gaussians), ("source", source)) if one is not None]
     if prior is not None and builds:
         raise InputError(f"nbv: `{builds[0]}` builds a prior; leave it out, or leave out `prior`")
     if prior is None and not builds and (root / "prior/prior.json").is_file():
         prior = root / "prior"
-    if prior is None or isinstance(prior, Prior):
-        return prior, None
-    return load_prior(Path(prior)), Path(prior)
+    return prior if prior is None or isinstance(prior, Prior) else Path(prior)
 
 
 def _check_images(dataset: Dataset, live: bool, settings: dict[str, Any]) -> None:
@@ -232,6 +232,8 @@ def start_fit(
 ) -> Run:
     """`start_run` of a run that takes all images at once and chooses none, from `start_of_fit`.
     Arguments and errors as `start_run`."""
+    if own := {"source", "loose", "parts", "live"} & set(settings):
+        raise InputError(f"fit: {min(own)} is for start_run; leave it out")
     data = load_dataset(dataset)
     start = start_of_fit(data, prior, gaussians, dict(settings.pop("train", {})))
     every = vars(start) | settings | {"seeds": len(data), "budget": 0}
@@ -248,8 +250,12 @@ def start_of_fit(data: Dataset, prior: Any, gaussians: Any, train: dict[str, Any
     of the object cannot explain what is around it. Gaussians of a prior from photographs that is
     built in the run are split where images need more: those of a whole scene unless their number is
     given, those of an object into that number."""
-    existing, _ = _prior_of(data.root, prior, gaussians)
-    kind, sh, parts = existing.kind if existing else choose_source(data.survey()), 0, 1.0
+    existing, sh, parts = _place_of(data.root, prior, gaussians), 0, 1.0
+    if isinstance(existing, Path):  # which `start_run` loads
+        numbers = read_leftover(existing / "prior.json")
+        kind = str(numbers.get("from", "")) if isinstance(numbers, dict) else ""
+    else:
+        kind = existing.kind if existing else choose_source(data.survey())
     whole = prior is None and kind == "points" and not has_masks(data.frames)
     source = "random" if whole and train.get("means", "free") == "free" else None
     kind = source or kind

@@ -76,7 +76,7 @@ def photographer_of(root: Path) -> tuple[Photographer, dict[str, Frame], bool]:
     if denoise and importlib.util.find_spec("pyoidn") is None:
         why = "its images are denoised by pyoidn, which is not installed"
         raise InputError(f'{path}: {why}; `pip install "mgs[denoise]"`')
-    check_cost(root, preset, 0, spp)
+    check_cost(root, preset, 1, spp)
     if mesh is not None:
         with reading(mesh, f"mesh, of which {root} is made"):
             if made_of != fingerprint(mesh) | {"up": up}:

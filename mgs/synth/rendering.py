@@ -121,7 +121,7 @@ def synth_orbit(
         if resumes(out, "config.json", resolved) and (out / "transforms.json").is_file():
             say(f"{out}: is finished already; nothing is rendered")
             return load_dataset(out)
-        check_cost(out, preset, test_views, spp)
+        check_cost(out, preset, preset.frames + test_views, spp)
         rock, scale = rock_of(settings, seed, mesh, mesh_up, say)
         size = preset.width, preset.height
         cameras = rock_cameras(settings, size, preset.frames, rock)
@@ -160,10 +160,10 @@ def synth_orbit(
         return load_dataset(out)
 
 
-def check_cost(out: Path, preset: RenderPreset, test_views: int, spp: int) -> None:
+def check_cost(out: Path, preset: RenderPreset, views: int, spp: int) -> None:
     """Raise InputError if a frame has more samples than Mitsuba renders at once, or if memory or
     disk do not suffice."""
-    views, pixels = preset.frames + test_views, preset.width * preset.height
+    pixels = preset.width * preset.height
     what = f"{views:,} views of {preset.width}x{preset.height} with {spp:,} samples per pixel"
     instead = "lower `frames`, `test_views`, `size` or `spp`"
     disk = views * pixels * PIXEL_BYTES
