@@ -78,6 +78,10 @@ def model_without(*names: str) -> Change:
     return apply
 
 
+def only_tests(root: Path) -> None:
+    (root / "transforms.json").rename(root / "transforms_test.json")
+
+
 def points_in_one_place(root: Path) -> None:
     write_cloud(root / "points.ply", SparseCloud(np.ones((500, 3))))
     header(ply_file_path="points.ply")(root)
@@ -189,6 +193,16 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
         ("none of the 8 images it lists exists, as images/kf_0000", without_images),
         ("kf_0000.jpg: not a readable image", corrupt_jpeg),
         ("points.ply: has values that are not finite", points_in_one_place),
+    ],
+    (synthetic.write_dataset, "import {d}/a.zip --out {out}"): [
+        ("a.zip: is no file that can be imported", text("a.zip", "PK"))
+    ],
+    (synthetic.write_dataset, "import {d} --exclude kf_0000 --out {out}"): [
+        ("exclude leaves no image", frames(lambda all: all[:1])),
+        ("transforms_test.json: its poses would be ignored", only_tests),
+    ],
+    (lambda d: synthetic.write_dataset(d / "deep"), "import {d} --out {out}"): [
+        ("deep/transforms.json: its poses would be ignored", nothing)
     ],
     (nothing, "import {d}/colmap --out {out}"): [
         ("sparse/0: a COLMAP model without points3D.bin; restore it", model_without("points3D")),

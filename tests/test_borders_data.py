@@ -125,11 +125,12 @@ def test_a_transforms_json_is_read_as_its_authors_mean_it(data):
 
 @pytest.mark.parametrize("windows", [True, False])
 def test_absolute_paths_give_names_of_what_differs(data, windows):
-    """Also of a folder that is elsewhere, whose pictures are found by their names' ends."""
+    """Also of a folder that is elsewhere, whose pictures are found by their names' ends, in
+    capitals or not."""
 
     def change(json):
         for k, frame in enumerate(json["frames"]):
-            path = data.root / f"images/{'ab'[k % 2]}/{k}.png"
+            path = data.root / f"images/{'ab'[k % 2]}/{k}.{'PNG' if windows else 'png'}"
             path.parent.mkdir(exist_ok=True)
             shutil.move(data.root / frame["file_path"], path)
             old = f"C:\\of\\a person\\{'ab'[k % 2]}\\{k}.png"
@@ -198,7 +199,7 @@ def colmap_text(data, tmp_path, rename=str):
     ids=["plain", "byte-order mark", "Windows lines"],
 )
 def test_colmap_text_keeps_names_and_loses_no_image(data, tmp_path, folder, encoded):
-    source, path = colmap_text(data, tmp_path, lambda name: f"{folder}/{name}")
+    source, path = colmap_text(data, tmp_path, lambda name: f"{folder}/{name[:-3]}PNG")
     (source / "images").unlink()
     shutil.copytree(data.root / "images", source / "images" / folder)
     for file in path.parent.iterdir():
@@ -208,7 +209,7 @@ def test_colmap_text_keeps_names_and_loses_no_image(data, tmp_path, folder, enco
     assert np.allclose(shots[0].camera.K, data.frames[0].camera.K)
     named = folder.replace("/", "_")
     assert [shot.name for shot in shots[:2]] == [f"{named}_kf_0000", f"{named}_kf_0001"]
-    lines = [line for line in path.read_text().splitlines() if line.endswith(".png")]
+    lines = [line for line in path.read_text().splitlines() if line.endswith(".PNG")]
     path.write_text("\n".join(lines) + "\n")
     fails("has no line of points after that of image", read_source, source)
     path.write_text(lines[0] + "\n\n" + lines[1][:40])

@@ -16,7 +16,7 @@ from mgs.camera import Camera
 from mgs.data.agreement import observed
 from mgs.data.dataset import FRAME_INTERVAL
 from mgs.data.lens import Lens, parameter_names
-from mgs.data.shots import Shot, Source, frame_name, natural
+from mgs.data.shots import Shot, Source, find_image, frame_name, natural
 from mgs.data.structure import cloud_of
 from mgs.errors import InputError
 from mgs.files import parsing, reading
@@ -120,8 +120,8 @@ def read_colmap(source: Path, models: list[Path], images: Path) -> Source:
     reconstruction, names = _opened(model)
     files = {}
     for number, name in names.items():
-        path = images / PureWindowsPath(name) if not (images / name).exists() else images / name
-        files[number] = name, path
+        found = (find_image(images, one) for one in (name, PureWindowsPath(name).as_posix()))
+        files[number] = name, next(filter(None, found), images / name)
     result = source_of(reconstruction, files, f"{model}: image")
     placed = {shot.image for shot in result.shots}
     kinds = {(path.parent, path.suffix) for path in placed if path.suffix and path.is_file()}

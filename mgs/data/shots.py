@@ -131,6 +131,8 @@ class Source:
         if unknown := out - {shot.name for shot in self.shots}:
             raise InputError(f"import: exclude {min(unknown)!r}: is no image of the source")
         shots = [shot for shot in self.shots if shot.name not in out]
+        if not shots:
+            raise InputError("import: exclude leaves no image; leave out fewer")
         counted = self.left_out + Counter({"excluded": len(out)})
         return replace(self, shots=shots, left_out=counted)
 
@@ -200,8 +202,11 @@ def _flat(parts: Sequence[str]) -> str:
 
 
 def find_image(folder: Path, name: str, suffixes: Sequence[str] = SUFFIXES) -> Path | None:
-    """The file of this name in a folder, with the first suffix that exists, or None."""
-    paths = (folder / f"{name}{suffix}" for suffix in suffixes)
+    """The file of this name in a folder, with the first suffix that exists, or None. A suffix of
+    the name may be in capitals or not, which other systems do not tell apart."""
+    paths = [folder / f"{name}{suffix}" for suffix in suffixes]
+    if suffix := Path(name).suffix:
+        paths.append((folder / name).with_suffix(suffix.swapcase()))
     return next((path for path in paths if path.is_file()), None)
 
 

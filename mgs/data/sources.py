@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -136,6 +137,9 @@ def _recognised(
         frames = folder / "frames"
         paths = sharpest_frames(source, frames, Spacing.parse(keyframes))
         return read_photographs(frames, paths, folder / "matches", exclude)
+    if source.is_file() and source.suffix.lower() != ".json":
+        cure = "give a transforms.json, a video or a folder; unpack an archive"
+        raise InputError(f"{source}: is no file that can be imported; {cure}")
     if path.is_file() or split_path.is_file():
         return _read_transforms(path if path.is_file() else split_path, images)
     if models := models_in(source):
@@ -146,6 +150,10 @@ def _recognised(
         if folder.resolve().is_relative_to(root.resolve()):
             why = "the output would lie among its photographs, and its pictures be taken for some"
             raise InputError(f"{root}: {why}; write it to a place outside")
+        inside = (root.rglob(name) for name in ("transforms*.json", "cameras.bin"))
+        for poses in (*source.glob("transforms_*.json"), *chain(*inside)):
+            cure = "give it, or its folder, as the source, or move it away"
+            raise InputError(f"{poses}: its poses would be ignored; {cure}")
         return read_photographs(images or source, paths, folder / "matches", exclude)
     raise InputError(
         f"{source}: holds no photographs (PNG, JPEG, TIFF, WebP), transforms.json, "
