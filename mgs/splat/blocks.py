@@ -64,6 +64,7 @@ class BlockLists:
     pair: Any  # pair at each slot, UInt32 [M], padded
     slot_start: Any  # range of slots of the splat at each place, UInt32 [N]
     slot_end: Any
+    summed: Any  # places by their number of slots, the largest first, UInt32 [N]
     block: Any  # of each lane, counted row by row, UInt32 [L]; in a tile the longest list first
     start: Any  # range of each lane's pairs, UInt32 [L]
     end: Any
@@ -77,7 +78,7 @@ class BlockLists:
     @cached_property
     def nbytes(self) -> int:
         """Memory held, bytes."""
-        return 4 * (2 * len(self.splat) + 11 * len(self.slot_start) + 3 * len(self.block))
+        return 4 * (2 * len(self.splat) + 12 * len(self.slot_start) + 3 * len(self.block))
 
 
 def footprints(splats: Splats) -> Footprints:
@@ -142,7 +143,7 @@ def build(splats: Splats, camera: Camera, older: BlockLists | None = None) -> Bl
     lane = _lanes_by_tile(end - start, numbers, _tile_numbers(blocks_x, blocks_y))
     ranges = (dr.gather(mi.UInt32, part, lane) for part in (start, end))
     edges = (dr.opaque(mi.UInt32, side) for side in (left, top, right, bottom, blocks_x))
-    slots = splat, pair, slot_start, slot_end
+    slots = splat, pair, slot_start, slot_end, _longest_first(slot_end - slot_start)
     lists = BlockLists(*(order, place, *slots, lane, *ranges, *edges, foot))
     dr.eval(lists)
     return lists
@@ -216,10 +217,15 @@ def _lanes_by_tile(length: Any, number: Any, numbers: int) -> Any:
     """Blocks in the order of lanes, UInt32 [L]: tile by tile, in a tile the longest list first, so
     that the lanes of a SIMD register have lists of similar lengths. length: of each block's list.
     number: `_tile_number` of each block. numbers: `_tile_numbers`."""
-    # Longest first, then stably by tile.
-    longest = _sorted(dr.arange(mi.UInt32, len(length)), 4095 - dr.minimum(length, 4095), 4096)
+    longest = _longest_first(length)  # then stably by tile
     tile = dr.gather(mi.UInt32, number, longest) // (TILE * TILE)
     return _sorted(longest, tile, numbers // (TILE * TILE))
+
+
+def _longest_first(length: Any) -> Any:
+    """Indices of UInt32 lengths, the longest first, those of 4095 and more as if equal. Lanes of a
+    SIMD register wait for the one that loops longest."""
+    return _sorted(dr.arange(mi.UInt32, len(length)), 4095 - dr.minimum(length, 4095), 4096)
 
 
 def _pairs(

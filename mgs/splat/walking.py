@@ -414,7 +414,8 @@ def sums_by_place(lists: BlockLists, by_pair: Any, count: int, real: Any) -> Any
     Float64), by place."""
     dr.eval(by_pair)
     # Slots of one splat are consecutive, so a lane adds those of one splat, in their order.
-    packets, end = packet_count(count), lists.slot_end
+    packets, place = packet_count(count), lists.summed
+    start, end = (dr.gather(mi.UInt32, part, place) for part in (lists.slot_start, lists.slot_end))
 
     def body(first: Any, totals: list[Any]) -> Any:
         # Reads of slots beyond the end are masked to 0.
@@ -424,9 +425,8 @@ def sums_by_place(lists: BlockLists, by_pair: Any, count: int, real: Any) -> Any
             totals = [total + mi.Vector4d(part) for total, part in zip(totals, parts, strict=True)]
         return first + AT_ONCE, totals
 
-    start = (mi.UInt32(lists.slot_start), [mi.Vector4d(0)] * packets)
-    _, totals = dr.while_loop(start, lambda first, totals: first < end, body)
-    place = dr.arange(mi.UInt32, len(lists.place))
+    state = start, [mi.Vector4d(0)] * packets
+    _, totals = dr.while_loop(state, lambda first, totals: first < end, body)
     sums = dr.empty(real, len(lists.place) * 4 * packets)
     vector = mi.Vector4f if real is mi.Float else mi.Vector4d
     for i, total in enumerate(totals):

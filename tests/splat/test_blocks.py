@@ -62,6 +62,16 @@ def test_lists_hold_every_pair_and_little_more():
         assert len(listed) < 1.25 * len(needed)
 
 
+def test_sums_of_splats_of_many_pairs_come_first():
+    lists = build(
+        projected(make_gaussians(60, 4, log_scales=(-9.0, 0.5)), make_camera()), make_camera()
+    )
+    place, pairs = np.asarray(lists.summed), np.asarray(lists.slot_end - lists.slot_start)
+    assert sorted(place) == list(range(60))
+    assert (np.diff(pairs[place].astype(int)) <= 0).all()
+    assert len(set(pairs)) > 10
+
+
 def test_a_new_camera_compiles_nothing():
     """Though the number of pairs differs from camera to camera."""
     g = as_drjit(make_gaussians(300, 3, log_scales=(-5.0, -3.0)))
