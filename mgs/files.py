@@ -6,12 +6,14 @@ import fcntl
 import hashlib
 import io
 import json
+import math
 import os
 import re
 import secrets
 import shutil
 import stat
 import tomllib
+import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -224,6 +226,29 @@ def read_leftover(path: Path) -> Any:
         return read_json(path) if path.is_file() else None
     except InputError:
         return None
+
+
+def stored_array(file: zipfile.ZipFile, name: str, kind: str) -> Any:
+    """An array of an NPZ file. Raises ValueError unless it is stored as it is, its dtype is of
+    this kind, and it is as long as its header says, so that it takes no more memory than disk."""
+    import numpy as np
+
+    info = file.getinfo(f"{name}.npy")
+    if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
+        raise ValueError(f"{name} is compressed")
+    with file.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        if version not in ((1, 0), (2, 0)):
+            raise ValueError(f"{name} has a header of another version")
+        read = np.lib.format.read_array_header_1_0
+        read = read if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read(member)
+        if dtype.kind != kind or dtype.hasobject:
+            raise ValueError(f"{name} has dtype {dtype}")
+        data = member.read()
+    if math.prod(shape) * dtype.itemsize != len(data):
+        raise ValueError(f"{name} has shape {shape} in {len(data)} bytes")
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C").copy("K")
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:

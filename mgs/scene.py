@@ -1,9 +1,12 @@
 """`Scene`, which stays fixed in a run, and `State`, which each step makes anew."""
 
-from collections.abc import Callable, Sequence
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,7 +18,8 @@ from mgs.errors import InputError
 from mgs.fit.fitting import Fit, fit_gaussians
 from mgs.fit.objective import Target, as_target
 from mgs.fit.settings import ALPHA_WEIGHT, ModelSettings, TrainSettings
-from mgs.gaussians import Gaussians
+from mgs.fit.unfinished import Unfinished
+from mgs.gaussians import ARRAYS, Gaussians
 from mgs.memory import IMAGE_BYTES, KEPT_BYTES, Deferred, kept_within, release
 from mgs.policy import poses
 from mgs.policy.visibility import Visibility, one_in
@@ -29,6 +33,29 @@ from mgs.splat.information import fisher_of_colours
 from mgs.survey.fusion import focus
 
 Value = TypeVar("Value")
+
+
+def _key_of_fit(
+    model: Gaussians,
+    start: Gaussians,
+    frames: Sequence[Frame],
+    gains: np.ndarray | None,
+    train: TrainSettings,
+    lam: Mapping[str, Any],
+) -> str:
+    """Hash of all that decides a fit; of files their size and time of modification."""
+    settings = json.dumps(train.model_dump(mode="json"), sort_keys=True)
+    digest = hashlib.blake2b(f"{settings} {lam}".encode(), digest_size=16)
+    digest.update(b"" if gains is None else gains.tobytes())
+    for name in ARRAYS:
+        for values in (getattr(model, name), getattr(start, name)):
+            digest.update(np.ascontiguousarray(values).data)
+    for frame in frames:
+        digest.update(frame.camera.key)
+        for path in (frame.image_path, frame.mask_path, frame.rock_path):
+            about = path.stat() if path else None
+            digest.update(repr(about and (about.st_size, about.st_mtime_ns)).encode())
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -97,6 +124,7 @@ class Scene:
     - on_pass(done, most, model): called after each pass of a fit.
     - keep: most bytes of the information of views about one model that are kept for several
       choices (`mgs.memory.VIEW_BYTES`).
+    - unfinished: file from which an interrupted fit continues.
 
     Values are computed at their first use and kept. Raises InputError as
     `ModelSettings.regularisation`, and where the prior was built with another upward direction."""
@@ -107,6 +135,7 @@ class Scene:
     capture: Callable[[Frame], Frame] = lambda frame: frame
     keep: int = 0
     on_pass: Callable[[int, int, Gaussians], None] = lambda done, most, model: None
+    unfinished: Path | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.dataset, Dataset) or not isinstance(self.prior, Prior):
@@ -268,10 +297,14 @@ class Scene:
         start = self.start(tuple(frames))
         self.memo.pop("views", None)  # they are about the model before
         release(KEPT_BYTES)  # what scores took, and then what the fit took
-        steps = train.passes * len(frames)
+        unfinished = None
+        if self.unfinished:
+            key = _key_of_fit(model, start, frames, gains, train, lam)
+            unfinished = Unfinished(self.unfinished, key)
         fit_ = fit_gaussians(
             *(model, cameras, targets, train, self.on_pass, self.cache, start, lam),
-            on_step=lambda done: report(Stage.FIT, done, steps),
+            on_image=partial(report, Stage.FIT),
+            unfinished=unfinished,
         )
         release(KEPT_BYTES)
         return fit_

@@ -7,7 +7,7 @@ import pytest
 from refusals import fails
 
 from mgs import fit_gaussians
-from mgs.fit import density, fitting
+from mgs.fit import density, fitting, unfinished
 from mgs.fit.density import Slopes, adapt, split
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.rotation import rotmat_from_quat
@@ -173,3 +173,45 @@ def test_a_fit_of_changing_number_repeats_bitwise(scene, monkeypatch, optimiser)
     assert np.abs(one.gaussians.sh[:, 1:]).max() > 0
     learns = {"colour": np.ones((300, 1, 1))}  # masks of Gaussians that may be removed
     fails("all learn", fit_gaussians, start, [camera], [target], train, learns=learns)
+
+
+@pytest.mark.parametrize("optimiser", ["adam", "natural"])
+def test_an_interrupted_fit_continues_bit_for_bit(scene, monkeypatch, tmp_path, optimiser):
+    """Also in the middle of a pass, and after Gaussians were divided."""
+    truth, camera, target = scene
+    monkeypatch.setattr(unfinished, "SECONDS", 0.0)
+    start = replace(truth, sh=np.zeros_like(truth.sh))
+    cameras, targets = [camera, camera, camera], [target, 0.9 * target, 0.8 * target]
+    rates = RATES | {"mean": 0.01}
+    train = TrainSettings(means="free", density="split", optimiser=optimiser, rates=rates, passes=8)
+    saves, used = [unfinished.Unfinished(tmp_path / "fit.npz", "these")], []
+    given = start, cameras, targets, train
+
+    def fit(last: int, saved: unfinished.Unfinished | None):
+        def on_image(done, most):
+            used.append(done)
+            assert done < most
+            if done == last:
+                raise KeyboardInterrupt
+
+        return fit_gaussians(*given, lam={"scale": 1.0}, on_image=on_image, unfinished=saved)
+
+    whole = fit(-1, None)
+    assert len(whole.gaussians) > len(truth)
+    every = used.copy()
+    for last in every[7::5]:
+        with pytest.raises(KeyboardInterrupt):
+            fit(last, saves[0])
+    used.clear()
+    found = fit(-1, saves[0])
+    assert used[0] > every[-6]
+    assert (found.gaussians, found.losses) == (whole.gaussians, whole.losses)
+    used.clear()
+    assert fit(-1, saves[0]).gaussians == whole.gaussians
+    assert not used, "the end is on disk, too"
+    fit(-1, unfinished.Unfinished(saves[0].path, "others"))
+    assert used == every
+    saves[0].path.write_bytes(b"PK damaged")
+    used.clear()
+    assert fit(-1, saves[0]).gaussians == whole.gaussians
+    assert used == every

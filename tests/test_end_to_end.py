@@ -12,6 +12,8 @@ from mgs import ListCache, initial_gaussians, load_dataset, load_prior, read_ply
 from mgs.cli import app, demo, terminal
 from mgs.cli.app import COMMANDS, main
 from mgs.evaluation import psnr_measure
+from mgs.fit import unfinished
+from mgs.progress import Stage
 from mgs.run.policies import POLICIES
 from mgs.synth.rendering import write_contact_sheet
 
@@ -58,10 +60,38 @@ def test_a_fit_shows_a_view_before_its_end(dataset, run, tmp_path, capsys, monke
     decibels = [float(number) for number in re.findall(r"pass \d of 5: ([\d.]+) dB", printed)]
     assert decibels[0] < decibels[1]
     assert (out / f"renders/{load_dataset(dataset).frames[0].name}.png").is_file()
-    assert "fitting: 7 of 50" in lines  # steps: within a pass, too
-    assert "fitting: 30 of 50" in lines
+    assert "fitting: 7 of 70" in lines  # uses of an image: within a pass, too
+    assert "fitting: 30 of 70" in lines
     command("dataset", "check", dataset)
     assert "reading: 3 of 10" in said(capsys)[1]
+
+
+def test_an_interrupted_fit_continues_within_its_pass(dataset, run, tmp_path, monkeypatch):
+    """From its config.json, too, which has its settings in another order."""
+    monkeypatch.setattr(unfinished, "SECONDS", 0.0)
+    out, report, used = tmp_path / "fit", scene.report, []
+
+    def interrupted(last):
+        def reported(stage, done, total):
+            if stage == Stage.FIT and total > 1:
+                used.append(done)
+            if done == last:
+                raise KeyboardInterrupt
+            report(stage, done, total)
+
+        return reported
+
+    arguments = ["fit", dataset, "--prior", run / "prior", "--passes", 4, "--means", "free"]
+    command(*arguments, "--out", tmp_path / "whole")
+    monkeypatch.setattr(scene, "report", interrupted(37))
+    assert exit_code(*arguments, "--out", out) == 130
+    assert (out / "fit.npz").is_file()
+    used.clear()
+    monkeypatch.setattr(scene, "report", interrupted(-1))
+    command("nbv", "--resume", out)
+    assert used == list(range(37, 60))
+    assert (out / "gaussians.ply").read_bytes() == (tmp_path / "whole/gaussians.ply").read_bytes()
+    assert not (out / "fit.npz").exists()
 
 
 def test_interrupted_in_the_middle_of_a_step_then_resumed(

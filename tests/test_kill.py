@@ -37,15 +37,18 @@ runtime.start()
 from mgs.cli.app import main
 from mgs.synth import arena
 arena.ROWS, arena.TEXELS = 60, 64
+from mgs.fit import unfinished
+unfinished.SECONDS = 0.0
 main()
 """
-"""mgs, with a coarse ground."""
+"""mgs, with a coarse ground, and with every step of a fit on disk."""
 
 TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 20\n"
 UNEQUAL = rb'"(commit|\w*seconds\w*)":\s*(\{[^}]*\}|"[^"]*"|[-+.\de]+)'
 LOOP = "--seeds 2 --budget 2 --set train.passes=3 --seed 1"
 COMMANDS = {
     "nbv": f"nbv {{data}} --prior {{prior}} --out {{out}} {LOOP} --set evaluate_every=1",
+    "fit": "fit {data} --prior {prior} --means free --density split --passes 6 --out {out}",
     "synth-orbit": "synth-orbit {out} --scene {scene} --frames 6 --size 64x48 --spp 2",
     "import": "import {data} --mesh {data}/rock.glb --out {out}",
     "photographs": "import {photographs} --out {out}",
@@ -94,7 +97,7 @@ def places(tmp_path_factory) -> dict[str, Path]:
 def started(name: str, places: dict[str, Path], **pipes: int) -> subprocess.Popen:
     """The process of a command; of a run that has begun, the one that resumes it."""
     arguments = COMMANDS[name].format(**places).split()
-    if arguments[0] == "nbv" and (places["out"] / "config.json").is_file():
+    if arguments[0] in ("nbv", "fit") and (places["out"] / "config.json").is_file():
         arguments = ["nbv", "--resume", str(places["out"])]
     program = [sys.executable, "-c", PROGRAM, *arguments]
     return subprocess.Popen(program, stdout=subprocess.DEVNULL, text=True, **pipes)

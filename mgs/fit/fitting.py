@@ -17,6 +17,7 @@ from mgs.fit.losses import LOSSES, Loss, loss_name
 from mgs.fit.objective import (
     Objective,
     ParameterPrior,
+    Photo,
     Target,
     View,
     filled,
@@ -27,7 +28,9 @@ from mgs.fit.objective import (
 from mgs.fit.optimisers import INFORMATION_PASSES, OPTIMISERS
 from mgs.fit.settings import TrainSettings
 from mgs.fit.stopping import StopReason, stop_reason
+from mgs.fit.unfinished import FitState, Unfinished
 from mgs.gaussians import ARRAYS, MAX_SH_DEGREE, Gaussians, learned
+from mgs.memory import Deferred
 from mgs.seeds import generator
 from mgs.splat import ListCache, as_drjit
 from mgs.splat.recording import frozen
@@ -128,7 +131,8 @@ def fit_gaussians(
     lam: Mapping[str, float | np.ndarray] | None = None,
     learns: Mapping[str, np.ndarray] | None = None,
     loss: Loss | None = None,
-    on_step: Callable[[int], None] = lambda done: None,
+    on_image: Callable[[int, int], None] = lambda done, most: None,
+    unfinished: Unfinished | None = None,
 ) -> Fit:
     """Fit Gaussians to images by lowering Phi (`mgs.fit.objective`). The result depends on the
     arguments alone, bitwise.
@@ -149,7 +153,9 @@ def fit_gaussians(
     loss: a function in place of `settings.loss` (`mgs.fit.losses.Loss`): loss(drawn, pixels,
         weights, size, linear) of Dr.Jit arrays, which differentiates it. It is recorded once, so it
         must depend on its arguments alone.
-    on_step(done): called after each step, of one image.
+    on_image(done, most): called whenever an image is used, with how many were before, and how many
+        are at most.
+    unfinished: file from which the fit continues, and which is written from time to time.
 
     Raises InputError if a parameter is not finite, optimiser or loss are unknown, `start` has
     another shape, means are to move without a rate, or a required alpha is missing.
@@ -172,43 +178,74 @@ def fit_gaussians(
         [dr.zeros(mi.TensorXf, offset.shape) for _ in range(optimiser.buffers)]
         for offset, _ in goal.offsets(model)
     ]
-    information: list[Any] = [None] * len(buffers)
     rng, draws = (generator(settings.seed, f"train/{name}") for name in ("order", "density"))
+    new = FitState(model, model, goal.prior, buffers, [None] * len(buffers), draws)
+    state = (unfinished.load(new) if unfinished else None) or new
+    keep = unfinished.save if unfinished else lambda state: None
     times = density.times(settings.passes, len(cameras)) if density else ()
-    slopes: list[Any] = []
-    last, end = 0, max(times, default=0)
-    losses, best, stop = [goal.loss(model)], model, None
+    end = max(times, default=0)
+    every = {*times, *range(0, settings.passes, INFORMATION_PASSES)}
+    measured = every if optimiser.uses_information else set()  # before these passes
+    uses = 1 + settings.passes + len(measured)
+    goal = _counted(replace(goal, prior=state.prior), state, uses * len(goal.photos), on_image)
+
+    def reason() -> StopReason | None:
+        tolerance = 0.0 if len(state.losses) <= end + 1 else settings.tolerance
+        return stop_reason(state.losses, tolerance, settings.passes)
+
+    state.losses = state.losses or [goal.loss(model)]
+    orders = [rng.permutation(len(goal.photos)) for _ in state.losses[1:]]
+    stop = reason() if orders else None
     while stop is None:
-        done = len(losses) - 1
-        changes = density is not None and done in times
-        if density and changes:
-            between = last * len(cameras), done * len(cameras)
-            measure = slopes_of(slopes, cameras, between, settings.most_gaussians)
-            goal, model, buffers = controlled(density, measure, goal, model, buffers, draws)
-            slopes, last = [], done
-        if density and not slopes and done < end:
-            slopes = [dr.zeros(mi.Float, len(model)) for _ in range(2)]
-            dr.make_opaque(slopes)
-        if optimiser.uses_information and (changes or done % INFORMATION_PASSES == 0):
-            information = [_together(part) for part in goal.largest_diagonal(model)]
-        parts = zip(kinds, goal.offsets(model), strict=True)
+        done = len(state.losses) - 1
+        if not state.steps:  # a new pass
+            if density and done in times:
+                between = state.changed * len(cameras), done * len(cameras)
+                measure = slopes_of(state.slopes, cameras, between, settings.most_gaussians)
+                changed = controlled(density, measure, goal, state.model, state.buffers, draws)
+                goal, state.model, state.buffers = changed
+                state.prior, state.slopes, state.changed = goal.prior, [], done
+            if density and not state.slopes and done < end:
+                state.slopes = [dr.zeros(mi.Float, len(state.model)) for _ in range(2)]
+                dr.make_opaque(state.slopes)
+            if done in measured:
+                largest = goal.largest_diagonal(state.model)
+                state.information = [_together(part) for part in largest]
+        parts = zip(kinds, goal.offsets(state.model), strict=True)
         shapes = {kind: offset.shape for kind, (offset, _) in parts}
         rates = _rates(settings, shapes, learns or {}, done, len(cameras))
         order = rng.permutation(len(goal.photos))
-        learning = buffers, information, rates, slopes
-        model, buffers, mean, slopes = _pass(
-            goal, settings.optimiser, model, order, *learning, done * len(order), on_step
-        )
-        if mean <= min(losses[1:], default=np.inf):  # false for NaN
-            best = model
-        losses.append(mean)
+        mean = _pass(goal, settings.optimiser, state, order, rates, keep)
+        if mean <= min(state.losses[1:], default=np.inf):  # false for NaN
+            state.best = state.model
+        state.losses.append(mean)
+        state.steps = []
         if on_pass:
-            on_pass(done + 1, settings.passes, model)
-        tolerance = 0.0 if done < end else settings.tolerance
-        stop = stop_reason(losses, tolerance, settings.passes)
+            on_pass(done + 1, settings.passes, state.model)
+        stop = reason()
+    keep(state)
+    losses = state.losses
     passes = len(losses) - 1
     lowest = min((loss for loss in losses[1:] if np.isfinite(loss)), default=losses[0])
-    return Fit(best.map(np.asarray), lowest, tuple(losses), passes, passes * len(goal.photos), stop)
+    best = state.best.map(np.asarray)
+    return Fit(best, lowest, tuple(losses), passes, passes * len(goal.photos), stop)
+
+
+def _counted(
+    goal: Objective,
+    state: FitState,
+    most: int,
+    on_image: Callable[[int, int], None],
+) -> Objective:
+    """The objective with `on_image` called, and `state.images` counted, at each use of an image."""
+    photos = goal.photos
+
+    def photo(i: int) -> Photo:
+        on_image(state.images, most)
+        state.images += 1
+        return photos[i]
+
+    return replace(goal, photos=Deferred(range(len(photos)), photo))
 
 
 def _together(information: Any) -> Any:
@@ -247,35 +284,33 @@ def _rates(
 def _pass(
     goal: Objective,
     optimiser: str,
-    model: Gaussians,
+    state: FitState,
     order: np.ndarray,
-    buffers: list[list[Any]],
-    information: list[Any],
     rates: list[Any],
-    slopes: list[Any],
-    t: int,
-    on_step: Callable[[int], None],
-) -> tuple[Gaussians, list[list[Any]], float, list[Any]]:
-    """One step on each image in this order, after t steps. Returns the model, the buffers, the mean
-    loss of the steps, NaN if a parameter is no longer finite, which cannot be rendered, and the
-    slopes."""
-    losses = []
-    for photo in (goal.photos[i] for i in order):
-        t += 1
+    keep: Callable[[FitState], None],
+) -> float:
+    """One step on each image in this order, but for those that a state in the middle of the pass
+    has. Returns the mean loss of the steps, or NaN if a parameter is no longer finite, which cannot
+    be rendered. keep(state): called after each step."""
+    before = (len(state.losses) - 1) * len(order)
+    for i in order[len(state.steps) :]:
+        photo = goal.photos[i]
         try:
-            view = goal.view(model, photo)
+            view = goal.view(state.model, photo)
         except InputError:
-            if _is_finite(model):  # raised for another reason, such as too many pairs
+            if _is_finite(state.model):  # raised for another reason, such as too many pairs
                 raise
-            return model, buffers, float("nan"), slopes
-        count = dr.opaque(mi.UInt32, t)
-        arguments = view, buffers, rates, count, information, slopes
-        model, buffers, loss, slopes = _step(optimiser, goal.error, model, goal.prior, *arguments)
-        losses.append(loss)
-        on_step(t)
-    finite = _is_finite(model)
-    mean = float(np.mean([float(loss[0]) for loss in losses])) if finite else float("nan")
-    return model, buffers, mean, slopes
+            return float("nan")
+        count = dr.opaque(mi.UInt32, before + len(state.steps) + 1)
+        arguments = view, state.buffers, rates, count, state.information, state.slopes
+        state.model, state.buffers, loss, state.slopes = _step(
+            optimiser, goal.error, state.model, goal.prior, *arguments
+        )
+        state.steps.append(loss)
+        keep(state)
+    if not _is_finite(state.model):
+        return float("nan")
+    return float(np.mean([float(loss[0]) for loss in state.steps]))
 
 
 def _is_finite(model: Gaussians) -> bool:

@@ -2,7 +2,6 @@
 written first. `checkpoint.npz` is replaced atomically: the commit of a step."""
 
 import json
-import math
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +19,16 @@ from mgs.data.frames import Frame
 from mgs.data.structure import POSES
 from mgs.data.world import PLUS_Z, Vector, unit_up
 from mgs.errors import InputError, Notice
-from mgs.files import atomic_path, parsing, read_json, reading, write_json, write_text
+from mgs.files import (
+    atomic_path,
+    parsing,
+    read_json,
+    reading,
+    remove_file,
+    stored_array,
+    write_json,
+    write_text,
+)
 from mgs.gaussians import ARRAYS, Gaussians
 from mgs.notebook import cloud, html, thumbnails
 from mgs.policy.criteria import observed, regularisation
@@ -34,9 +42,10 @@ from mgs.splat_places import to_source
 from mgs.splat_ply import read_ply, write_ply
 
 CHECKPOINT, STEPS, POLICY_SOURCE = "checkpoint.npz", "steps.jsonl", "policy.py"
+UNFINISHED = "fit.npz"  # state of the fit at work, until its step is in the checkpoint
 
 FILES = [
-    *("config.json", CHECKPOINT, STEPS, "metrics.json", "gaussians*", POLICY_SOURCE),
+    *("config.json", CHECKPOINT, UNFINISHED, STEPS, "metrics.json", "gaussians*", POLICY_SOURCE),
     *("prior", "dataset", "renders", "diagnostics", "export.*", "video.*"),
 ]
 """Names in the folder of a run, with what commands add to it."""
@@ -301,6 +310,7 @@ def write_checkpoint(out: Path, state: Checkpoint) -> None:
     arrays = {name: getattr(g, name) for name in ARRAYS}
     with atomic_path(out / CHECKPOINT) as temporary, open(temporary, "wb") as file:
         np.savez(file, H=state.H, surface=state.surface, json=np.array(text), **arrays)
+    remove_file(out, out / UNFINISHED)
     write_steps(out, state)
 
 
@@ -330,7 +340,7 @@ def read_record(out: Path) -> dict[str, Any] | None:
     with _checkpoint(out) as file:
         if file is None:
             return None
-        record = parse_record(Record, str(_member(file, "json", "U")[()]))
+        record = parse_record(Record, str(stored_array(file, "json", "U")[()]))
     frames = read_config(out)["frames"]
     if not all(0 <= frame < len(frames) for frame in record["taken"]):
         raise InputError(f"{out / CHECKPOINT}: takes frames that the run lacks; start the run anew")
@@ -346,7 +356,7 @@ def read_checkpoint(out: Path) -> Checkpoint | None:
     with _checkpoint(out) as file:
         assert file is not None
         arrays: dict[str, Any]
-        arrays = {name: _member(file, name, "f") for name in (*ARRAYS, "H", "surface")}
+        arrays = {name: stored_array(file, name, "f") for name in (*ARRAYS, "H", "surface")}
         H, surface = arrays.pop("H"), arrays.pop("surface")
         antialiased, linear = record.pop("antialiased"), record.pop("linear")
         gaussians = Gaussians(**arrays, antialiased=antialiased, linear=linear)
@@ -354,24 +364,3 @@ def read_checkpoint(out: Path) -> Checkpoint | None:
         if H.ndim != 2 or surface.ndim != 2 or len(H) != len(gaussians):
             raise ValueError(f"H has shape {H.shape} of {len(gaussians)} Gaussians")
     return Checkpoint(gaussians, H, surface, **{"upright": False} | record)
-
-
-def _member(file: zipfile.ZipFile, name: str, kind: str) -> np.ndarray:
-    """An array of a checkpoint. Raises ValueError unless it is stored as it is, its dtype is of
-    this kind, and it is as long as its header says, so that it takes no more memory than disk."""
-    info = file.getinfo(f"{name}.npy")
-    if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1:
-        raise ValueError(f"{name} is compressed")
-    with file.open(info) as member:
-        version = np.lib.format.read_magic(member)
-        if version not in ((1, 0), (2, 0)):
-            raise ValueError(f"{name} has a header of another version")
-        read = np.lib.format.read_array_header_1_0
-        read = read if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read(member)
-        if dtype.kind != kind or dtype.hasobject:
-            raise ValueError(f"{name} has dtype {dtype}")
-        data = member.read()
-    if math.prod(shape) * dtype.itemsize != len(data):
-        raise ValueError(f"{name} has shape {shape} in {len(data)} bytes")
-    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C").copy("K")
