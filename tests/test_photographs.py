@@ -427,10 +427,15 @@ def test_lengths_of_unknown_unit_are_not_called_metres(tmp_path, capsys):
 # Photographs of a phone
 
 
-def test_a_smaller_image_is_the_mean_of_its_blocks_and_rays_stay(exact, tmp_path):
-    arguments = ["import", exact.root, "--out", tmp_path / "d", "--downscale"]
-    assert exit_code(*arguments, "100") == 2
-    command(*arguments, "5")
+@pytest.mark.parametrize("given", [True, False])
+def test_a_smaller_image_is_the_mean_of_its_blocks_and_rays_stay(
+    exact, tmp_path, monkeypatch, given
+):
+    """Also by default, where images have more pixels than a fit resolves."""
+    arguments = ["import", exact.root, "--out", tmp_path / "d"]
+    assert exit_code(*arguments, "--downscale", "100") == 2
+    monkeypatch.setattr("mgs.data.importers.MOST_PIXELS", 96 * 72 // 16 - 1)
+    command(*arguments, *(["--downscale", "5"] if given else []))
     whole, small = exact.frames[0], load_dataset(tmp_path / "d").frames[0]
     assert (small.camera.width, small.camera.height) == (19, 14)
     pixels, reduced = (np.asarray(Image.open(f.image_path), float) for f in (whole, small))

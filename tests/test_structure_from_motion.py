@@ -268,8 +268,8 @@ def test_a_video_gives_the_sharpest_frames_up_to_where_it_ends(tmp_path):
 
 def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, capsys, monkeypatch):
     """So does one that is refused then, and one that is refused after the photographs are placed. A
-    finished one places none again, and names what differs. Large images are named before they are
-    written."""
+    finished one places none again, and names what differs. What is made of large images is
+    said before it is written."""
     root = frames[0].image_path.parent
     out, matches = tmp_path / "d", tmp_path / "d.unpacked/matches/database.db"
     with monkeypatch.context() as patched:
@@ -282,13 +282,13 @@ def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, capsys, monke
         assert exit_code("import", root, "--out", out, *wrong) == 2
         assert "other" in said(capsys)[1]
     monkeypatch.setattr("pycolmap.incremental_mapping", stop_at())
+    monkeypatch.setattr("mgs.data.importers.MOST_PIXELS", WIDTH * HEIGHT // 3)
     with monkeypatch.context() as patched:
-        patched.setattr("mgs.data.importers.MANY_PIXELS", WIDTH * HEIGHT // 3)
         patched.setattr("mgs.data.importers.write_png", stop_at())
         unmasked = ["import", root, "--out", out, "--masks", matches.parent]
         assert "no mask for image" in refused(capsys, unmasked)
         assert exit_code("import", root, "--out", out) == 130
-        assert "take long to fit; downscale 2" in said(capsys)[1]
+        assert "are written at 1/2 of their sides; downscale 1 keeps them" in said(capsys)[1]
     command("import", root, "--out", out)
     assert len(load_dataset(out)) == len(frames)
     assert not (tmp_path / "d.unpacked").exists()

@@ -37,7 +37,7 @@ def import_data(
     keyframes: str = "0.5s",
     masks: Path | None = None,
     mesh: Path | None = None,
-    downscale: Annotated[int, typer.Option(min=1)] = 1,
+    downscale: Annotated[int | None, typer.Option(min=1)] = None,
     up: str = "auto",
     unit: float | None = None,
     distance: str | None = None,
@@ -65,7 +65,8 @@ def import_data(
     - masks: Folder of masks, named like the images; the object is white.
     - mesh: Mesh of the object, world coordinates; masks are its projections. GLB is converted from
       +Y up to +Z up.
-    - downscale K: Average blocks of K x K pixels; 4 suits 12 megapixels.
+    - downscale K: Average blocks of K x K pixels. Default: the least K that leaves at most 2.1
+      megapixels, since a fit has at most 200,000 Gaussians.
     - up: Up direction: X,Y,Z in the source's world, or auto: from how cameras were held.
     - unit: Metres per unit of length of the source. Default: as the source says, if it does.
     - distance A,B,METRES: Distance between the cameras of two images, which gives the scale.
@@ -79,7 +80,7 @@ def import_data(
     options = {key: value for key, value in locals().items() if key not in ("out", "force")}
     from mgs.data.bags import is_bag
     from mgs.data.colmap import models_in
-    from mgs.data.importers import RECORD, import_source
+    from mgs.data.importers import RECORD, import_source, least_factor
     from mgs.data.meshes import GLTF
     from mgs.data.photographs import KIND as PHOTOGRAPHS
     from mgs.data.photographs import PLACED, photographs_in
@@ -131,7 +132,7 @@ def import_data(
         result = import_source(trained, out, **how, tests=tests, options=options)
         fit, cloud = shots.fit, shots.sparse
         if shots.kind != PHOTOGRAPHS:
-            larger = trained.shots if downscale > 1 else []
+            larger = trained.shots if (downscale or least_factor(shots.shots)) > 1 else []
             refine = refine_poses and not record
             about = shots, larger, scratch, mesh is None, console if refine else None
             result, fit, cloud = _checked(result, *about)

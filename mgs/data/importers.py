@@ -26,7 +26,7 @@ from mgs.progress import report
 
 Silhouette = Callable[[Camera], np.ndarray]  # mask of a camera, bool [H,W]
 
-MANY_PIXELS = 2_000_000  # pixels of an image beyond which downscale is recommended
+MOST_PIXELS = 2_100_000  # of an image by default, as 1920x1080: ten for each Gaussian
 CHECKED = 4  # about the number of pictures that are checked before an import
 RECORD = "import.json"  # record of what is imported; an interrupted import of the same continues
 
@@ -37,7 +37,7 @@ def import_source(
     *,
     masks: Path | None = None,
     mesh: Path | None = None,
-    downscale: int = 1,
+    downscale: int | None = 1,
     up: Vector = PLUS_Z,
     tests: Source | None = None,
     options: Mapping[str, Any] | None = None,
@@ -49,15 +49,15 @@ def import_source(
     come from the source's mask files or the images' alpha. Rock images come from the source, or
     from an alpha with intermediate values that gives the mask; with `masks` or `mesh` there are
     none. Images, depth and masks are undistorted to a pinhole camera in which every pixel is valid,
-    then reduced by blocks of `downscale` x `downscale`. up: as `World`. tests: shots of the same
-    world, which become the test views. options: recorded, values of JSON; of others an interrupted
-    import is not continued.
+    then reduced by blocks of `downscale` x `downscale`, None: `least_factor`. up: as `World`.
+    tests: shots of the same world, which become the test views. options: recorded, values of JSON;
+    of others an interrupted import is not continued.
 
     When an interrupted import continues, a finished frame is made again only if one of its files
     is newer; the result is the same bit for bit. A finished import is loaded as it is. Raises
     InputError as `read_mesh`; if a file is missing, damaged or of another size than its camera; if
     `out` holds anything else or is locked by another process. Finished frames are kept."""
-    shots, silhouette = source.shots, None
+    shots, silhouette, factor = source.shots, None, downscale or least_factor(source.shots)
     every = [*shots, *(tests.shots if tests else ())]
     if masks is not None:
         shots = [replace(shot, mask=_mask_file(masks, shot, every), rock=None) for shot in shots]
@@ -72,7 +72,7 @@ def import_source(
         "frames": len(shots),
         "sha256_of_frames": _digest(shots),
         "mesh": fingerprint(mesh) if mesh is not None and masks is None else None,
-        "downscale": downscale,
+        "downscale": factor,
         "test_views": None if tests is None else len(tests.shots),
     }
     with folder_locked(out):
@@ -87,17 +87,18 @@ def import_source(
         def begin() -> None:
             if not (out / RECORD).is_file():
                 write_json(out / RECORD, record)
-                _advise_size(shots[0].camera, downscale)
+                if downscale is None and factor > 1:
+                    _say_reduced(shots[0].camera, factor)
 
         _warn_of_bits(shots)
         frames = []
         for k, shot in enumerate(shots):
             report("importing", k, len(shots))
-            frames.append(import_shot(shot, out, silhouette, downscale, begin))
+            frames.append(import_shot(shot, out, silhouette, factor, begin))
         if source.sparse is not None:
             write_cloud(out / "sparse.ply", source.sparse)
         if tests is not None and not (out / TEST_FOLDER / "transforms.json").is_file():
-            how: Any = {"masks": masks, "mesh": mesh, "downscale": downscale, "up": up}
+            how: Any = {"masks": masks, "mesh": mesh, "downscale": factor, "up": up}
             import_source(tests, out / TEST_FOLDER, **how)
         world = World(up, source.unit or "unit", source.origin)
         upright = [replace(frame, camera=world.enter(frame.camera)) for frame in frames]
@@ -249,13 +250,19 @@ def _warn_of_bits(shots: Sequence[Shot]) -> None:
         warnings.warn(Notice(text), stacklevel=2)
 
 
-def _advise_size(camera: Camera, downscale: int) -> None:
-    """Warn where images will be large, before they are written, since that takes long, too."""
-    least = int(np.ceil(np.sqrt(camera.width * camera.height / MANY_PIXELS)))
-    if downscale < least:
-        size = f"{camera.width // downscale}x{camera.height // downscale}"
-        text = f"images of {size} take long to fit; downscale {least} makes them smaller"
-        warnings.warn(Notice(text), stacklevel=2)
+def least_factor(shots: Sequence[Shot]) -> int:
+    """Least factor of a reduction that leaves no image of more than MOST_PIXELS."""
+    most = max(shot.camera.width * shot.camera.height for shot in shots)
+    return int(np.ceil(np.sqrt(most / MOST_PIXELS)))
+
+
+def _say_reduced(camera: Camera, factor: int) -> None:
+    """Say so before images are written, since that takes long, too."""
+    text = (
+        f"images of {camera.width}x{camera.height} are written at 1/{factor} of their sides; "
+        "downscale 1 keeps them, for longer fits and more memory"
+    )
+    warnings.warn(Notice(text), stacklevel=2)
 
 
 def silhouette_of(mesh: Mesh) -> Silhouette:
