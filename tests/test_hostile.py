@@ -55,6 +55,20 @@ def test_an_image_is_measured_by_its_header(capsys, dataset, tmp_path, monkeypat
     fails("GiB are free", image_size, bomb(tmp_path / "b.png", 11_000))
 
 
+def test_images_too_large_for_a_fit_are_named_before_it_starts(
+    capsys, dataset, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("mgs.memory.MEMORY_FILE", tmp_path / "meminfo")
+    (tmp_path / "meminfo").write_text("MemAvailable: 8000000 kB")
+    path = dataset / "transforms.json"
+    data = json.loads(path.read_text())
+    for frame in [data, *data["frames"]]:
+        frame |= {"w": 8192, "h": 5464}
+    path.write_text(json.dumps(data))
+    line = refused(capsys, ["fit", dataset, "--out", tmp_path / "fit"], tmp_path / "fit")
+    assert "8192x5464 may take 16.7 GiB, 7.6 GiB are free; import them smaller" in line
+
+
 def test_postscript_in_a_picture_is_not_run(tmp_path, monkeypatch):
     """Pillow would give it to Ghostscript, whatever the name of the file."""
     program, ran = tmp_path / "gs", tmp_path / "ran"

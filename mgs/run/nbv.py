@@ -19,7 +19,7 @@ from mgs.fit.density import GROWTH, split_times
 from mgs.fit.settings import ALPHA_WEIGHT, MOST_OF_FIT, ModelSettings, TrainSettings, as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE, Gaussians
 from mgs.learning import information, refine_poses, surface_information
-from mgs.memory import VIEW_BYTES
+from mgs.memory import VIEW_BYTES, check_room
 from mgs.policy.poses import seed_views
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.photographs import choose_source
@@ -31,6 +31,7 @@ from mgs.run.folder import (
     DATASET,
     FILES,
     POLICY_SOURCE,
+    UNFINISHED,
     Checkpoint,
     Run,
     holds_run,
@@ -48,6 +49,7 @@ from mgs.scene import Scene, State
 from mgs.splat.constants import NEAR
 from mgs.survey.fusion import focus
 
+PIXEL_BYTES = 400  # peak memory of a fit for a pixel of its largest image; measured
 FREE_PASSES = 30  # passes of a fit of free means to all images; chosen
 
 FREE_TRAIN = {"passes": FREE_PASSES, "decay": 0.02, "tolerance": 0.0}
@@ -190,7 +192,12 @@ def _place_of(
 
 
 def _check_images(dataset: Dataset, live: bool, settings: dict[str, Any]) -> None:
-    """Raises InputError where images lack that a run needs first, or none is to be captured."""
+    """Raises InputError where images lack that a run needs first, or none is to be captured, and
+    where the largest need more memory in a fit than is free."""
+    largest = max(dataset.cameras, key=lambda camera: camera.width * camera.height)
+    width, height = largest.width, largest.height
+    what = f"{dataset.root}: fitting images of {width}x{height}"
+    check_room(width * height * PIXEL_BYTES, what, "import them smaller (`downscale`)")
     if live and not dataset.on_demand:
         raise InputError(f"{dataset.root}: all its images exist; leave out live capture")
     if settings.get("refine_poses") and dataset.on_demand:
@@ -358,7 +365,7 @@ def resume_nbv(
     scores = None if policy is None else policy_of(policy)
     scene, retry = scene_of(run, live, like), bool(live)
     if scene is not like:
-        scene = replace(scene, on_pass=on_pass)
+        scene = replace(scene, on_pass=on_pass, unfinished=run.folder / UNFINISHED)
     state = recording.run(
         run.folder, run.settings, scene, scores, on_step=on_step, progress=progress, retry=retry
     )
