@@ -75,7 +75,8 @@ def learn(
     new = taken[len(before.taken) :] if before else taken
     frames = captured(scene, frames, new)
     read = scene.image if scene.settings.exposure else scene.target
-    for i in new:
+    for done, i in enumerate(new):
+        report(Stage.READ, done, len(new))
         read(frames[i])
     fit, exposure = fit_views(scene, frames, taken, before)
     if fit.stop_reason == StopReason.DIVERGED:
@@ -131,7 +132,12 @@ def surface_information(
 ) -> np.ndarray:
     """`State.surface` after new views; it depends on poses and the prior alone."""
     surface = scene.surface(state)
-    of_views = (surface.exact(surface.cameras[i]) for i in new)  # not kept: used once
+
+    def exact(done: int) -> np.ndarray:  # not kept: used once
+        report(Stage.INFORMATION, done, len(new))
+        return surface.exact(surface.cameras[new[done]])
+
+    of_views = map(exact, range(len(new)))
     if before is None:
         return np.zeros((len(scene.prior.points), len(scene.surface_lam))) + sum(of_views)
     return sum(of_views, before.surface)

@@ -10,6 +10,7 @@ class Stage(StrEnum):
     """Stages of a run that are timed. Values are shown; `seconds` in steps.jsonl has the names."""
 
     CAPTURE = "capturing"
+    READ = "reading images"
     FIT = "fitting"
     INFORMATION = "information of the training set"
     SCORE = "scoring candidates"

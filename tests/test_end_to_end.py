@@ -53,7 +53,8 @@ def test_the_run_is_whole_and_learns_from_more_images(dataset, run):
 
 def test_a_fit_shows_a_view_before_its_end(dataset, run, tmp_path, capsys, monkeypatch):
     """Without a terminal, lines of progress are on the standard error."""
-    monkeypatch.setattr(terminal, "SECONDS_BETWEEN", 0.0)
+    for name in ("BETWEEN", "MOST"):
+        monkeypatch.setattr(terminal, f"SECONDS_{name}", 0.0)
     out = tmp_path / "fit"
     command("fit", dataset, "--out", out, "--prior", run / "prior", "--passes", 5)
     printed, lines = said(capsys)

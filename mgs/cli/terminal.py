@@ -42,16 +42,17 @@ def echo(text: str) -> None:
     print(printable_lines(text))
 
 
-SECONDS_BETWEEN = 10.0  # least time between two lines of progress where there is no terminal
+# Least and largest time between two lines of progress without a terminal; a tenth of all time.
+SECONDS_BETWEEN, SECONDS_MOST = 10.0, 60.0
 
 
 class ProgressBar:
     """Lines at the bottom of the terminal: the stage at work, and above it the whole. Without a
-    terminal, a line on the standard error every SECONDS_BETWEEN."""
+    terminal, a line on the standard error from time to time."""
 
     def __init__(self, bar: Progress, stage: str) -> None:
         self._bar = bar
-        self._printed = time.monotonic()
+        self._begun = self._printed = time.monotonic()
         self._whole: TaskID | None = None
         self._name = stage
         self._stage = bar.add_task(stage, total=None)
@@ -62,8 +63,10 @@ class ProgressBar:
             self._bar.remove_task(self._stage)
             self._name, self._stage = stage, self._bar.add_task(stage, total=None)
         self._bar.update(self._stage, completed=done, total=total or None)
-        if self._bar.disable and time.monotonic() > self._printed + SECONDS_BETWEEN:
-            self._printed = time.monotonic()
+        now = time.monotonic()
+        pause = max(SECONDS_BETWEEN, min((now - self._begun) / 10, SECONDS_MOST))
+        if self._bar.disable and now > self._printed + pause:
+            self._printed = now
             of = f": {done} of {total}" if total > 1 else ""
             print(printable_lines(f"{stage}{of}"), file=sys.stderr, flush=True)
 

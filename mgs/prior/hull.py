@@ -71,8 +71,10 @@ class _Contradiction(InputError):
 
 def _carved(frames: Sequence[Frame]) -> Surface:
     """`visual_hull` of all frames. Raises _Contradiction where their masks do not fit."""
-    report("visual hull")
-    views = [_view(frame) for frame in frames]
+    views = list[_View]()
+    for frame in frames:
+        report("reading masks", len(views), len(frames))
+        views.append(_view(frame))
     lo, edge = _bounds(frames)
     cell, best = edge / (COARSE * 2**REFINEMENTS), -1.0
     for wrong in (0.0, FEW) if FEW * len(views) >= 1 else (0.0,):
@@ -184,6 +186,7 @@ def _inside(views: Sequence[_View], points: np.ndarray, reach: float, wrong: flo
     image."""
     field = np.full(len(points), -reach, np.float32)
     for first in range(0, len(points), BLOCK):
+        report("visual hull", first, len(points))
         part = points[first : first + BLOCK]
         values, active = np.empty((len(views), len(part))), np.arange(len(part))
         deep = np.zeros(len(part), int)
@@ -247,6 +250,7 @@ def _fit(views: Sequence[_View], mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
     depth, shares = mesh_depth(mesh), list[tuple[float, float]]()
     for view in views:
+        report("comparing the hull with masks", len(shares), len(views))
         mask, outline = view.distance > 0, depth(view.camera) > 0
         both = (mask & outline).sum()
         areas = mask.sum(), (mask | outline).sum()

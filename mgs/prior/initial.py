@@ -17,6 +17,7 @@ from mgs.colour import srgb_from_linear
 from mgs.data.frames import Frame, in_image, in_mask, visible
 from mgs.gaussians import ARRAYS, Gaussians, sh_from_rgb
 from mgs.prior.build import Prior
+from mgs.progress import Stage, report
 from mgs.rotation import quat_from_normals
 
 IN_PLANE_SCALE = 0.65  # standard deviation of a Gaussian along the surface, over the spacing
@@ -69,6 +70,7 @@ def initial_gaussians(
     total, count = np.zeros((n, 3)), np.zeros(n)
     colours = colours or colours_of(prior)
     for k, frame in enumerate(frames):
+        report(Stage.READ, k, len(frames))
         seen, rgb = colours(frame)
         total[seen] += rgb if gains is None else rgb / gains[k]
         count[seen] += 1
@@ -106,6 +108,7 @@ def round_gaussians(
     gains, linear: as in `initial_gaussians`."""
     total, count = np.zeros((len(points), 3)), np.zeros(len(points))
     for k, frame in enumerate(frames):
+        report(Stage.READ, k, len(frames))
         pixels, z = frame.camera.project(points)
         here = in_image(frame.camera, pixels, z) & in_mask(points, frame)
         column, row = pixels[here].astype(int).T

@@ -13,6 +13,7 @@ from mgs.data.frames import Frame
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, kept_within
 from mgs.prior.exposure import without_gain
+from mgs.progress import Stage, report
 from mgs.run import detectors
 from mgs.run.flight import views_left
 from mgs.run.policies import DIRECTIONAL_D, Policy
@@ -58,8 +59,9 @@ class Checks:
     def views(
         self, model: Gaussians, state: State, some: Sequence[int]
     ) -> list[detectors.ViewIndicators]:
-        views = []
+        views = list[detectors.ViewIndicators]()
         for k, view in list(enumerate(state.taken))[-len(some) :]:
+            report(Stage.CHECK, len(views), len(some))
             frame = state.frames[view]
             key = "before fit", state.taken[: state.seeds], frame
             before = self.scene.once(key, partial(self._before_fit, state, frame))
