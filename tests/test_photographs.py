@@ -138,6 +138,10 @@ def test_the_hull_of_a_convex_body_seen_from_all_sides_is_that_body(tmp_path, mo
     blocks = visual_hull(dataset.frames).mesh.vertices
     away = distances_to_mesh(blocks, found.mesh.vertices, found.mesh.faces)
     assert 0 < away.max() < 1.5 * 3.0 / 90  # pixels
+    monkeypatch.undo()
+    monkeypatch.setattr(hull, "COARSE", 24)
+    monkeypatch.setattr(hull, "IMAGE_BYTES", 30 * 96 * 72)  # of all 30 masks together, 4 a pixel
+    assert np.array_equal(visual_hull(dataset.frames).mesh.vertices, blocks)
 
 
 def test_the_hull_keeps_each_piece_inside_the_masks(tmp_path, monkeypatch):
@@ -172,7 +176,7 @@ def test_slightly_wrong_poses_cut_no_thin_part_away(tmp_path, monkeypatch):
     exact = synthetic.write_dataset(tmp_path, synthetic.orbit_cameras(40, 128, 96), parts)
     cameras = perturb([f.camera for f in exact.frames], 0.01, 0.15, np.random.default_rng(0))
     frames = [replace(f, camera=c) for f, c in zip(exact.frames, cameras, strict=True)]
-    views, overlaps = [hull._view(frame) for frame in exact.frames], []
+    views, overlaps = [hull._view(frame, hull.MOST_PIXELS) for frame in exact.frames], []
     for fitting in (0.0, hull.FITTING):
         monkeypatch.setattr(hull, "FITTING", fitting)
         found = visual_hull(frames)

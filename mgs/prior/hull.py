@@ -14,6 +14,7 @@ from mgs.data.frames import Frame, in_image, nearest_point
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh
 from mgs.errors import InputError, Notice
+from mgs.memory import IMAGE_BYTES
 from mgs.prior.surface import Surface
 from mgs.progress import report
 
@@ -21,7 +22,8 @@ COARSE, REFINEMENTS = 48, 2  # cells along an edge of the first grid; its refine
 NEAR_SURFACE = 3.0  # nodes are evaluated anew if their interpolated value is under this many cells
 BLOCK = 32_768  # points that are carved at once
 ROW = 4096  # points are passed to OpenCV in rows of this length
-MOST_PIXELS = 1_000_000  # of a mask to carve with: 4 MB each, with outlines finer than the grid
+# Of a mask to carve with: outlines finer than the grid. More than 268 share IMAGE_BYTES.
+MOST_PIXELS = 1_000_000
 MARGIN = 1.3  # half edge of the grid over the largest radius of the object that a mask shows
 LEAST_VIEWS = 3  # A point in the image of fewer frames is outside
 AGREEMENT = 0.8  # least median share of a mask that the hull must fill
@@ -71,10 +73,10 @@ class _Contradiction(InputError):
 
 def _carved(frames: Sequence[Frame]) -> Surface:
     """`visual_hull` of all frames. Raises _Contradiction where their masks do not fit."""
-    views = list[_View]()
+    views, most = list[_View](), min(MOST_PIXELS, IMAGE_BYTES // (4 * len(frames)))
     for frame in frames:
         report("reading masks", len(views), len(frames))
-        views.append(_view(frame))
+        views.append(_view(frame, most))
     lo, edge = _bounds(frames)
     cell, best = edge / (COARSE * 2**REFINEMENTS), -1.0
     for wrong in (0.0, FEW) if FEW * len(views) >= 1 else (0.0,):
@@ -127,9 +129,9 @@ class _View:
         return np.where(inside, value, np.inf)
 
 
-def _view(frame: Frame) -> _View:
-    """View of a frame, with a mask of at most MOST_PIXELS, since all are kept in memory."""
-    camera, smaller = shrunk_to(frame.camera, MOST_PIXELS)
+def _view(frame: Frame, most: int) -> _View:
+    """View of a frame, with a mask of at most `most` pixels, since all are kept in memory."""
+    camera, smaller = shrunk_to(frame.camera, most)
     mask = smaller(frame.mask().astype(np.uint8) * 255, True) >= 128
     far = np.full(mask.shape, float(max(mask.shape)))
     inside = far if mask.all() else distance_transform_edt(mask) - 0.5
