@@ -194,6 +194,8 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
         ("kf_0000.jpg: not a readable image", corrupt_jpeg),
         ("points.ply: has values that are not finite", points_in_one_place),
     ],
+    (Path.mkdir, "suggest {d}"): [("d: holds no transforms.json; make", nothing)],
+    (synthetic.write_dataset, "import {d} --out /"): [("/: is there already", nothing)],
     (synthetic.write_dataset, "import {d}/a.zip --out {out}"): [
         ("a.zip: is no file that can be imported", text("a.zip", "PK"))
     ],

@@ -306,6 +306,11 @@ def test_masks_and_test_views_without_effect_are_noticed(data, tmp_path, capsys)
     errors = said(capsys)[1]
     assert "12 of 12 masks looked at are empty" in errors
     assert "1 test views are no frame, as none" in errors
+    inverted = np.pad(np.zeros((20, 28), np.uint8), 2, constant_values=255)
+    for frame in data.frames:
+        Image.fromarray(inverted).save(frame.mask_path)
+    command("import", data.root, "--out", tmp_path / "inverted")
+    assert "white along their borders" in said(capsys)[1]
 
 
 def test_frames_elsewhere_stay_there_when_transforms_json_is_written(data, tmp_path):

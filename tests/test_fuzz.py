@@ -246,7 +246,7 @@ def photograph(path: Path) -> None:
 def of_photograph(path: Path) -> None:
     """Read a photograph as an import of a folder does, as far as its features."""
     read_image(path)
-    usable, _ = _usable([path])
+    usable, _ = _usable(path.parent, [path])
     if usable:
         Matcher(usable, path.parent / "matches")._extract([0])
 

@@ -208,6 +208,15 @@ def test_photographs_that_are_left_out_are_named_with_the_reason(placed):
         assert f"{names}, that {why}" in notes
 
 
+def test_photographs_of_one_name_or_none_are_left_out(frames, tmp_path):
+    paths = [tmp_path / name for name in ("a/1.png", "a_1.png", "b\n.png")]
+    for frame, path in zip(frames, paths, strict=False):
+        path.parent.mkdir(exist_ok=True)
+        shutil.copy(frame.image_path, path)
+    usable, dropped = photographs._usable(tmp_path, paths)
+    assert (usable, [*dropped]) == (paths[:1], ["a_1.png", r"'b\n.png'"])
+
+
 def test_a_distance_gives_the_scale(placed):
     scaled = placed[1].with_distance("view 00.jpg, view 06.jpg, 10")
     eyes = {shot.name: shot.camera.position for shot in scaled.shots}
@@ -353,6 +362,13 @@ def test_photographs_added_later_are_taken_with_the_same_camera(frames, tmp_path
     with closing(pycolmap.Database.open(matcher.database)) as database:
         assert len(database.read_all_images()) == 3
         assert len(database.read_all_cameras()) == 1
+
+
+def test_a_disk_that_is_too_small_is_one_line(frames, tmp_path, monkeypatch):
+    """In place of the abort of pycolmap."""
+    matcher = Matcher([frame.image_path for frame in frames], tmp_path / "m")
+    monkeypatch.setattr("mgs.data.structure.FEATURE_BYTES", 1 << 50)
+    fails("m: features of 9 pictures may take", matcher.match, [(0, 1)])
 
 
 def test_given_cameras_that_change_are_not_those_of_matches_before(frames, tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from mgs.data.structure import Matcher
 
 EXPOSURE_DIFFERS = 0.1  # stops by EXIF beyond which --exposure is recommended
+WHITE_RIM = 0.9  # share of white along the border of masks that may be inverted
 MOSTLY = 0.3  # share of empty masks beyond which a line says so
 
 FILES = ("import.json", "transforms.json", "images", "depth", "masks", "rock", "sparse.ply", "test")
@@ -107,7 +109,7 @@ def import_data(
     if record.get("kind") == PHOTOGRAPHS and "files" in record:  # to place them again takes long
         console.print(f"{out} is finished already; --force makes it again", soft_wrap=True)
         return
-    unpacked = out.with_name(f"{out.name}.unpacked")
+    unpacked = Path(f"{os.path.abspath(out)}.unpacked")
     with (
         scratch_folder(unpacked, "" if is_bag(source) else f"*/{PLACED}") as scratch,
         progress_bar("reading", console),
@@ -276,8 +278,9 @@ def _advice(source: Source, result: Dataset) -> Iterator[str]:
     if empty > MOSTLY * len(masks):
         many = f"{empty} of {len(masks)} masks looked at are empty"
         yield f"{many}: the object must be white in them, and a mesh in the cameras' axes"
-    if masks and all(mask.all() for mask in masks):
-        yield "the masks cover their pictures whole: only the object must be white in them"
+    rims = [(mask[0], mask[-1], mask[:, 0], mask[:, -1]) for mask in masks]
+    if masks and min(np.concatenate(rim).mean() for rim in rims) > WHITE_RIM:
+        yield "the masks are white along their borders: only the object must be white in them"
     stops = [value for shot in source.shots if (value := exif_exposure(shot.image)) is not None]
     if stops and max(stops) - min(stops) > EXPOSURE_DIFFERS:
         most = f"by up to {max(stops) - min(stops):.1f} stops between photographs"

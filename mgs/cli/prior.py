@@ -1,6 +1,7 @@
 """`mgs prior`: from depth images, points, masks or a mesh to a rock mesh and samples of it."""
 
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -182,7 +183,7 @@ def _built(
     try:
         return prior_and_cloud(dataset, settings, **options)
     except NoSurface as refused:
-        picture = folder.with_name(f"{folder.name}-refused.png")
+        picture = Path(f"{os.path.abspath(folder)}-refused.png")
         draw_refused(picture, refused.points, refused.kept)
         raise InputError(f"{refused} (the points: {picture})") from None
 

@@ -119,7 +119,7 @@ def suggest(
     fit: dict[str, Any] = {"prior": prior, "gaussians": parse_gaussians(gaussians)}
     fit["policy"] = policy
     if holds_photographs(source):
-        site = source.resolve().with_name(f"{source.resolve().name}{SITE}")
+        site = Path(f"{source.resolve()}{SITE}")
         source = _placed(source, site, console)
         out, force = out or site / NEXT, force or out is None
         fit["train"] = {"passes": PASSES}
@@ -175,6 +175,8 @@ def _place(source: Path) -> Any:
     from mgs.run.folder import holds_run, open_run
 
     root = open_run(source).settings.dataset if holds_run(source) else source
+    if not (root / "transforms.json").is_file():  # which `load_dataset` says better
+        return None
     text = read_records(root / "transforms.json")[0].get("place")
     return parse_origin(text) if isinstance(text, str) else None
 

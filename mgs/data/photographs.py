@@ -66,7 +66,7 @@ def read_photographs(
     if unknown := out - set(names):
         raise InputError(f"import: exclude {min(unknown)!r}: is no photograph of {source}")
     paths = [path for name, path in zip(names, paths, strict=True) if name not in out]
-    paths, dropped = _usable(paths)
+    paths, dropped = _usable(source, paths)
     if len(paths) < FEWEST:
         raise InputError(
             f"{source}: of its photographs {len(paths)} can be used; take at least {FEWEST}, "
@@ -102,23 +102,27 @@ def read_photographs(
     return replace(result, up=PLUS_Z, unit="m", place=georeferenced, notes=notes)
 
 
-def _usable(paths: Sequence[Path]) -> tuple[list[Path], dict[str, str]]:
-    """Photographs that can be read and are no copies, also by name without its ending, and why the
+def _usable(source: Path, paths: Sequence[Path]) -> tuple[list[Path], dict[str, str]]:
+    """Photographs that can be read and are no copies, also by the name of their frame, and why the
     others are left out, by name."""
     usable, dropped, seen = [], dict[str, str](), set[str]()
     for k, path in enumerate(paths):
         report("reading photographs", k, len(paths))
+        name = path.relative_to(source).as_posix()
         if path.suffix.lower() in UNREAD:
-            dropped[path.name] = "that are HEIC or raw: convert them to JPEG"
+            dropped[name] = "that are HEIC or raw: convert them to JPEG"
+            continue
+        if not name.isprintable():
+            dropped[ascii(name)] = "whose names cannot be printed: rename them"
             continue
         try:
             read_rgba(path)
         except InputError:
-            dropped[path.name] = "that cannot be read: damaged, or neither grey nor RGB"
+            dropped[name] = "that cannot be read: damaged, or neither grey nor RGB"
             continue
-        same = {hashlib.sha256(path.read_bytes()).hexdigest(), str(path.with_suffix(""))}
+        same = {hashlib.sha256(path.read_bytes()).hexdigest(), frame_name(name)}
         if same & seen:
-            dropped[path.name] = "that are copies of others, or have their name"
+            dropped[name] = "that are copies of others, or have their name"
             continue
         seen |= same
         usable.append(path)

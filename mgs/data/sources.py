@@ -1,6 +1,7 @@
 """Data to import: recognition of its format, and the files of nerfstudio and NeRF-synthetic."""
 
 import math
+import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -128,7 +129,7 @@ def _recognised(
         raise InputError(f"{source}: is HEIC or raw; convert all photographs to JPEG")
     path = source if source.is_file() else source / "transforms.json"
     split_path = source / TRAINING
-    folder = unpack or source.with_name(f"{source.name}.unpacked")
+    folder = unpack or Path(f"{os.path.abspath(source)}.unpacked")
     recording = next((kind for kind, (fits, _) in RECORDINGS.items() if fits(source)), None)
     if recording is not None:
         reader = RECORDINGS[recording][1]

@@ -17,12 +17,14 @@ from mgs.data.clouds import SparseCloud
 from mgs.data.dataset import FILES, TEST_FOLDER, Dataset, load_dataset, write_transforms
 from mgs.data.frames import Frame, moves
 from mgs.data.lens import Lens
+from mgs.errors import InputError
 from mgs.files import below, copy_file, read_leftover, write_json
 from mgs.images import exif_orientation, unlimited_headers
 from mgs.progress import report
 
 WIDEST = 1000  # longer side, pixels, to which larger pictures are reduced for features
 FEATURES = 4096  # most features of a picture
+FEATURE_BYTES = 152  # of a feature in the database
 PICTURES_AT_ONCE, PAIRS_AT_ONCE = 8, 64  # of one call of pycolmap, then progress is reported
 ALIKE = 16  # pictures that each is matched with where poses are known: the most alike by pose
 CLOUD = "sparse.ply"  # file of a dataset with its triangulated points
@@ -98,6 +100,7 @@ class Matcher:
         import pycolmap
 
         every = sorted({(min(pair), max(pair)) for pair in pairs})
+        self._check_disk()
         self._extract(sorted({place for pair in every for place in pair}))
         options, listed = pycolmap.TwoViewGeometryOptions(), self.folder / "pairs.txt"
         options.ransac.random_seed = 0
@@ -113,6 +116,15 @@ class Matcher:
                 pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
                 verification_options=options,
             )
+
+    def _check_disk(self) -> None:
+        """Raise InputError where the disk may be too small, since pycolmap aborts the process."""
+        free, need = shutil.disk_usage(self.folder).free, len(self.names) * FEATURES * FEATURE_BYTES
+        free += self.database.stat().st_size if self.database.is_file() else 0
+        if need > free:
+            room = f"may take {need / 2**20:,.0f} MiB on disk, {free / 2**20:,.0f} are free"
+            what = f"features of {len(self.names)} pictures"
+            raise InputError(f"{self.folder}: {what} {room}; choose a place with room")
 
     def _extract(self, places: Sequence[int]) -> None:
         import pycolmap
