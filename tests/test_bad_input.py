@@ -203,9 +203,12 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
         ("exclude leaves no image", frames(lambda all: all[:1])),
         ("transforms_test.json: its poses would be ignored", only_tests),
     ],
-    (lambda d: synthetic.write_dataset(d / "deep"), "import {d} --out {out}"): [
-        ("deep/transforms.json: its poses would be ignored", nothing)
-    ],
+    **{
+        (lambda d: synthetic.write_dataset(d / "deep"), words): [
+            ("deep/transforms.json: its poses would be ignored", nothing)
+        ]
+        for words in ("import {d} --out {out}", "suggest {d}")
+    },
     (nothing, "import {d}/colmap --out {out}"): [
         ("sparse/0: a COLMAP model without points3D.bin; restore it", model_without("points3D")),
         ("without cameras.bin and images.bin", model_without("images", "cameras")),

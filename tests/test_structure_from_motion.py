@@ -304,14 +304,17 @@ def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, capsys, monke
     words = [sys.executable, "-m", "mgs", "import", root, "--out", out]  # also in another process
     done = subprocess.run(words, capture_output=True, text=True)
     assert done.stdout == f"{out} is finished already; --force makes it again\n"
-    again = ["import", os.path.relpath(root), "--out", out, "--up", "auto"]
+    again = ["import", os.path.relpath(root), "--out", out, "--up", "auto", "--downscale", "2"]
     assert "is finished already" in output(capsys, *again)
-    options = ["--up", "0,0,1"], ["--masks", root], ["--refine-poses"], ["--exclude", "view 00"]
+    options = ["--up", "0,0,1"], ["--masks", root], ["--refine-poses"], ["--downscale", "1"]
     for words in options:
         assert f"finished with another {words[0]};" in refused(capsys, [*again[:4], *words], out)
     shutil.copytree(root, tmp_path / "other")
     assert "another source" in refused(capsys, ["import", tmp_path / "other", *again[2:]], out)
     record = read_json(out / "import.json")
+    masked = record["options"] | {"masks": "elsewhere"}
+    write_json(out / "import.json", record | {"options": masked})
+    assert "another --masks" in refused(capsys, again, out)
     write_json(out / "import.json", record | {"files": "other"})
     assert "photographs, masks, mesh or model have changed" in refused(capsys, again, out)
     write_json(out / "import.json", record | {"options": {}})  # of another version: unknown

@@ -76,12 +76,11 @@ def import_source(
         "test_views": None if tests is None else len(tests.shots),
     }
     with folder_locked(out):
-        before = read_leftover(out / RECORD)
-        if options and (
-            before is None or "options" in before
-        ):  # those of earlier versions lack them
+        finished, before = (out / "transforms.json").is_file(), read_leftover(out / RECORD)
+        # Records of earlier versions lack options; of finished imports the caller compares them.
+        if options and not finished and (before is None or "options" in before):
             record["options"] = options
-        if resumes(out, RECORD, record) and (out / "transforms.json").is_file():
+        if resumes(out, RECORD, record) and finished:
             return load_dataset(out)
 
         def begin() -> None:

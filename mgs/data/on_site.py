@@ -8,7 +8,7 @@ from PIL import Image
 
 from mgs.data.dataset import Dataset
 from mgs.data.importers import import_source
-from mgs.data.photographs import photographs_in
+from mgs.data.photographs import check_alone, photographs_in
 from mgs.data.sources import read_source
 from mgs.data.structure import WIDEST
 from mgs.files import (
@@ -43,6 +43,7 @@ def dataset_at(folder: Path, site: Path) -> tuple[Dataset, Sequence[str]]:
     """Dataset of a folder of photographs, and notes on what was left out. site: folder for it, of
     which a later call registers the photographs since then to the same model. Raises InputError as
     `read_source`, and if `site` was made by something else."""
+    check_alone(folder)
     record = site / RECORD
     if not record.is_file():
         check_leftover(site)

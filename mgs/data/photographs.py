@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +51,14 @@ def photographs_in(source: Path) -> list[Path]:
     endings = (*PICTURE_SUFFIXES, *UNREAD)
     paths = [path for path in pictures_of(source).rglob("*") if path.suffix.lower() in endings]
     return sorted((path for path in paths if path.is_file()), key=natural)
+
+
+def check_alone(source: Path) -> None:
+    """Raise InputError where poses lie in a folder of photographs, or among them."""
+    inside = (pictures_of(source).rglob(name) for name in ("transforms*.json", "cameras.bin"))
+    for poses in chain(source.glob("transforms*.json"), *inside):
+        cure = "give it, or its folder, as the source, or move it away"
+        raise InputError(f"{poses}: its poses would be ignored; {cure}")
 
 
 def read_photographs(

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -23,6 +22,7 @@ from mgs.data.photographs import KIND as PHOTOGRAPHS
 from mgs.data.photographs import (
     UNREAD,
     VIDEO_SUFFIXES,
+    check_alone,
     photographs_in,
     pictures_of,
     read_photographs,
@@ -151,10 +151,7 @@ def _recognised(
         if folder.resolve().is_relative_to(root.resolve()):
             why = "the output would lie among its photographs, and its pictures be taken for some"
             raise InputError(f"{root}: {why}; write it to a place outside")
-        inside = (root.rglob(name) for name in ("transforms*.json", "cameras.bin"))
-        for poses in (*source.glob("transforms_*.json"), *chain(*inside)):
-            cure = "give it, or its folder, as the source, or move it away"
-            raise InputError(f"{poses}: its poses would be ignored; {cure}")
+        check_alone(images or source)
         return read_photographs(images or source, paths, folder / "matches", exclude)
     raise InputError(
         f"{source}: holds no photographs (PNG, JPEG, TIFF, WebP), transforms.json, "
