@@ -194,6 +194,13 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
         ("kf_0000.jpg: not a readable image", corrupt_jpeg),
         ("points.ply: has values that are not finite", points_in_one_place),
     ],
+    (synthetic.write_dataset, "import {d} --images {d}/none --out {out}"): [
+        ("none: no such folder", nothing)
+    ],
+    (synthetic.write_dataset, "import {d} --keyframes 5 --out {out}"): [
+        ("expected seconds or metres", nothing)
+    ],
+    (lambda d: d.symlink_to(d), "import {d} --out {out}"): [("no such file or folder", nothing)],
     (Path.mkdir, "suggest {d}"): [("d: holds no transforms.json; make", nothing)],
     (synthetic.write_dataset, "import {d} --out /"): [("/: is there already", nothing)],
     (synthetic.write_dataset, "import {d}/a.zip --out {out}"): [
@@ -247,7 +254,12 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
     ],
     (bare, f"{BUILD} --source random --poisson-depth 6"): [("has no surface", nothing)],
     (bare, f"{BUILD} --source hull"): [("has no masks; ", nothing)],
-    (photographs(), f"{BUILD} --source depth"): [("has no depth images; take the", nothing)],
+    (synthetic.write_dataset, f"{BUILD} --source depth"): [
+        ("has frames without depth images", frame(0, depth_file_path=None))
+    ],
+    (photographs(), f"{BUILD} --source depth"): [
+        ("has frames without depth images; take the", nothing)
+    ],
     (synthetic.write_dataset, "survey {d}"): [
         ("too few for a survey", frames(lambda all: all[:2])),
         ("depth_file_path", frames(lambda all: [replace(one, depth_path=None) for one in all])),

@@ -195,9 +195,10 @@ def _evidence(fit: Agreement | None, cloud: SparseCloud | None = None) -> str:
 
 def _resolved(options: dict[str, Any]) -> dict[str, Any]:
     """Options as values of JSON that are the same for other words of the same."""
-    paths = {key: str(value.resolve()) for key, value in options.items() if isinstance(value, Path)}
-    names = sorted(set(options["exclude"] or ()))
-    resolved: dict[str, Any] = json.loads(json.dumps(options | paths | {"exclude": names}))
+    values: dict[str, Any] = {"exclude": sorted(set(options["exclude"] or ()))}
+    paths = {key: one for key, one in options.items() if isinstance(one, Path)}
+    values |= {key: os.path.realpath(path) for key, path in paths.items()}
+    resolved: dict[str, Any] = json.loads(json.dumps(options | values))
     return resolved
 
 

@@ -233,7 +233,8 @@ def checked(path: Path, source: Source) -> Source:
     tests = frozenset(names.get(name, name) for name in source.tests)
     for name, count in Counter(shot.name for shot in there).items():
         if count > 1:
-            raise InputError(f"{path}: lists {name} more than once; remove the duplicate frames")
+            cure = "remove duplicate frames, or rename images that differ in the ending alone"
+            raise InputError(f"{path}: lists {name} more than once; {cure}")
         if not name or name != Path(name).name or not name.isprintable():
             raise InputError(f"{path}: {name!r} cannot be the name of a file; rename the image")
     return replace(source, shots=there, left_out=+left_out, tests=tests)

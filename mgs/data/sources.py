@@ -130,13 +130,16 @@ def _recognised(
     path = source if source.is_file() else source / "transforms.json"
     split_path = source / TRAINING
     folder = unpack or Path(f"{os.path.abspath(source)}.unpacked")
+    spacing = Spacing.parse(keyframes)
     recording = next((kind for kind, (fits, _) in RECORDINGS.items() if fits(source)), None)
     if recording is not None:
         reader = RECORDINGS[recording][1]
-        return reader(source, images, Spacing.parse(keyframes), folder, pose)
+        return reader(source, images, spacing, folder, pose)
+    if images is not None and not images.is_dir():
+        raise InputError(f"{images}: no such folder; give the folder of the images")
     if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
         frames = folder / "frames"
-        paths = sharpest_frames(source, frames, Spacing.parse(keyframes))
+        paths = sharpest_frames(source, frames, spacing)
         return read_photographs(frames, paths, folder / "matches", exclude)
     if source.is_file() and source.suffix.lower() != ".json":
         cure = "give a transforms.json, a video or a folder; unpack an archive"

@@ -36,7 +36,7 @@ def choose_source(dataset: Dataset, source: str | None = None, points: Path | No
     random. points: file of a given cloud. Raises InputError if there is no source, or not the one
     asked for."""
     has = {
-        "depth": any(frame.depth_path for frame in dataset.frames),
+        "depth": all(frame.depth_path for frame in dataset.frames),
         "points": points is not None or (dataset.root / CLOUD).is_file(),
         "hull": has_masks(dataset.frames),
         "random": True,
@@ -48,7 +48,11 @@ def choose_source(dataset: Dataset, source: str | None = None, points: Path | No
         return source
     if source not in (None, *SOURCES):
         raise InputError(f"source {source!r}: is unknown; choose one of {', '.join(SOURCES)}")
-    lacks = {"depth": "no depth images", "points": f"no points ({CLOUD})", "hull": "no masks"}
+    lacks = {
+        "depth": "frames without depth images",
+        "points": f"no points ({CLOUD})",
+        "hull": "no masks",
+    }
     lack = lacks.get(source, "no mesh of its own")
     ways = {
         "depth": "import data with depth",
