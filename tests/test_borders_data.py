@@ -209,6 +209,9 @@ def test_colmap_text_keeps_names_and_loses_no_image(data, tmp_path, folder, enco
     assert np.allclose(shots[0].camera.K, data.frames[0].camera.K)
     named = folder.replace("/", "_")
     assert [shot.name for shot in shots[:2]] == [f"{named}_kf_0000", f"{named}_kf_0001"]
+    image = source / f"images/{folder}/kf_0000.png"
+    image.rename(image.with_suffix(".PNG.png"))  # a mask, as COLMAP names it, is no picture
+    assert read_source(source).left_out["whose file is missing"] == 1
     lines = [line for line in path.read_text().splitlines() if line.endswith(".PNG")]
     path.write_text("\n".join(lines) + "\n")
     fails("has no line of points after that of image", read_source, source)

@@ -120,7 +120,8 @@ def read_colmap(source: Path, models: list[Path], images: Path) -> Source:
     reconstruction, names = _opened(model)
     files = {}
     for number, name in names.items():
-        found = (find_image(images, one) for one in (name, PureWindowsPath(name).as_posix()))
+        spellings = name, PureWindowsPath(name).as_posix()
+        found = (find_image(images, one, [""]) for one in spellings)
         files[number] = name, next(filter(None, found), images / name)
     result = source_of(reconstruction, files, f"{model}: image")
     placed = {shot.image for shot in result.shots}
