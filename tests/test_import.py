@@ -15,7 +15,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from program import command, exit_code, output, python, said
+from program import command, exit_code, output, python, said, stop_at
 from refusals import fails, listing, refused
 
 from mgs import Frame
@@ -386,6 +386,36 @@ def test_images_are_set_apart_as_test_views(dataset, tmp_path, capsys):
         frame.image_path.unlink()
     assert exit_code(*arguments, tmp_path / "none") == 2
     assert "1 test views of 1 images leave none to choose from" in said(capsys)[1]
+
+
+def test_an_import_of_an_earlier_version_is_continued_as_it_was(
+    dataset, tmp_path, capsys, monkeypatch
+):
+    """Its record has neither options nor files, and its images are whole."""
+    out = tmp_path / "out"
+    _import(dataset.root, out)
+    monkeypatch.setattr(importers, "MOST_PIXELS", 1)
+    for words in ("is finished already", "wrote"):
+        assert words in output(capsys, "import", dataset.root, "--out", out)
+        same_cameras(dataset, load_dataset(out))
+        (out / "transforms.json").unlink()
+    for damaged in (5, {}):
+        write_json(out / "import.json", damaged)
+        line = refused(capsys, ["import", dataset.root, "--out", out], out)
+        assert "an unfinished dataset of other settings or sources" in line
+
+
+def test_an_import_interrupted_at_its_last_checks_has_the_same_options(
+    dataset, tmp_path, capsys, monkeypatch
+):
+    out = tmp_path / "out"
+    arguments = ["import", dataset.root, "--out", out, "--up"]
+    with monkeypatch.context() as patched:
+        patched.setattr("mgs.cli.import_data._checked", stop_at())
+        assert exit_code(*arguments, "0,0,1") == 130
+    assert (out / "transforms.json").is_file()
+    assert "of other settings" in refused(capsys, [*arguments, "1,0,0"], out)
+    command(*arguments, "0,0,1")
 
 
 def test_masks_by_projecting_a_mesh_or_from_files(dataset, tmp_path, capsys):

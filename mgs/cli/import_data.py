@@ -228,10 +228,8 @@ def _check_same(
     before: Any = record.get("options")
     known: dict[str, Any] = before if isinstance(before, dict) else {}
     for key, value in known.items():
-        if options.get(key, value) not in (
-            value,
-            record.get(key, value),
-        ):  # of downscale, what it was
+        same = value, record.get(key, value)  # of downscale also what the default came to
+        if options.get(key, value) not in same:
             what = key if key == "source" else f"--{key.replace('_', '-')}"
             raise InputError(f"{out}: is finished with another {what}; --force makes it again")
     if files and record.get("files", files) != files:

@@ -49,15 +49,18 @@ def import_source(
     come from the source's mask files or the images' alpha. Rock images come from the source, or
     from an alpha with intermediate values that gives the mask; with `masks` or `mesh` there are
     none. Images, depth and masks are undistorted to a pinhole camera in which every pixel is valid,
-    then reduced by blocks of `downscale` x `downscale`, None: `least_factor`. up: as `World`.
-    tests: shots of the same world, which become the test views. options: recorded, values of JSON;
-    of others an interrupted import is not continued.
+    then reduced by blocks of `downscale` x `downscale`; None: those of the import that is there,
+    else `least_factor`. up: as `World`. tests: shots of the same world, which become the test
+    views. options: recorded, values of JSON; of others an interrupted import is not continued.
 
     When an interrupted import continues, a finished frame is made again only if one of its files
     is newer; the result is the same bit for bit. A finished import is loaded as it is. Raises
     InputError as `read_mesh`; if a file is missing, damaged or of another size than its camera; if
     `out` holds anything else or is locked by another process. Finished frames are kept."""
-    shots, silhouette, factor = source.shots, None, downscale or least_factor(source.shots)
+    shots, silhouette, before = source.shots, None, read_leftover(out / RECORD)
+    before = before if isinstance(before, dict) else {}
+    old = before.get("downscale")
+    factor = downscale or (old if isinstance(old, int) and old > 0 else least_factor(shots))
     every = [*shots, *(tests.shots if tests else ())]
     if masks is not None:
         shots = [replace(shot, mask=_mask_file(masks, shot, every), rock=None) for shot in shots]
@@ -76,11 +79,10 @@ def import_source(
         "test_views": None if tests is None else len(tests.shots),
     }
     with folder_locked(out):
-        finished, before = (out / "transforms.json").is_file(), read_leftover(out / RECORD)
-        # Records of earlier versions lack options; of finished imports the caller compares them.
-        if options and not finished and (before is None or "options" in before):
+        # Records of earlier versions lack options; of whole imports the caller compares them.
+        if options and (not before or ("options" in before and "files" not in before)):
             record["options"] = options
-        if resumes(out, RECORD, record) and finished:
+        if resumes(out, RECORD, record) and (out / "transforms.json").is_file():
             return load_dataset(out)
 
         def begin() -> None:
