@@ -44,8 +44,9 @@ def _key_of_fit(
     lam: Mapping[str, Any],
 ) -> str:
     """Hash of all that decides a fit; of files their size and time of modification."""
-    settings = json.dumps(train.model_dump(mode="json"), sort_keys=True)
-    digest = hashlib.blake2b(f"{settings} {lam}".encode(), digest_size=16)
+    numbers = {kind: np.asarray(values).tolist() for kind, values in lam.items()}
+    settings = json.dumps([train.model_dump(mode="json"), numbers], sort_keys=True)
+    digest = hashlib.blake2b(settings.encode(), digest_size=16)
     digest.update(b"" if gains is None else gains.tobytes())
     for name in ARRAYS:
         for values in (getattr(model, name), getattr(start, name)):

@@ -1,5 +1,6 @@
 """Density control of a fit: adaption, bitwise repetition."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from mgs.fit import density, fitting, unfinished
 from mgs.fit.density import Slopes, adapt, split
 from mgs.fit.settings import RATES, TrainSettings
 from mgs.rotation import rotmat_from_quat
+from mgs.scene import _key_of_fit
 from mgs.splat import reference, render
 from studies.bench import surface_camera, surface_gaussians
 
@@ -212,6 +214,29 @@ def test_an_interrupted_fit_continues_bit_for_bit(scene, monkeypatch, tmp_path, 
     fit(-1, unfinished.Unfinished(saves[0].path, "others"))
     assert used == every
     saves[0].path.write_bytes(b"PK damaged")
-    used.clear()
-    assert fit(-1, saves[0]).gaussians == whole.gaussians
-    assert used == every
+    with pytest.raises(KeyboardInterrupt):
+        fit(9, saves[0])
+    arrays = dict(np.load(saves[0].path))
+    empty = json.dumps(json.loads(str(arrays["json"])) | {"losses": []})
+    degree = np.zeros((len(truth), 4, 3), np.float32)
+    for change in (
+        {"json": np.array(empty)},
+        {"best.sh": degree},
+        {"slopes.1": None},
+        {"information.sh": None} if optimiser == "natural" else {"buffer.sh.1": None},
+    ):
+        parts = {name: part for name, part in (arrays | change).items() if part is not None}
+        np.savez(saves[0].path, **parts)
+        used.clear()
+        assert fit(-1, saves[0]).gaussians == whole.gaussians
+        assert used == every, "starts anew"
+    np.savez(saves[0].path, **{name: arrays[name] for name in arrays if "slopes" not in name})
+    fit(-1, saves[0])
+
+
+def test_any_other_number_is_another_fit(scene):
+    """Also the last bit of one in an array, of which NumPy prints eight digits."""
+    given = scene[0], scene[0], [], None, TrainSettings()
+    lam = np.full((1, 4, 3), 1 / 3)
+    keys = {_key_of_fit(*given, {"colour": each}) for each in (lam, np.nextafter(lam, 1), 1 / 3)}
+    assert len(keys) == 3

@@ -174,18 +174,18 @@ def fit_gaussians(
     goal = objective(
         gaussians, cameras, targets, start, lam, cache, *how, loss_name(loss or settings.loss)
     )
-    buffers = [
-        [dr.zeros(mi.TensorXf, offset.shape) for _ in range(optimiser.buffers)]
-        for offset, _ in goal.offsets(model)
-    ]
+    arrays = [offset.shape for offset, _ in goal.offsets(model)]
+    buffers = [[dr.zeros(mi.TensorXf, each) for _ in range(optimiser.buffers)] for each in arrays]
+    informed = optimiser.uses_information
+    information = [dr.zeros(mi.TensorXf, each) if informed else None for each in arrays]
     rng, draws = (generator(settings.seed, f"train/{name}") for name in ("order", "density"))
-    new = FitState(model, model, goal.prior, buffers, [None] * len(buffers), draws)
+    new = FitState(model, model, goal.prior, buffers, information, draws)
     state = (unfinished.load(new) if unfinished else None) or new
     keep = unfinished.save if unfinished else lambda state: None
     times = density.times(settings.passes, len(cameras)) if density else ()
     end = max(times, default=0)
     every = {*times, *range(0, settings.passes, INFORMATION_PASSES)}
-    measured = every if optimiser.uses_information else set()  # before these passes
+    measured = every if informed else set()  # before these passes
     uses = 1 + settings.passes + len(measured)
     goal = _counted(replace(goal, prior=state.prior), state, uses * len(goal.photos), on_image)
 
@@ -199,7 +199,7 @@ def fit_gaussians(
     while stop is None:
         done = len(state.losses) - 1
         if not state.steps:  # a new pass
-            if density and done in times:
+            if density and state.slopes and done in times:
                 between = state.changed * len(cameras), done * len(cameras)
                 measure = slopes_of(state.slopes, cameras, between, settings.most_gaussians)
                 changed = controlled(density, measure, goal, state.model, state.buffers, draws)

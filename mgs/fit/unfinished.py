@@ -69,7 +69,6 @@ class Unfinished:
             "images": state.images,
             "changed": state.changed,
             "draws": state.draws.bit_generator.state,
-            "information": state.information[0] is not None,
         }
         arrays: dict[str, Any] = {name: np.asarray(each) for name, each in _arrays(state).items()}
         with atomic_path(self.path) as temporary, open(temporary, "wb") as file:
@@ -114,7 +113,6 @@ def _loaded(
     images: int,
     changed: int,
     draws: dict[str, Any],
-    information: bool,
 ) -> FitState:
     """Raises an error of any type where the file is damaged."""
 
@@ -128,17 +126,19 @@ def _loaded(
         arrays: dict[str, Any] = {name: array(f"{part}.{name}") for name in ARRAYS}
         return as_drjit(replace(new.model, **arrays))
 
-    model, start, names = gaussians("model"), gaussians("start"), list(new.prior.lam)
+    model, best, start = (gaussians(part) for part in ("model", "best", "start"))
+    names = list(new.prior.lam)
     shapes = {name: tuple(getattr(model, name).shape) for name in names}
-    if start.sh.shape != model.sh.shape or model.sh.shape[1:] != new.model.sh.shape[1:]:
-        raise ValueError(f"start has colours of shape {start.sh.shape}")
+    degrees = {one.sh_degree for one in (model, best, start, new.model)}
+    if len(degrees) > 1 or len(start) != len(model) or not losses:
+        raise ValueError("parts do not fit together")
     lam = {
         name: mi.Float(array(f"lam.{name}", (1 if len(old) == 1 else int(np.prod(shapes[name])),)))
         for name, old in new.prior.lam.items()
     }
     state = FitState(
         model,
-        gaussians("best"),
+        best,
         replace(new.prior, start=start, lam=lam),
         [
             [
@@ -148,14 +148,14 @@ def _loaded(
             for name in names
         ],
         [
-            mi.TensorXf(array(f"information.{name}", shapes[name])) if information else None
-            for name in names
+            None if old is None else mi.TensorXf(array(f"information.{name}", shapes[name]))
+            for name, old in zip(names, new.information, strict=True)
         ],
         new.draws,
         [
             mi.Float(array(f"slopes.{i}", shapes[names[0]][:1]))
             for i in range(2)
-            if f"slopes.{i}.npy" in file.namelist()
+            if "slopes.0.npy" in file.namelist()
         ],
         [float(loss) for loss in losses],
         [mi.Float(loss) for loss in steps],
