@@ -68,7 +68,7 @@ def import_data(
     - mesh: Mesh of the object, world coordinates; masks are its projections. GLB is converted from
       +Y up to +Z up.
     - downscale K: Average blocks of K x K pixels. Default: the least K that leaves at most 2.1
-      megapixels, since a fit has at most 200,000 Gaussians.
+      megapixels, since a fit has by default at most 200,000 Gaussians.
     - up: Up direction: X,Y,Z in the source's world, or auto: from how cameras were held.
     - unit: Metres per unit of length of the source. Default: as the source says, if it does.
     - distance A,B,METRES: Distance between the cameras of two images, which gives the scale.
