@@ -304,7 +304,8 @@ def outline_error(mesh: Mesh, frames: Sequence[Frame]) -> float:
     from mgs.data.raycast import mesh_depth  # imported here because it loads Mitsuba
 
     depth, errors = mesh_depth(mesh), list[float]()
-    for frame in frames:
+    for k, frame in enumerate(frames):
+        report("comparing the surface with masks", k, len(frames))
         if frame.mask_path is None and frame.rock_path is None:
             continue
         mask, silhouette = frame.mask(), depth(frame.camera) > 0
@@ -324,7 +325,8 @@ def _seen_by(mesh: Mesh, frames: Sequence[Frame], tolerance: float) -> Mesh:
     with_depth = [frame for frame in frames if frame.depth_path is not None]
     depth_of_mesh = None if with_depth else mesh_depth(mesh)
     seen, normals = np.zeros(len(mesh.vertices), bool), mesh.vertex_normals
-    for frame in with_depth or frames:
+    for k, frame in enumerate(with_depth or frames):
+        report("surface seen by frames", k, len(with_depth or frames))
         camera = frame.camera
         if depth_of_mesh:
             camera = shrunk_to(camera, MOST_PIXELS)[0]

@@ -8,6 +8,7 @@ import numpy as np
 from mgs.data.frames import Frame
 from mgs.prior.build import Prior
 from mgs.prior.initial import depth_of, seen_colours
+from mgs.progress import Stage, report
 
 SAMPLES = 4000  # about the most surface samples compared, evenly spread over the prior's
 # Exponent of the cosine between normal and view in a sample's weight: surfaces shine at grazing
@@ -69,6 +70,7 @@ def exposure_of(prior: Prior) -> Callable[[Sequence[Frame]], np.ndarray]:
     def gains(frames: Sequence[Frame]) -> np.ndarray:
         for frame in frames:
             if frame.name not in cache:
+                report(Stage.READ, len(cache), len(frames))
                 cache[frame.name] = shown(frame)
         colours, weights = zip(*(cache[frame.name] for frame in frames), strict=True)
         return solve_gains(np.stack(colours), np.stack(weights))

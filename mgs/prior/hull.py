@@ -143,7 +143,8 @@ def _bounds(frames: Sequence[Frame]) -> tuple[np.ndarray, float]:
     """Lowest corner [3] and edge of the cube to carve in, around the point nearest to the rays
     through the masks' centres. Raises InputError if every mask is empty or fills its image."""
     rays, cones = [], []
-    for frame in frames:
+    for k, frame in enumerate(frames):
+        report("outlines of masks", k, len(frames))
         mask = frame.mask()
         if not mask.any() or mask.all():
             continue
