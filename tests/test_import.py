@@ -405,6 +405,15 @@ def test_an_import_of_an_earlier_version_is_continued_as_it_was(
         assert "an unfinished dataset of other settings or sources" in line
 
 
+def test_what_force_replaces_stays_where_masks_lack(dataset, tmp_path, capsys):
+    out = tmp_path / "out"
+    _import(dataset.root, out)
+    (dataset.root / "masks/kf_0003.png").unlink()
+    for masks, why in {"masks": "no mask for image", "none": "no such folder"}.items():
+        arguments = ["import", dataset.root, "--out", out, "--masks", dataset.root / masks]
+        assert why in refused(capsys, [*arguments, "--force"], out)
+
+
 def test_an_import_interrupted_at_its_last_checks_has_the_same_options(
     dataset, tmp_path, capsys, monkeypatch
 ):

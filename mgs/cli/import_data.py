@@ -15,7 +15,7 @@ import typer
 from mgs.cli.options import parse_up
 from mgs.cli.terminal import Terminal, progress_bar
 from mgs.errors import InputError
-from mgs.files import Ours, clear_folder, read_json, scratch_folder, write_json
+from mgs.files import Ours, read_json, scratch_folder, write_json
 
 if TYPE_CHECKING:
     from mgs.data.agreement import Agreement
@@ -126,12 +126,11 @@ def import_data(
         shots = shots if unit is None else shots.in_metres(unit)
         shots = shots if distance is None else shots.with_distance(distance)
         upward, reason = shots.up_or_estimate() if axis is None else (axis, "as --up says")
-        if force:
-            read = [path for shot in shots.shots for path in shot.files]
-            clear_folder(out, Ours(FILES, [*given, *read]))
+        read = [path for shot in shots.shots for path in shot.files]
+        replaced = Ours(FILES, [*given, *read]) if force else None
         trained, tests = shots.set_apart(test_every)
         how: Any = {"masks": masks, "mesh": mesh, "downscale": downscale, "up": upward}
-        result = import_source(trained, out, **how, tests=tests, options=options)
+        result = import_source(trained, out, **how, tests=tests, options=options, replaced=replaced)
         fit, cloud = shots.fit, shots.sparse
         if shots.kind != PHOTOGRAPHS:
             larger = trained.shots if (downscale or least_factor(shots.shots)) > 1 else []

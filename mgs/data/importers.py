@@ -20,7 +20,16 @@ from mgs.data.meshes import Mesh, read_mesh
 from mgs.data.shots import Shot, Source, find_image
 from mgs.data.world import PLUS_Z, Vector, World
 from mgs.errors import InputError, Notice
-from mgs.files import copy_file, fingerprint, folder_locked, read_leftover, remove_file, write_json
+from mgs.files import (
+    Ours,
+    clear_folder,
+    copy_file,
+    fingerprint,
+    folder_locked,
+    read_leftover,
+    remove_file,
+    write_json,
+)
 from mgs.images import PNG_BIT_DEPTH, read_depth, read_mask, read_rgba, write_exr, write_png
 from mgs.progress import report
 
@@ -41,6 +50,7 @@ def import_source(
     up: Vector = PLUS_Z,
     tests: Source | None = None,
     options: Mapping[str, Any] | None = None,
+    replaced: Ours | None = None,
 ) -> Dataset:
     """Write a source as a dataset into `out`: new, empty, or left by an interrupted import of it.
 
@@ -52,15 +62,13 @@ def import_source(
     then reduced by blocks of `downscale` x `downscale`; None: those of the import that is there,
     else `least_factor`. up: as `World`. tests: shots of the same world, which become the test
     views. options: recorded, values of JSON; of others an interrupted import is not continued.
+    replaced: kind of folder that is deleted first, once masks and mesh are found.
 
     When an interrupted import continues, a finished frame is made again only if one of its files
     is newer; the result is the same bit for bit. A finished import is loaded as it is. Raises
     InputError as `read_mesh`; if a file is missing, damaged or of another size than its camera; if
     `out` holds anything else or is locked by another process. Finished frames are kept."""
-    shots, silhouette, before = source.shots, None, read_leftover(out / RECORD)
-    before = before if isinstance(before, dict) else {}
-    old = before.get("downscale")
-    factor = downscale or (old if isinstance(old, int) and old > 0 else least_factor(shots))
+    shots, silhouette = source.shots, None
     every = [*shots, *(tests.shots if tests else ())]
     if masks is not None:
         shots = [replace(shot, mask=_mask_file(masks, shot, every), rock=None) for shot in shots]
@@ -70,6 +78,12 @@ def import_source(
 
         cameras, world = [shot.camera for shot in shots], World(origin=source.origin)
         silhouette = silhouette_of(mesh_in_sight(read_mesh(mesh), cameras, world, mesh))
+    if replaced:
+        clear_folder(out, replaced)
+    before = read_leftover(out / RECORD)
+    before = before if isinstance(before, dict) else {}
+    old = before.get("downscale")
+    factor = downscale or (old if isinstance(old, int) and old > 0 else least_factor(shots))
     record: dict[str, Any] = {
         "kind": source.kind,
         "frames": len(shots),
