@@ -141,6 +141,9 @@ def test_absolute_paths_give_names_of_what_differs(data, windows):
     source = read_source(data.root, data.root / "images" if windows else None)
     assert [shot.name for shot in source.shots] == [f"{'ab'[k % 2]}_{k}" for k in range(12)]
     assert source.tests == {"b_1"}
+    first = source.shots[0].image
+    left = read_source(data.root, first.parents[1], exclude=[str(first)]).shots
+    assert [shot.name for shot in left] == [shot.name for shot in source.shots[1:]]
 
 
 FISHEYE = "OPENCV_FISHEYE"

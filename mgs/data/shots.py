@@ -89,7 +89,7 @@ class Source:
         their images. Raises InputError for another text, unknown names and cameras in one place."""
         words = [word.strip() for word in text.split(",")]
         eyes = {shot.name: shot.camera.position for shot in self.shots}
-        names = [frame_name(word) for word in words[:2]]
+        names = [self._name(word) for word in words[:2]]
         try:
             metres = float(words[2])
         except (IndexError, ValueError):
@@ -102,6 +102,11 @@ class Source:
         if apart == 0:
             raise InputError(f"import: distance {text!r}: its cameras are in one place; correct it")
         return self.in_metres(metres / apart)
+
+    def _name(self, image: str) -> str:
+        """Name of the shot of an image, which is given by its name or its whole path."""
+        paths = {str(shot.image): shot.name for shot in self.shots}
+        return paths.get(image) or frame_name(image)
 
     def fitted(self) -> Source:
         """Source whose cameras are `mgs.data.lens.fitted` to their images."""
@@ -127,7 +132,7 @@ class Source:
 
     def without(self, names: Sequence[str]) -> Source:
         """Source without the shots of these images. Raises InputError for an unknown name."""
-        out = {frame_name(name) for name in names}
+        out = {self._name(name) for name in names}
         if unknown := out - {shot.name for shot in self.shots}:
             raise InputError(f"import: exclude {min(unknown)!r}: is no image of the source")
         shots = [shot for shot in self.shots if shot.name not in out]
