@@ -1,4 +1,4 @@
-# make demo   the whole way on a small rock: dataset, prior, five policies, table and pictures
+# make demo   the whole way on a small rock: dataset, prior, three policies, table and pictures
 # make test   lint, format, types, tests
 # make docs   the documentation as a site, in site/
 # They do all the set-up on their own (Python 3.11 or newer, libLLVM 19 or newer).

@@ -223,7 +223,8 @@ def fit(
     prior_std is 4 times as in the table, with random points 40 times.
 
     - out: New folder for the run.
-    - passes: Default: 30 with adaptive density or free means from photographs, else 10.
+    - passes: Default: 60 with adaptive density or free means from photographs (of more than 100
+      images fewer, 30 at least), else 10.
     - means: Default: free from photographs or with adaptive density, else frozen.
     - sh: Default: 3 with adaptive density, 1 with free means from photographs, else 0.
     - density: The defaults of adaptive are those of 3DGS. Default: split of photographs without a

@@ -50,9 +50,10 @@ from mgs.splat.constants import NEAR
 from mgs.survey.fusion import focus
 
 PIXEL_BYTES = 400  # peak memory of a fit for a pixel of its largest image; measured
-FREE_PASSES = 30  # passes of a fit of free means to all images; chosen
+# Passes of a fit of free means to all images: as many as give so many steps, within these limits.
+FREE_STEPS, FREE_PASSES = 6000, (30, 60)  # chosen (docs/fit.md)
 
-FREE_TRAIN = {"passes": FREE_PASSES, "decay": 0.02, "tolerance": 0.0}
+FREE_TRAIN = {"decay": 0.02, "tolerance": 0.0}
 """`TrainSettings` of such a fit: all passes, the last at low rates (docs/fit.md). Chosen."""
 
 FREE_SH = {"points": 1, "hull": 1, "random": 0}  # `NbvSettings.sh` of such a fit (docs/fit.md)
@@ -258,6 +259,7 @@ def start_of_fit(data: Dataset, prior: Any, gaussians: Any, train: dict[str, Any
     built in the run are split where images need more: those of a whole scene unless their number is
     given, those of an object into that number."""
     existing, sh, parts = _place_of(data.root, prior, gaussians), 0, 1.0
+    passes = {"passes": int(np.clip(FREE_STEPS // len(data), *FREE_PASSES))}
     if isinstance(existing, Path):  # which `start_run` loads
         numbers = read_leftover(existing / "prior.json")
         kind = str(numbers.get("from", "")) if isinstance(numbers, dict) else ""
@@ -269,11 +271,11 @@ def start_of_fit(data: Dataset, prior: Any, gaussians: Any, train: dict[str, Any
     if train.get("density") == "adaptive":
         recipe = as_3dgs(extent_of([frame.camera for frame in data.frames]))
         rates = recipe["rates"] | train.get("rates", {})
-        train, sh = {"passes": FREE_PASSES} | recipe | train | {"rates": rates}, MAX_SH_DEGREE
+        train, sh = passes | recipe | train | {"rates": rates}, MAX_SH_DEGREE
     train.setdefault("means", "free" if kind in LOOSE else "frozen")
     if train["means"] != "free" or kind not in LOOSE:
         return FitStart(source, train, sh)
-    train, of_object = FREE_TRAIN | train, kind != "random" and existing is None
+    train, of_object = passes | FREE_TRAIN | train, kind != "random" and existing is None
     few = kind == "random" and (data.root / CLOUD).is_file() and not isinstance(gaussians, int)
     if of_object or few:
         train.setdefault("density", "split")
