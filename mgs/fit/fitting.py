@@ -12,7 +12,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.colour import SH_C0
 from mgs.errors import InputError, row_named
-from mgs.fit.density import DENSITIES, controlled, slopes_of
+from mgs.fit.density import DENSITIES, Density, controlled, slopes_of
 from mgs.fit.losses import LOSSES, Loss, loss_name
 from mgs.fit.objective import (
     Objective,
@@ -199,15 +199,7 @@ def fit_gaussians(
     while stop is None:
         done = len(state.losses) - 1
         if not state.steps:  # a new pass
-            if density and state.slopes and done in times:
-                between = state.changed * len(cameras), done * len(cameras)
-                measure = slopes_of(state.slopes, cameras, between, settings.most_gaussians)
-                changed = controlled(density, measure, goal, state.model, state.buffers, draws)
-                goal, state.model, state.buffers = changed
-                state.prior, state.slopes, state.changed = goal.prior, [], done
-            if density and not state.slopes and done < end:
-                state.slopes = [dr.zeros(mi.Float, len(state.model)) for _ in range(2)]
-                dr.make_opaque(state.slopes)
+            goal = _changed(goal, state, density, times, cameras, settings.most_gaussians)
             if done in measured:
                 largest = goal.largest_diagonal(state.model)
                 state.information = [_together(part) for part in largest]
@@ -229,6 +221,30 @@ def fit_gaussians(
     lowest = min((loss for loss in losses[1:] if np.isfinite(loss)), default=losses[0])
     best = state.best.map(np.asarray)
     return Fit(best, lowest, tuple(losses), passes, passes * len(goal.photos), stop)
+
+
+def _changed(
+    goal: Objective,
+    state: FitState,
+    density: Density | None,
+    times: Sequence[int],
+    cameras: Sequence[Camera],
+    most: int,
+) -> Objective:
+    """The objective before a pass, after the density control, whose `times` these are, has changed
+    the state's Gaussians, if it is time. Slopes are summed until its last call."""
+    done = len(state.losses) - 1
+    if density and state.slopes and done in times:
+        measure = slopes_of(
+            state.slopes, cameras, (state.changed * len(cameras), done * len(cameras)), most
+        )
+        changed = controlled(density, measure, goal, state.model, state.buffers, state.draws)
+        goal, state.model, state.buffers = changed
+        state.prior, state.slopes, state.changed = goal.prior, [], done
+    if density and not state.slopes and done < max(times, default=0):
+        state.slopes = [dr.zeros(mi.Float, len(state.model)) for _ in range(2)]
+        dr.make_opaque(state.slopes)
+    return goal
 
 
 def _counted(
