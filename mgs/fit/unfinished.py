@@ -1,6 +1,7 @@
 """State of a fit after a step, and the file from which an interrupted fit continues bit for bit."""
 
 import json
+import math
 import time
 import zipfile
 from collections.abc import Sequence
@@ -133,7 +134,7 @@ def _loaded(
     if len(degrees) > 1 or len(start) != len(model) or not losses:
         raise ValueError("parts do not fit together")
     lam = {
-        name: mi.Float(array(f"lam.{name}", (1 if len(old) == 1 else int(np.prod(shapes[name])),)))
+        name: mi.Float(array(f"lam.{name}", (1 if len(old) == 1 else math.prod(shapes[name]),)))
         for name, old in new.prior.lam.items()
     }
     state = FitState(
