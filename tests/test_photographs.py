@@ -30,7 +30,7 @@ from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.shots import Shot, Source
 from mgs.data.sources import read_source
 from mgs.data.world import World, degrees_between, levelled, unit_up, up_of_cameras
-from mgs.errors import Notice
+from mgs.errors import InputError, Notice
 from mgs.files import read_json, write_json
 from mgs.fit import density
 from mgs.images import write_png
@@ -38,6 +38,8 @@ from mgs.prior import hull
 from mgs.prior.build import build_prior, load_prior, prior_and_cloud
 from mgs.prior.hull import visual_hull
 from mgs.prior.points import _grown, main_cluster, on_surface, reliable, scattered
+from mgs.prior.segmentation import Plane
+from mgs.prior.surface import shell
 from mgs.splat_files import load_gaussians
 from mgs.synth.orbit import perturb
 
@@ -251,6 +253,33 @@ def test_a_front_seen_from_one_side_is_closed_behind_and_is_no_ground(tmp_path):
     away = np.minimum(np.abs(prior.points[:, 1]), np.abs(prior.points[:, 1] + 0.3))
     assert np.quantile(away, 0.9) < 0.2
     assert prior.numbers["sampled_area"] > 12
+
+
+def test_points_that_poisson_does_not_close_get_a_shell(tmp_path, monkeypatch):
+    def refuse(*_: object) -> None:
+        raise InputError("prior: no closed surface")
+
+    monkeypatch.setattr("mgs.prior.photographs.closed_poisson", refuse)
+    ball = np.random.default_rng(0).normal(size=(1500, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    eyes = [(5 * np.cos(a), 5 * np.sin(a), z) for a, z in product(range(6), (-2.0, 2.0))]
+    cameras = [synthetic.pinhole(150.0, 128, 96, eye, [0, 0, 0]) for eye in eyes]
+    write_cloud(tmp_path / "sparse.ply", SparseCloud(ball))
+    dataset = Dataset(tmp_path, tuple(Frame(f"{k}", c, k, tmp_path) for k, c in enumerate(cameras)))
+    with pytest.warns(Notice, match="the prior is what is near them"):
+        prior = build_prior(dataset, PriorSettings(gaussians=1000, backing=0), source="points")
+    assert "poisson_depth" not in prior.numbers
+    spacing = prior.numbers["cloud_spacing"]
+    for mesh, volume in (
+        (prior.mesh, 4 / 3 * np.pi),
+        (shell(ball, spacing, Plane(np.array([0.0, 0, 1]), 0.0, 0.01, 0.1)), 2 / 3 * np.pi),
+    ):
+        solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
+        assert solid.is_watertight
+        assert volume < solid.volume < 1.6 * volume  # filled
+        above = ball[ball[:, 2] > mesh.vertices[:, 2].min()]
+        assert distances_to_mesh(above, mesh.vertices, mesh.faces).max() < 2 * spacing
+    assert abs(mesh.vertices[:, 2].min()) < 1e-9
 
 
 def test_points_of_any_ply_can_be_given(tmp_path, capsys):

@@ -1,5 +1,6 @@
 """Surfaces from photographs without depth: of triangulated points, the visual hull, or both."""
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,12 +12,12 @@ from mgs.data.dataset import Dataset
 from mgs.data.frames import Frame, has_masks, in_image
 from mgs.data.meshes import Mesh
 from mgs.data.structure import CLOUD
-from mgs.errors import InputError
+from mgs.errors import InputError, Notice
 from mgs.prior.hull import visual_hull
 from mgs.prior.points import segment_points, spacing_of
 from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud
 from mgs.prior.settings import PriorSettings
-from mgs.prior.surface import Surface, closed_poisson, intersection, poisson_mesh
+from mgs.prior.surface import Surface, closed_poisson, intersection, poisson_mesh, shell
 from mgs.progress import report
 from mgs.survey.fusion import focus, voxel_means
 
@@ -98,9 +99,9 @@ def surface_of(
     dataset: Dataset, source: str, settings: PriorSettings, points: Path | None = None
 ) -> Surface:
     """Surface of the source "points" or "hull". points: file of the cloud, by default the dataset's
-    own. With masks, the hull bounds the surface of the points and closes it. Raises InputError as
-    `visual_hull`, `read_cloud` and `segment_points`, and NoSurface if the surface cannot be
-    closed."""
+    own. With masks, the hull bounds the surface of the points and closes it. Without, points that
+    Poisson does not close get a `shell`, and a word. Raises InputError as `visual_hull`,
+    `read_cloud` and `segment_points`, and NoSurface if the hull has no part of the surface."""
     if source == "hull":
         settings.refuse_shaping("a hull is carved from masks")
         return visual_hull(dataset.frames)
@@ -109,22 +110,25 @@ def surface_of(
     hull = visual_hull(dataset.frames) if has_masks(dataset.frames) else None
     report("Poisson mesh")
     spacing = spacing_of(segmented.rock_points)
+    depth: int | None = None
     try:
         mesh, depth = _closed(segmented, hull, spacing, settings)
-    except NoSurface:
-        raise
     except InputError as error:
-        cloud_points = segmented.cloud.points
-        inside = cKDTree(segmented.rock_points).query(cloud_points)[0] == 0
-        raise NoSurface(str(error), cloud_points, inside) from None
+        if hull is not None:
+            cloud_points = segmented.cloud.points
+            inside = cKDTree(segmented.rock_points).query(cloud_points)[0] == 0
+            raise NoSurface(str(error), cloud_points, inside) from None
+        why = "the points give no closed surface, so the prior is what is near them"
+        warnings.warn(Notice(f"{why}; more photographs or masks make it exact"), stacklevel=2)
+        mesh = shell(segmented.rock_points, spacing, segmented.plane)
     numbers = {
         "points": len(cloud.points),
         "points_kept": len(segmented.cloud.points),
         "clusters": segmented.clusters,
         "cluster_size": len(segmented.rock_points),
         "cloud_spacing": spacing,
-        "poisson_depth": depth,
     }
+    numbers |= {} if depth is None else {"poisson_depth": depth}
     numbers |= {} if hull is None else hull.numbers
     return Surface(mesh, spacing, numbers, segmented)
 

@@ -26,6 +26,9 @@ from mgs.seeds import derive_seed
 POISSON_SCALE = 2.0
 POISSON_CELL = 1.5  # largest edge of the finest cells, over the voxel. Finer cells fit noise.
 POISSON_DEPTHS = (5, 10)  # least and largest octree depth chosen; beyond 12 pymeshlab crashes
+# A shell fills what is so near to points, over their spacing, but at least this share of their
+# extent, then loses two thirds of that at its outside. It is so many cells of a grid.
+SHELL, LEAST_SHELL, SHELL_CELLS = 3.0, 1 / 40, 3
 SUPPORT = 0.02  # least share of the points next to a piece of the surface, for the piece to be kept
 CUBES = ((1, 0), (2, 1))  # to try: factor on POISSON_SCALE, and octree levels that keep the cells
 OVERSAMPLING = 5  # random candidates per sample
@@ -54,14 +57,20 @@ def poisson_mesh(
     Raises InputError if there is no closed surface above the ground. Sources: Kazhdan and Hoppe
     2013, by pymeshlab; the cut by manifold3d."""
     solid, depth = _closed_solid(points, normals, voxel, depth, plane)
+    return _above(plane, solid, points), depth
+
+
+def _above(plane: Plane, solid: Any, points: np.ndarray) -> Mesh:
+    """Mesh of what is above the ground of a solid of manifold3d around points [M,3]; its flat base
+    is not seen. Raises InputError if there is nothing."""
     solid = _supported(solid.trim_by_plane(plane.normal, plane.offset), points)
     if solid.is_empty():
         cure = "give more frames, or take the source hull"
-        raise InputError(f"prior: Poisson at depth {depth} gives nothing above the ground; {cure}")
+        raise InputError(f"prior: the surface of the points is nowhere above the ground; {cure}")
     mesh = _from_solid(solid)
     limit = 1e-6 * np.ptp(mesh.vertices, axis=0).max()
     on_ground = np.abs(plane.height(mesh.vertices)) < limit
-    return replace(mesh, seen=~on_ground[mesh.faces].all(1)), depth
+    return replace(mesh, seen=~on_ground[mesh.faces].all(1))
 
 
 def closed_poisson(
@@ -71,6 +80,26 @@ def closed_poisson(
     and errors as `poisson_mesh`, without plane and cut."""
     solid, depth = _closed_solid(points, normals, voxel, depth, None)
     return _from_solid(_supported(solid, points)), depth
+
+
+def shell(points: np.ndarray, spacing: float, plane: Plane | None) -> Mesh:
+    """Closed mesh of what is near points [M,3] (SHELL), or enclosed by that, cut at the ground if
+    there is one: for points of which Poisson makes no closed surface. spacing: of the points.
+    Raises InputError if nothing is above the ground."""
+    from scipy.ndimage import binary_fill_holes, distance_transform_edt
+    from skimage.measure import marching_cubes
+
+    low, high = points.min(0), points.max(0)
+    reach = max(SHELL * spacing, LEAST_SHELL * float((high - low).max()))
+    cell = reach / SHELL_CELLS
+    low, high = low - reach - 2 * cell, high + reach + 2 * cell
+    cells = np.indices(np.ceil((high - low) / cell).astype(int) + 1)
+    near = cKDTree(points).query(low + cell * np.moveaxis(cells, 0, -1))[0] < reach
+    filled = binary_fill_holes(near)
+    depth = distance_transform_edt(filled) - distance_transform_edt(~filled)
+    vertices, faces, *_ = marching_cubes(depth, SHELL_CELLS * 2 / 3, gradient_direction="ascent")
+    solid = _to_solid(low + cell * vertices, faces)
+    return _above(plane, solid, points) if plane else _from_solid(_supported(solid, points))
 
 
 def _supported(solid: Any, points: np.ndarray) -> Any:
