@@ -54,6 +54,7 @@ class Shot:
 
     @property
     def files(self) -> list[Path]:
+        """Files that an import of it reads."""
         return [path for path in (self.image, self.depth, self.mask, self.rock) if path]
 
 
@@ -222,9 +223,9 @@ def none_exists(path: Path, count: int, example: str = "") -> InputError:
 
 
 def checked(path: Path, source: Source) -> Source:
-    """Source without the shots whose image does not exist. Absolute paths become
-    names of what their folders do not have in common. Raises InputError if none is left, if a name
-    is listed twice, or cannot be that of a file."""
+    """Source without the shots whose image does not exist. Frames of absolute paths are named by
+    what these do not have in common. Raises InputError if no shot is left, if a name is listed
+    twice, or cannot be that of a file."""
     there = [shot for shot in source.shots if shot.image.is_file()]
     left_out = source.left_out + Counter({"whose file is missing": len(source.shots) - len(there)})
     if not there:
