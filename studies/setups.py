@@ -25,6 +25,7 @@ from mgs.run import policy_file
 from mgs.run.inputs import policy_record
 from mgs.run.loop import finished
 from mgs.run.policies import Policy
+from mgs.seeds import generator
 from studies.frame.case import FRESH, NAMESAKE, ROCKS, Case, Rock, Size, rocks_of, test_views_of
 from studies.frame.output import (
     Panel,
@@ -81,6 +82,7 @@ class Setup:
     orbit: values of the scene's orbit. frames: number of poses. seeds: views to start with. every:
     take only the first half of the frames, and one in so many of the others. settings: more of
     `mgs nbv`. survey: poses, depth and prior are those of `mgs survey`, with its noise and drift.
+    drawn: the candidates are a random half of the frames, and the seeds are random, in each draw.
     """
 
     orbit: Mapping[str, Any]
@@ -89,6 +91,7 @@ class Setup:
     every: int | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     survey: bool = False
+    drawn: bool = False
 
 
 RING = {"kind": "circle", "distances": [1]}
@@ -119,8 +122,8 @@ class SetupSize:
 
     width, height, tests, spp: of the images. images: that a run takes, seeds among them. fewer:
     divisor of the numbers of frames of `setups`. gaussians: of the prior; None: automatic. passes:
-    of the fit that is judged, as by default. draws: runs of `random`, averaged. count: default
-    number of rocks. rocks: set by the options.
+    of the fit that is judged, as by default. draws: runs of `random`, and of every policy in a
+    set-up that is drawn, averaged. count: default number of rocks. rocks: set by the options.
     """
 
     width: int = 128
@@ -207,25 +210,28 @@ def cells_of(
         spiral = spiral_of(rock, size)
         data = [*data, spiral.cells()[0]]
         common = {"seeds": setup.seeds, "budget": size.images - setup.seeds, **setup.settings}
-        for policy in size.policies if policies is None else policies:
+        every_policy = size.policies if policies is None else policies
+        for draw, policy in product(range(size.draws), every_policy):
+            if draw and policy != RANDOM and not setup.drawn:
+                continue
             shown = shown_as(policy)
             version = "".join(f"-{digest[:8]}" for digest in policy_record(policy).values())
             shape = f"{size.images}x{size.width}x{size.height}"
             where = f"{rock.name}/{name.replace(' ', '-')}-{shape}"
             about = {"rock": rock.name, "scene": rock.scene, "setup": name, "policy": shown}
-            for draw in range(size.draws if policy == RANDOM else 1):
-                settings = common | {"policy": policy, "seed": rock.index + 1000 * draw}
-                *_, last = case.with_task(
-                    f"setup/{where}/{shown}{version}-{draw}",
-                    f"{__name__}:choose_and_judge",
-                    spiral=spiral.dataset,
-                    every=setup.every,
-                    passes=size.passes,
-                    settings=settings,
-                )
-                needs = tuple(cell.name for cell in data)
-                made = (*data, replace(last, needs=needs, about=about))
-                cells |= {cell.name: cell for cell in made}
+            settings = common | {"policy": policy, "seed": rock.index + 1000 * draw}
+            *_, last = case.with_task(
+                f"setup/{where}/{shown}{version}-{draw}",
+                f"{__name__}:choose_and_judge",
+                spiral=spiral.dataset,
+                every=setup.every,
+                drawn=setup.drawn,
+                passes=size.passes,
+                settings=settings,
+            )
+            needs = tuple(cell.name for cell in data)
+            made = (*data, replace(last, needs=needs, about=about))
+            cells |= {cell.name: cell for cell in made}
     return list(cells.values())
 
 
@@ -238,6 +244,7 @@ def choose_and_judge(
     every: int | None,
     settings: dict[str, Any],
     passes: int = SetupSize.passes,
+    drawn: bool = False,
 ) -> dict[str, Any]:
     """Task: choose views by a policy, fit all of them from the prior, and judge the model.
 
@@ -245,13 +252,15 @@ def choose_and_judge(
     the views taken).
     """
     name, seed = settings["policy"], settings["seed"]
-    shared, tests, pool = shared_scene(root / dataset, root / prior, every)
+    draw = seed if drawn else None
+    shared, tests, pool = shared_scene(root / dataset, root / prior, every, draw)
     further = views_of(root / spiral)
     scene = shared.with_seed(seed)
     mission = mgs.Mission(**{k: v for k, v in settings.items() if k not in ("policy", "seed")})
     policy = policy_file.policy_of(name) if name != ORACLE else _oracle(shared)
     start = _after_seeds if policy.needs_fit else before_any_fit
-    state = start(shared, tuple(shared.seeds(mission.seeds)))
+    count = mission.seeds
+    state = start(shared, tuple(range(count) if drawn else shared.seeds(count)))
     state, _ = choose_views(scene, policy, mission, state)
     train = scene.settings.train.model_copy(update={"passes": passes})
     taken = list(state.taken)
@@ -298,16 +307,20 @@ Measure = Callable[..., dict[str, np.ndarray]]
 
 @lru_cache(maxsize=1)
 def shared_scene(
-    dataset: Path, prior: Path, every: int | None
+    dataset: Path, prior: Path, every: int | None, draw: int | None = None
 ) -> tuple[mgs.Scene, Measure, Measure]:
     """Scene of a set-up on one rock, and PSNR over test views and candidates.
 
-    All policies share them, with the visibility of the surface."""
+    All policies share them, with the visibility of the surface. draw: seed of a random half of the
+    frames in random order; None: all."""
     data = mgs.load_dataset(dataset)
     if every is not None:
         half = len(data) // 2
         some = (f for i, f in enumerate(data.frames) if i < half or (i - half) % every == 0)
         data = replace(data, frames=tuple(some))
+    if draw is not None:
+        order = generator(draw, "pool").permutation(len(data))[: len(data) // 2]
+        data = replace(data, frames=tuple(data.frames[i] for i in order))
     _after_seeds.cache_clear()
     tests, pool = _measure(test_views_of(data).frames), _measure(data.frames)
     return mgs.Scene(data, mgs.load_prior(prior)), tests, pool

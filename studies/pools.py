@@ -1,0 +1,27 @@
+"""Policies compared over random pools of candidates with random seeds: see `studies.setups`."""
+
+from dataclasses import replace
+
+from studies import setups
+from studies.frame.program import study_of
+
+DRAWN = {
+    f"drawn {name}": replace(setups.SETUPS[name], frames=72, drawn=True)
+    for name in ("hemisphere", "mixed distances")
+}
+"""Set-ups with as many candidates as those they are named after, of twice as many frames."""
+
+POLICIES = (setups.LEADER, "cover", setups.RANDOM, *setups.BASELINES[1:3])
+
+tables = setups.tables
+
+STUDY = replace(
+    setups.STUDY,
+    name="pools",
+    about="Compare policies as `setups` does, over five random pools with random seeds each.",
+    cells=lambda work: setups.cells_of(work.size, POLICIES, DRAWN),
+    write=lambda work: setups.write(work, "pools", work.cells),
+)
+
+if __name__ == "__main__":
+    study_of("pools")()
