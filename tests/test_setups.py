@@ -19,7 +19,7 @@ from mgs.fit.settings import ALPHA_WEIGHT
 from mgs.run.folder import read_checkpoint
 from mgs.survey import flight
 from mgs.survey.flight import SurveySettings, fly
-from studies import certificate, fits, flights, link, setups, table1
+from studies import certificate, fits, flights, link, pools, setups, table1
 from studies.frame import case
 from studies.frame.case import Case, Rock, Size
 from studies.frame.output import read_rows
@@ -152,6 +152,29 @@ def test_metres_are_compared_at_the_same_psnr():
     *_, found, low = flights.rows_of({cell.name: {"flights": flown}}, [cell])
     assert (found["ratio"], found["gain"]) == (pytest.approx(15 / 35), pytest.approx(4))
     assert (low["ratio"], low["gain"]) == (None, pytest.approx(-1.8))
+
+
+def test_each_draw_has_its_own_pool_and_seeds(tmp_path, capsys, monkeypatch):
+    drawn = replace(SETUPS["hemisphere"], frames=4 * 16, seeds=2, drawn=True)
+    monkeypatch.setattr(pools, "DRAWN", {"drawn": drawn})
+    monkeypatch.setattr(pools, "POLICIES", ("uniform", "random"))
+    out = tmp_path / "out"
+    done(capsys, "pools", out, "--rocks", 1)
+    assert len(read_rows(out / "pools.csv")) == 2, "draws are averaged"
+    cells = [json.loads(path.read_text()) for path in out.glob("cells/setup/**/result.json")]
+    by_draw = {(cell["arguments"]["settings"]["seed"]): cell["found"] for cell in cells}
+    assert len(cells) == 4
+    assert {tuple(cell["found"]["taken"][:2]) for cell in cells} == {(0, 1)}
+    assert by_draw[0]["path"] != by_draw[1000]["path"]
+    folders = cells[0]["arguments"]["dataset"], cells[0]["arguments"]["prior"]
+    places = [out / folder for folder in folders]
+    names = [
+        [frame.name for frame in setups.shared_scene(*places, None, draw)[0].frames]
+        for draw in (0, 1000, 0)
+    ]
+    assert [len(set(of)) for of in names] == [8] * 3
+    assert names[0] == names[2]
+    assert set(names[0]) != set(names[1])
 
 
 @pytest.mark.slow
