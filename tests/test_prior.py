@@ -14,7 +14,7 @@ from mgs.data.frames import visible
 from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.raycast import mesh_depth
 from mgs.prior.build import build_prior, load_prior, outline_error, prior_and_cloud, save_prior
-from mgs.prior.segmentation import Plane, ground_plane, rock_cluster
+from mgs.prior.segmentation import Plane, dbscan, ground_plane, rock_cluster
 from mgs.prior.surface import error_to_truth, poisson_mesh, sample_surface
 from mgs.survey.fusion import Cloud, focus
 
@@ -287,6 +287,21 @@ def test_prior_round_trip_and_determinism(built, orbit, tmp_path):
     assert loaded.spacing == prior.spacing
     assert loaded.depth_tolerance == prior.depth_tolerance
     assert trimesh.load(tmp_path / "prior/mesh.ply").is_watertight
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_dbscan_gives_the_labels_of_scikit_learn(seed):
+    from sklearn.cluster import DBSCAN
+
+    rng = np.random.default_rng(seed)
+    sizes = [(rng.uniform(-2, 2, 3), rng.uniform(0.05, 0.6), rng.integers(5, 400)) for _ in "abcd"]
+    blobs = [rng.normal(middle, width, (count, 3)) for middle, width, count in sizes]
+    points = rng.permutation(np.concatenate([*blobs, rng.uniform(-3, 3, (100, 3))]))
+    eps, least = rng.uniform(0.1, 0.5), int(rng.integers(2, 12))
+    usual = DBSCAN(eps=eps, min_samples=least).fit_predict(points)
+    assert usual.max() >= 0
+    assert np.array_equal(dbscan(points, eps, least), usual)
+    assert (dbscan(points, 1e-9, 2) == -1).all()
 
 
 def test_one_frame_with_depth_gives_what_it_saw(tmp_path):

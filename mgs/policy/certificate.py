@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from mgs.errors import InputError
 from mgs.policy.relaxation import TOLERANCE, Bound, Criterion, Floats
@@ -148,8 +147,9 @@ def _last_view(criterion: Criterion, lo: Floats, hi: Floats, k: int) -> list[int
 
 def _moved(x: Floats, lo: Floats, hi: Floats, k: int) -> Floats:
     """Weights in the box with the sum k, near to x."""
-    shift = brentq(lambda t: np.clip(x + t, lo, hi).sum() - k, -2, 2)
-    return np.clip(x + shift, lo, hi)
+    shifts = np.sort(np.concatenate([lo - x, hi - x]))  # between them, the sum is linear
+    sums = np.clip(x + shifts[:, None], lo, hi).sum(axis=1)
+    return np.clip(x + np.interp(k, sums, shifts), lo, hi)
 
 
 def _fixed(

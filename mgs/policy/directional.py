@@ -13,6 +13,7 @@ with M_j = sum over the dome of W_vj y_vj y_vj^T, by the Sherman-Morrison formul
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -98,5 +99,12 @@ def of_points(views: Views, some: slice) -> Views:
 def in_parts(count: int, part: Callable[[slice], Result]) -> list[Result]:
     """Results of `part` for slices of CHUNK out of `count`, in order, from threads."""
     chunks = [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        return list(pool.map(part, chunks))
+    if len(chunks) < 2:
+        return [part(some) for some in chunks]
+    return list(_threads(os.getpid()).map(part, chunks))
+
+
+@lru_cache(maxsize=1)
+def _threads(process: int) -> ThreadPoolExecutor:
+    """Threads of a process, which a fork of it does not have."""
+    return ThreadPoolExecutor(len(os.sched_getaffinity(0)))

@@ -17,7 +17,6 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linprog
 
 from mgs.errors import InputError
 from mgs.memory import VIEW_BYTES
@@ -134,23 +133,24 @@ class Relaxation(Bounded):
         return np.concatenate(in_parts(len(self.base), part))
 
     def gain(self, views: Iterable[int]) -> float:
-        taken = np.flatnonzero(self._taken(views))
+        taken, before = np.flatnonzero(self._taken(views)), self.before
 
         def part(some: slice) -> float:
             z = self.vectors(some)[:, taken]
             A = self.base[some] + z.transpose(0, 2, 1) @ z
             value = self._value(A, np.linalg.inv(A), some)
-            return float((value - self.before[some]).sum())
+            return float((value - before[some]).sum())
 
         return sum(in_parts(len(self.base), part))
 
     def tangent(self, x: Floats) -> tuple[float, Floats]:
         """f at weights x [C], and its gradient [C]."""
+        before = self.before
 
         def part(some: slice) -> tuple[float, Floats]:
             z, A = self._at(x, some)
             value, slope, _ = self._phi(A, some)
-            return float((value - self.before[some]).sum()), np.einsum("nvk,nvk->v", z @ slope, z)
+            return float((value - before[some]).sum()), np.einsum("nvk,nvk->v", z @ slope, z)
 
         values, slopes = zip(*in_parts(len(self.base), part), strict=True)
         return sum(values), sum(slopes)
@@ -368,6 +368,8 @@ class Coverage(Bounded):
     def steps(self, x: Floats, box: tuple[Floats, Floats]) -> Iterator[tuple[float, Bound]]:
         """Cutting planes: every x tried gives a tangent, and HiGHS finds the next x, where the
         least tangent is largest. Any mean of tangents is a bound; the prices are its slope."""
+        from scipy.optimize import linprog  # takes half a second
+
         rows, counts = self.shares
         size = round(float(x.sum()))
         most = np.sort(rows * box[1], axis=1)[:, -size:].sum(axis=1)

@@ -8,14 +8,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mgs.data.meshes import Mesh, face_crosses
-from mgs.plotting import STYLE, drawing
+from mgs.plotting import NO_GRID, drawing, painted
 from mgs.prior.build import Prior
 from mgs.prior.segmentation import SegmentedCloud
 
 UP = np.array([0.0, 0.0, 1.0])
 BLUE, TAN = [0.15, 0.35, 0.75], [0.85, 0.76, 0.6]
-FRAMED = STYLE | {"axes.spines.top": True, "axes.spines.right": True}
-MAX_DOTS = 60_000  # most points drawn in a panel; with more, it looks the same
+FRAMED = NO_GRID | {"axes.spines.top": True, "axes.spines.right": True}
+PIXELS = 560  # width and height of the image of a panel of dots, somewhat more than the panel has
 LIGHT = np.array([-0.5, 0.4, 0.77])  # direction to the light in picture coordinates, about unit
 
 
@@ -37,17 +37,21 @@ class _View:
         limits = (-zoom * self.reach, zoom * self.reach)
         axis.set(xlim=limits, ylim=limits, aspect="equal", xticks=[], yticks=[])
 
-    def dots(self, axis, points: np.ndarray, colour: np.ndarray, zoom: float, size: float) -> None:
-        """Draw world points [N,3], nearest last, as dots of `size` square points. colour: RGB
+    def dots(self, axis, points: np.ndarray, colour: np.ndarray, zoom: float, size: int) -> None:
+        """Draw world points [N,3], nearest last, as squares of `size` of the PIXELS. colour: RGB
         [N,3], or values [N] for a colour map."""
-        points = self.picture(points)
-        if len(points) > MAX_DOTS:
-            subset = np.random.default_rng(0).choice(len(points), MAX_DOTS, replace=False)
-            points, colour = points[subset], colour[subset]
-        order = np.argsort(points[:, 2])
-        x, y = points[order, :2].T
-        cmap = "viridis" if colour.ndim == 1 else None
-        axis.scatter(x, y, c=colour[order], cmap=cmap, s=size, linewidths=0, rasterized=True)
+        if colour.ndim == 1:
+            colour = painted(colour, "viridis", colour.min(), colour.max()) / 255
+        places, across = self.picture(points), np.arange(size) - size / 2
+        order = np.argsort(places[:, 2])
+        x, y = PIXELS / 2 * (1 + places[order, :2] / (zoom * self.reach)).T[..., None, None]
+        row, column = np.broadcast_arrays(y + across[:, None], x + across)
+        inside = (np.minimum(row, column) >= 0) & (np.maximum(row, column) < PIXELS)
+        colours = np.broadcast_to(colour[order, None, None], (*row.shape, 3))
+        image = np.ones((PIXELS, PIXELS, 3))
+        image[row[inside].astype(int), column[inside].astype(int)] = colours[inside]
+        limits = (-zoom * self.reach, zoom * self.reach)
+        axis.imshow(image, extent=limits * 2, origin="lower")
         self.frame(axis, zoom)
 
 
@@ -65,7 +69,7 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
     normals = prior.normals @ view.axes.T
     towards = normals[:, 2] > 0
     shade = _lambert(normals[towards]) * [0.95, 0.85, 0.7]
-    dot = float(np.clip(60_000 / max(len(shade), 1), 1, 12))
+    dot = round(np.sqrt(np.clip(4e5 / max(len(shade), 1), 9, 100)))
     metres = prior.numbers.get("unit", "m") == "m"
     spacing = f"{1e3 * prior.spacing:.2f} mm" if metres else f"{prior.spacing:.3g} units"
     area = f"{prior.mesh.areas.sum():.2f} {'m' if metres else 'unit'}²"
@@ -95,7 +99,7 @@ def draw_refused(path: str | Path, points: np.ndarray, rock: np.ndarray) -> None
         views = {"from the side": oblique, "from above": above}
         taken = f"{int(rock.sum()):,} taken for the object (blue)"
         for axis, (name, axes) in zip(figure.subplots(1, 2), views.items(), strict=True):
-            _View(axes, middle, reach).dots(axis, points, tint, 2, 1.5)
+            _View(axes, middle, reach).dots(axis, points, tint, 2, 3)
             axis.set_title(f"{name}: {len(points):,} points,\n{taken}")
 
 
@@ -117,7 +121,7 @@ def _cloud_panels(axes, view: _View, segmented: SegmentedCloud) -> None:
         (f"rock cluster: {len(rock):,} points", rock, rock[:, 2], 1.0),
     ]
     for axis, (title, points, colour, zoom) in zip(axes, panels, strict=True):
-        view.dots(axis, points, colour, zoom, 0.8)
+        view.dots(axis, points, colour, zoom, 2)
         axis.set_title(title)
 
 

@@ -18,7 +18,14 @@ from mgs.data.frames import Frame, has_masks, mask_share
 from mgs.data.meshes import Mesh
 from mgs.data.structure import CLOUD
 from mgs.errors import InputError
-from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud, estimate_normals, ground_plane
+from mgs.prior.segmentation import (
+    NoSurface,
+    Plane,
+    SegmentedCloud,
+    dbscan,
+    estimate_normals,
+    ground_plane,
+)
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import MOST_GAUSSIANS
 from mgs.progress import report
@@ -170,10 +177,8 @@ def _cluster_looked_at(
 
 def _grown(points: np.ndarray, inside: np.ndarray) -> np.ndarray:
     """Points [N,3] above the ground in a cluster [N] bool, or joined to it (GROWN)."""
-    from sklearn.cluster import DBSCAN
-
     eps = GROWN * float(np.ptp(points[inside], axis=0).max())
-    labels = DBSCAN(eps=eps, min_samples=GROWN_NEIGHBOURS).fit_predict(points)
+    labels = dbscan(points, eps, GROWN_NEIGHBOURS)
     own = labels[inside & (labels >= 0)]
     return inside | (labels == np.bincount(own).argmax()) if len(own) else inside
 

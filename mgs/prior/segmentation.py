@@ -4,6 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mgs.data.dataset import Dataset
@@ -103,6 +105,25 @@ def ground_plane(cloud: Cloud, frames: Sequence[Frame], seed: int) -> Plane:
     return Plane(sign * model.normal, sign * model.offset, sigma, tolerance)
 
 
+def dbscan(points: np.ndarray, eps: float, least: int) -> np.ndarray:
+    """Cluster of each point [N], from 0, or -1, by DBSCAN (Ester et al. 1996). points: [N,3]; eps:
+    radius of neighbourhoods; least: points in one, its own among them, that make a core.
+
+    The same labels as scikit-learn's DBSCAN, which takes a second to import."""
+    n, pairs = len(points), cKDTree(points).query_pairs(eps, output_type="ndarray")
+    core = 1 + np.bincount(pairs.ravel(), minlength=n) >= least
+    joined = pairs[core[pairs].all(axis=1)]
+    graph = coo_array((np.ones(len(joined), bool), tuple(joined.T)), shape=(n, n))
+    piece = connected_components(graph, directed=False)[1]
+    number = np.full(n, n)
+    number[core] = np.unique(piece[core], return_inverse=True)[1]
+    # A point at the border of several clusters belongs to the first.
+    labels = number.copy()
+    for near, of in (pairs.T, pairs[:, ::-1].T):
+        np.minimum.at(labels, near, np.where(core[near], n, number[of]))
+    return np.where(labels == n, -1, labels)
+
+
 def rock_cluster(
     points: np.ndarray,
     voxel: float,
@@ -112,8 +133,7 @@ def rock_cluster(
     sparse: float = 0.0,
     belongs: Callable[[np.ndarray, np.ndarray], bool] = lambda part, rock: False,
 ) -> tuple[np.ndarray, float, int]:
-    """Find the rock among points above the ground [N,3], by DBSCAN (Ester et al. 1996,
-    scikit-learn).
+    """Find the rock among points above the ground [N,3], by `dbscan`.
 
     voxel: distance between neighbours, metres. target: [3] point that the cameras look at, metres.
     name: of the cloud, for messages. weight: points [N,3] -> weights [N]. sparse: distance between
@@ -123,8 +143,6 @@ def rock_cluster(
     cluster, points of the rock so far) is true. Returns (inside [N] bool, eps in metres, number of
     clusters). Raises InputError if there is no cluster, or two that do not belong together are
     equally large and about equally near."""
-    from sklearn.cluster import DBSCAN
-
     thin, cell = points, voxel
     while cell < sparse or len(thin) > CLUSTER_POINTS:
         cell = max(1.25 * cell, sparse)
@@ -133,7 +151,7 @@ def rock_cluster(
         why = f"no rock in the cloud ({len(points)} points above the ground plane)"
         raise InputError(f"{name}: {why}; aim the cameras at one")
     eps = 2 * float(np.median(cKDTree(thin).query(thin, CLUSTER_NEIGHBOURS + 1)[0][:, -1]))
-    labels = DBSCAN(eps=eps, min_samples=CLUSTER_NEIGHBOURS).fit_predict(thin)
+    labels = dbscan(thin, eps, CLUSTER_NEIGHBOURS)
     count = int(labels.max()) + 1
     if count == 0:
         why = "no rock in the cloud (only scattered points above the ground plane)"
