@@ -107,7 +107,7 @@ class Encoder:
         model = gaussians_of(columns, start.means[self.kept], quats, self.axes)
         model = replace(model, antialiased=g.antialiased, linear=g.linear)
         each = [(gradient_of(model, quats, self.axes, by), by["means"]) for by in gradients(model)]
-        self.columns, self.gradients = columns, np.stack([columns for columns, _ in each])
+        self.columns, self.gradients = columns, np.stack([columns for columns, _ in each], axis=1)
         self.of_means = float(np.square([means for _, means in each]).sum(0).mean())
 
     def _codes(self, grid: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -140,8 +140,8 @@ class Encoder:
             centres[number] = columns[layer == number].mean(0)
         centres = fixed(centres, CENTRES)
         values = tree.forward(columns - centres[layer])
-        slopes = np.stack([tree.forward(one[order], adjoint=True) for one in self.gradients])
-        h = allocate.sensitivity(slopes, tree.band)
+        slopes = tree.forward(self.gradients[order].reshape(len(order), -1), adjoint=True)
+        h = allocate.sensitivity(slopes.reshape(self.gradients.shape).swapaxes(0, 1), tree.band)
         start, g = self.places, self.g
         flags = ANTIALIASED * g.antialiased + LINEAR * g.linear + SHARED * bool(self.start)
         header = Header(

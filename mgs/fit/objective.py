@@ -19,7 +19,7 @@ from mgs import runtime
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.errors import InputError, row_named
-from mgs.fit.losses import LOSSES
+from mgs.fit.losses import LOSSES, Size
 from mgs.gaussians import Gaussians, learned
 from mgs.memory import IMAGE_BYTES, Deferred, adopted, kept_within, padded
 from mgs.splat import ListCache, as_drjit, fisher, groups
@@ -86,7 +86,7 @@ class Photo:
     target: Target
 
     @property
-    def size(self) -> tuple[int, int, int]:
+    def size(self) -> Size:
         """Width, height and number of channels."""
         return self.camera.width, self.camera.height, self.target.channels
 
@@ -98,7 +98,7 @@ class View:
 
     camera: Any
     target: Target
-    size: tuple[int, int, int]
+    size: Size
     lists: BlockLists
     packed: Any
 
@@ -162,8 +162,7 @@ class Objective:
         errors = []
         for photo in self.photos:
             image, target = _rendered(model, photo, self.cache), photo.target
-            arguments = image, target.pixels, target.weights, photo.size, model.linear
-            values = LOSSES[self.error](*arguments)
+            values = _errors(self.error, image, target, photo.size, model.linear)
             errors.append(dr.mean(values) + penalty / len(target))
             dr.eval(errors[-1])  # frees the rendered image
         return float(np.mean([float(error[0]) for error in errors]))
@@ -321,6 +320,12 @@ def _rendered(model: Gaussians, photo: Photo, cache: ListCache) -> Any:
     """Pixels of a model for a photo, Float [H*W*C]. Raises InputError as `mgs.splat.render`."""
     splats, lists, packed = splats_and_lists(model, photo.camera, cache)
     return composite_channels(splats, packed, lists, *photo.size).array
+
+
+@frozen(lambda error, image, target, size, linear: (error, *size, target.stored, linear))
+def _errors(error: str, image: Any, target: Target, size: Size, linear: bool) -> Any:
+    """Loss LOSSES[error] of each pixel value of a render, Float [H*W*C]."""
+    return LOSSES[error](image, target.pixels, target.weights, size, linear)
 
 
 def with_gradients(model: Gaussians, prior: ParameterPrior) -> Gaussians:
