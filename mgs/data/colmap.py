@@ -153,7 +153,7 @@ def source_of(
 def _observed(image: Any, reconstruction: Any) -> tuple[Camera, np.ndarray, np.ndarray]:
     """Camera of an image without distortion, and points [N,3] with the pixels [N,2] of which they
     were triangulated."""
-    marks = [mark for mark in image.points2D if mark.has_point3D()]
+    marks = image.get_observation_points2D()
     points = [reconstruction.points3D[mark.point3D_id].xyz for mark in marks]
     rays = image.camera.cam_from_img(np.reshape([mark.xy for mark in marks], (-1, 2)))
     pose = np.eye(4)

@@ -197,7 +197,7 @@ class Matcher:
                 config.add_image(number)
                 config.set_constant_cam_intrinsics(image.camera_id)
                 place = self.names.index(image.name)
-                numbers = [mark.point3D_id for mark in image.points2D if mark.has_point3D()]
+                numbers = [mark.point3D_id for mark in image.get_observation_points2D()]
                 seen = np.stack([result.points3D[k].xyz for k in numbers])
                 std = POSITION_STD * float(np.median(cameras[place].project(seen)[1]))
                 priors.append(
