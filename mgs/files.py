@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatch
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, TextIO
@@ -85,9 +86,9 @@ def remove_file(root: Path, path: Path) -> None:
         raise not_writable(path, error) from None
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files that ended processes left in a folder and below it."""
-    for where, _, names in os.walk(folder):
+def remove_leftovers(folder: Path, below_it: bool = True) -> None:
+    """Remove the temporary files that ended processes left in a folder, and those below it."""
+    for where, _, names in islice(os.walk(folder), None if below_it else 1):
         for name in names:
             match, path = LEFTOVER.fullmatch(name), Path(where, name)
             if match and not path.is_symlink() and path.is_file():

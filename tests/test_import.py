@@ -555,3 +555,9 @@ def test_killed_before_the_first_frame(many, tmp_path):
     (tmp_path / "out/.import.1073741824-01234567.part.json").touch()
     command(*many, tmp_path / "out")
     assert not list((tmp_path / "out").glob(".*"))
+
+
+def test_a_folder_of_something_else_keeps_its_temporary_files(many, tmp_path, capsys):
+    (tmp_path / "out/deep").mkdir(parents=True)
+    (tmp_path / "out/deep/.import.1073741824-01234567.part.json").touch()
+    assert "is there already" in refused(capsys, [*many, tmp_path / "out"], tmp_path / "out")

@@ -293,8 +293,9 @@ def resumes(out: Path, record: str, settings: dict[str, Any]) -> bool:
     a dataset has the JSON file `record`, which must agree with every item of `settings`. It is
     finished if it has a transforms.json. Temporary files of a killed process are removed. Raises
     InputError if `out` holds anything else."""
-    remove_leftovers(out)
-    if not (out / record).is_file():
+    begun = (out / record).is_file()
+    remove_leftovers(out, below_it=begun)  # before the record, nothing is written below
+    if not begun:
         check_new_folder(out)
         return False
     old = read_json(out / record)
