@@ -4,6 +4,7 @@ import gc
 import os
 import shutil
 import signal
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -102,6 +103,34 @@ def browser():
 
     with chromium() as found:
         yield found
+
+
+@pytest.fixture(scope="module")
+def features_once():
+    """Features of the same PNG are extracted once, since that takes most of a matcher's seconds."""
+    import pycolmap
+
+    extract, found = pycolmap.extract_features, {}
+
+    def once(path, folder, image_names, **options):
+        pixels = {name: (folder / name).read_bytes() for name in image_names}
+        new = [name for name in image_names if name[-4:] != ".png" or pixels[name] not in found]
+        if new:  # of no names it takes all
+            extract(path, folder, image_names=new, **options)
+        with closing(pycolmap.Database.open(path)) as database:
+            numbers = {image.name: image.image_id for image in database.read_all_images()}
+            for name in image_names:
+                if name in new:
+                    features = database.read_keypoints, database.read_descriptors
+                    found[pixels[name]] = [read(numbers[name]) for read in features]
+                else:
+                    keypoints, descriptors = found[pixels[name]]
+                    database.write_keypoints(numbers[name], keypoints)
+                    database.write_descriptors(numbers[name], descriptors)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(pycolmap, "extract_features", once)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,8 @@ from mgs.data.dataset import write_transforms
 from mgs.data.structure import Matcher
 from mgs.images import write_exr, write_png
 
+pytestmark = pytest.mark.usefixtures("features_once")
+
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):

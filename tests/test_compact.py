@@ -333,7 +333,15 @@ def test_damaged_files_are_refused_or_read(tmp_path):
     assert not any("\n" in line for line in lines)
 
 
-def test_the_command_writes_what_fits_and_programs_read_it(dataset, prior, tmp_path, capsys):
+@pytest.fixture
+def short_searches(monkeypatch):
+    """Steps are found to a factor of 1.5."""
+    monkeypatch.setattr(compacting, "HALVINGS", 4)
+
+
+def test_the_command_writes_what_fits_and_programs_read_it(
+    dataset, prior, tmp_path, capsys, short_searches
+):
     run = tmp_path / "run"
     small_run(dataset, prior, run)
     capsys.readouterr()
@@ -415,7 +423,9 @@ def test_fewer_gaussians_are_tried_until_all_fit_at_the_finest_steps(
         assert len(tried) == 1 + next(k for k, s in enumerate(sizes) if s <= size)
 
 
-def test_a_small_file_is_better_with_fewer_gaussians_fitted_once_more(dataset, prior, tmp_path):
+def test_a_small_file_is_better_with_fewer_gaussians_fitted_once_more(
+    dataset, prior, tmp_path, short_searches
+):
     run = small_run(dataset, prior, tmp_path / "run")
     made = compacting.compact_run(run, 400)
     encoders = starmap(compacting.encoding(run, shared=False), compacting.thinned(run, whole=False))

@@ -36,6 +36,7 @@ from mgs.images import write_png
 from mgs.prior.photographs import check_photographs
 from mgs.progress import listening
 
+pytestmark = pytest.mark.usefixtures("features_once")
 WIDTH, HEIGHT = 320, 240
 
 
