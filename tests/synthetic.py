@@ -130,7 +130,7 @@ def edit(
     (root / name).write_text(json.dumps(data))  # NaN, which write_json refuses, too
 
 
-def write_colmap(dataset: Dataset, root: Path, binary: bool, count: int = 2000) -> None:
+def write_colmap(dataset: Dataset, root: Path, binary: bool, count: int = 500) -> None:
     """Export to COLMAP: one camera, and points on the rock and the ground, tracked where seen."""
     import pycolmap
 

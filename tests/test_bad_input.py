@@ -272,6 +272,7 @@ IDS = [f"{command.split()[0]}: {words}" for _, command, words, _ in CASES]
 
 
 @pytest.mark.parametrize(("world", "command", "words", "change"), CASES, ids=IDS)
+@pytest.mark.usefixtures("coarse_arena", "coarse_priors")
 def test_bad_input_is_one_line_and_leaves_nothing(capsys, tmp_path, world, command, words, change):
     world(tmp_path / "d")
     change(tmp_path / "d")

@@ -185,7 +185,7 @@ def pages():
 def data(tmp_path_factory, coarse_priors):
     """Inputs of the how-to pages: demo, photos with depth, a COLMAP model, masks, a mesh."""
     folder = tmp_path_factory.mktemp("readers")
-    dataset = synthetic.write_dataset(folder / "demo/dataset", synthetic.orbit_cameras(14, 48, 36))
+    dataset = synthetic.write_dataset(folder / "demo/dataset", synthetic.orbit_cameras(10, 48, 36))
     prior = mgs.build_prior(dataset, mgs.PriorSettings(gaussians=300))
     mgs.save_prior(folder / "demo/prior", prior)
     photos = synthetic.write_dataset(folder / "photos", synthetic.orbit_cameras(10, 48, 36))
@@ -250,12 +250,25 @@ def test_the_notebooks_are_their_pages(pages):
         assert not re.search(r'"!(mgs|python)\b', made)
 
 
+SMALLER = {
+    "--dome 40": "--dome 12", "120x90": "48x36", "width=120, height=90": "width=48, height=36",
+    "images=8": "images=2", "(1, 16, 256)": "(1, 4, 64)",
+    "errors[256] < errors[16]": "errors[64] < errors[4]",
+}  # fmt: skip
+
+
+def test_what_pages_are_run_with_is_smaller_than_what_they_show():
+    text = "".join(page.read_text() for page in HOWTO)
+    assert [old for old in SMALLER if old not in text] == []
+
+
 @pytest.mark.parametrize("page", HOWTO, ids=lambda page: page.stem)
 @pytest.mark.usefixtures("quick", "tables_restored")
 def test_a_how_to_page_can_be_followed(pages, data, page, tmp_path):
-    """With fewer poses to rate, and smaller pictures."""
-    small, text = tmp_path / page.name, page.read_text().replace("--dome 40", "--dome 12")
-    text = text.replace("120x90", "48x36").replace("width=120, height=90", "width=48, height=36")
+    """With fewer poses to rate and random images, and smaller pictures."""
+    small, text = tmp_path / page.name, page.read_text()
+    for old, new in SMALLER.items():
+        text = text.replace(old, new)
     small.write_text(text)
     assert pages.run_page(small, data)[1] == []
 

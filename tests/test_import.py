@@ -96,7 +96,7 @@ def test_any_camera_and_any_pixels_survive(data, tmp_path_factory):
 
 @pytest.mark.parametrize("binary", [True, False])
 def test_colmap_gives_cameras_and_points(dataset, tmp_path, binary):
-    synthetic.write_colmap(dataset, tmp_path / "colmap", binary)
+    synthetic.write_colmap(dataset, tmp_path / "colmap", binary, 2000)
     copy = _import(tmp_path / "colmap", tmp_path / "copy")
     same_cameras(dataset, copy)
     points = read_cloud(copy.root / "sparse.ply").points
