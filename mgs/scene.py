@@ -27,6 +27,7 @@ from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of, without_gain
 from mgs.prior.initial import colours_of, initial_gaussians, pixel_on
 from mgs.progress import Stage, report
+from mgs.provenance import versions
 from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups, render
 from mgs.splat.information import fisher_of_colours
@@ -43,19 +44,17 @@ def _key_of_fit(
     train: TrainSettings,
     lam: Mapping[str, Any],
 ) -> str:
-    """Hash of all that decides a fit; of files their size and time of modification."""
-    numbers = {kind: np.asarray(values).tolist() for kind, values in lam.items()}
-    settings = json.dumps([train.model_dump(mode="json"), numbers], sort_keys=True)
-    digest = hashlib.blake2b(settings.encode(), digest_size=16)
-    digest.update(b"" if gains is None else gains.tobytes())
-    for name in ARRAYS:
-        for values in (getattr(model, name), getattr(start, name)):
-            digest.update(np.ascontiguousarray(values).data)
+    """Hash of all that decides a fit, with the content of files and the versions of libraries."""
+    settings = json.dumps([versions(), train.model_dump(mode="json")], sort_keys=True)
+    digest = hashlib.sha256(settings.encode())
+    models = [(name, getattr(one, name)) for name in ARRAYS for one in (model, start)]
+    for name, values in (("gains", gains), *models, *sorted(lam.items())):
+        array = np.ascontiguousarray(() if values is None else values)
+        digest.update(repr((name, array.shape, array.dtype)).encode() + array.tobytes())
     for frame in frames:
         digest.update(frame.camera.key)
         for path in (frame.image_path, frame.mask_path, frame.rock_path):
-            about = path.stat() if path else None
-            digest.update(repr(about and (about.st_size, about.st_mtime_ns)).encode())
+            digest.update(hashlib.sha256(path.read_bytes()).digest() if path else b"none")
     return digest.hexdigest()
 
 

@@ -1,6 +1,7 @@
 """Density control of a fit: adaption, bitwise repetition."""
 
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,8 @@ import pytest
 from refusals import fails
 
 from mgs import fit_gaussians
+from mgs.data.frames import Frame
+from mgs.errors import Notice
 from mgs.fit import density, fitting, unfinished
 from mgs.fit.density import Slopes, adapt, split
 from mgs.fit.settings import RATES, TrainSettings
@@ -211,10 +214,11 @@ def test_an_interrupted_fit_continues_bit_for_bit(scene, monkeypatch, tmp_path, 
     used.clear()
     assert fit(-1, saves[0]).gaussians == whole.gaussians
     assert not used, "the end is on disk, too"
-    fit(-1, unfinished.Unfinished(saves[0].path, "others"))
+    with pytest.warns(Notice, match="fit.npz: is of other .*; the fit starts anew"):
+        fit(-1, unfinished.Unfinished(saves[0].path, "others"))
     assert used == every
     saves[0].path.write_bytes(b"PK damaged")
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt), pytest.warns(Notice, match="damaged; the fit starts"):
         fit(9, saves[0])
     arrays = dict(np.load(saves[0].path))
     empty = json.dumps(json.loads(str(arrays["json"])) | {"losses": []})
@@ -228,15 +232,24 @@ def test_an_interrupted_fit_continues_bit_for_bit(scene, monkeypatch, tmp_path, 
         parts = {name: part for name, part in (arrays | change).items() if part is not None}
         np.savez(saves[0].path, **parts)
         used.clear()
-        assert fit(-1, saves[0]).gaussians == whole.gaussians
-        assert used == every, "starts anew"
+        with pytest.warns(Notice, match="damaged; the fit starts anew"):
+            assert fit(-1, saves[0]).gaussians == whole.gaussians
+        assert used == every
     np.savez(saves[0].path, **{name: arrays[name] for name in arrays if "slopes" not in name})
     fit(-1, saves[0])
 
 
-def test_any_other_number_is_another_fit(scene):
-    """Also the last bit of one in an array, of which NumPy prints eight digits."""
-    given = scene[0], scene[0], [], None, TrainSettings()
-    lam = np.full((1, 4, 3), 1 / 3)
-    keys = {_key_of_fit(*given, {"colour": each}) for each in (lam, np.nextafter(lam, 1), 1 / 3)}
-    assert len(keys) == 3
+def test_any_other_number_picture_or_version_is_another_fit(scene, tmp_path, monkeypatch):
+    """Also the last bit of one in an array, of which NumPy prints eight digits, and a picture of
+    the same size and time."""
+    picture, lam = tmp_path / "a.png", np.full((1, 4, 3), 1 / 3)
+    given = scene[0], scene[0], [Frame("a", scene[1], 0.0, picture)], None, TrainSettings()
+    picture.write_bytes(b"before")
+    keys = [_key_of_fit(*given, {"colour": each}) for each in (lam, np.nextafter(lam, 1), 1 / 3)]
+    time = picture.stat().st_mtime_ns
+    picture.write_bytes(b"edited")
+    os.utime(picture, ns=(time, time))
+    keys.append(_key_of_fit(*given, {"colour": lam}))
+    monkeypatch.setattr("mgs.provenance.__version__", "99")
+    keys += [_key_of_fit(*given, {kind: lam}) for kind in ("colour", "scale")]
+    assert len(set(keys)) == len(keys)

@@ -3,6 +3,7 @@
 import json
 import math
 import time
+import warnings
 import zipfile
 from collections.abc import Sequence
 from contextlib import suppress
@@ -13,7 +14,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from mgs.errors import InputError
+from mgs.errors import InputError, Notice
 from mgs.files import atomic_path, parsing, reading, stored_array
 from mgs.fit.objective import ParameterPrior
 from mgs.gaussians import ARRAYS, Gaussians
@@ -77,7 +78,8 @@ class Unfinished:
         self._since = time.monotonic()
 
     def load(self, new: FitState) -> FitState | None:
-        """Read the state of this fit; None where there is none. new: its state before any step."""
+        """Read the state of this fit; None where there is none, with a Notice where there is that
+        of another. new: its state before any step."""
         if not self.path.is_file():
             return None
         with (
@@ -89,6 +91,8 @@ class Unfinished:
             numbers = json.loads(str(stored_array(file, "json", "U")[()]))
             if numbers.pop("key") == self.key:
                 return _loaded(file, new, **numbers)
+        why = "is of other pictures, settings or versions, or damaged"
+        warnings.warn(Notice(f"{self.path}: {why}; the fit starts anew"), stacklevel=2)
         return None
 
 
