@@ -90,7 +90,7 @@ def read_source(
     bag and the matches of photographs, by default SOURCE.unpacked. pose: topic of a bag's poses.
     exclude: names of images to leave out. Raises InputError if no format is recognised, no image
     exists, a frame is listed twice, a camera model is not supported, photographs cannot be placed,
-    or there is no such test split."""
+    there is no such test split, or `pose` is given and the source is no bag."""
     source = Path(source)
     source.exists()  # an OSError of the source itself is not one of a file that it names
     try:
@@ -132,6 +132,8 @@ def _recognised(
     folder = unpack or Path(f"{os.path.abspath(source)}.unpacked")
     spacing = Spacing.parse(keyframes)
     recording = next((kind for kind, (fits, _) in RECORDINGS.items() if fits(source)), None)
+    if pose is not None and recording != "ROS bag":
+        raise InputError(f"{source}: is no ROS bag, so it has no topic {pose}; leave out --pose")
     if recording is not None:
         reader = RECORDINGS[recording][1]
         return reader(source, images, spacing, folder, pose)
