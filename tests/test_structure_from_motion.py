@@ -87,17 +87,26 @@ def test_poses_without_points_get_them(downscale, frames, tmp_path, capsys):
 
 
 def test_noisy_poses_are_adjusted_to_the_pictures(frames, tmp_path, capsys, monkeypatch):
-    """Noise of 0.25 degrees and 6 mm about each axis: turns between neighbours become right."""
+    """Noise of 0.25 degrees and 6 mm about each axis: turns between neighbours become right. Where
+    it was interrupted between test views and others, it begins with the given poses again."""
     rng, std = np.random.default_rng(0), [np.radians(0.25)] * 3 + [0.0065] * 3
     noisy = [replace(f, camera=displaced(f.camera, rng.normal(0, std))) for f in frames]
     root = frames[0].image_path.parent.parent
     write_transforms(root, noisy)
     options = ["--refine-poses", "--up", "0,0,1", "--test-every", "4"]
+    command("import", root, "--out", tmp_path / "whole", *options)
+
+    def written_and_stopped(*arguments):
+        write_transforms(*arguments)
+        raise KeyboardInterrupt
+
     with monkeypatch.context() as patched:
-        patched.setattr("mgs.data.structure.refined", stop_at())
+        patched.setattr("mgs.data.structure.write_transforms", written_and_stopped)
         assert exit_code("import", root, "--out", tmp_path / "d", *options) == 130
     for words in ("poses moved 0.", "is finished already"):
         assert words in output(capsys, "import", root, "--out", tmp_path / "d", *options)
+    for name in ("transforms.json", "test/transforms.json", "sparse.ply"):
+        assert (tmp_path / "d" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     data = load_dataset(tmp_path / "d")
     after = sorted([*data.frames, *data.test_views().frames], key=lambda frame: frame.name)
 

@@ -93,10 +93,12 @@ def import_source(
         "test_views": None if tests is None else len(tests.shots),
     }
     with folder_locked(out):
-        # Records of earlier versions lack options; of whole imports the caller compares them.
-        if options and (not before or ("options" in before and "files" not in before)):
+        # Records of earlier versions lack options; of whole imports the caller compares them. One
+        # whose poses are not checked yet begins with those of the source.
+        begun = options and (not before or ("options" in before and "files" not in before))
+        if begun:
             record["options"] = options
-        if resumes(out, RECORD, record) and (out / "transforms.json").is_file():
+        if resumes(out, RECORD, record) and (out / "transforms.json").is_file() and not begun:
             return load_dataset(out)
 
         def begin() -> None:
@@ -112,9 +114,9 @@ def import_source(
             frames.append(import_shot(shot, out, silhouette, factor, begin))
         if source.sparse is not None:
             write_cloud(out / "sparse.ply", source.sparse)
-        if tests is not None and not (out / TEST_FOLDER / "transforms.json").is_file():
+        if tests is not None:
             how: Any = {"masks": masks, "mesh": mesh, "downscale": factor, "up": up}
-            import_source(tests, out / TEST_FOLDER, **how)
+            import_source(tests, out / TEST_FOLDER, **how, options=options)
         world = World(up, source.unit or "unit", source.origin)
         upright = [replace(frame, camera=world.enter(frame.camera)) for frame in frames]
         place = {"place": source.place} if source.place and up == PLUS_Z else {}
