@@ -146,6 +146,15 @@ def test_a_finished_import_says_so(capsys, dataset, tmp_path):
     arguments = ["import", dataset, "--out", tmp_path / "out"]
     for words in ("wrote", "is finished already"):
         assert words in output(capsys, *arguments)
+    picture = sorted((dataset / "images").iterdir())[2]
+    whole, time = picture.read_bytes(), picture.stat().st_mtime_ns
+    os.utime(picture)
+    assert "is finished already" in output(capsys, *arguments)
+    picture.write_bytes(whole[:-1] + b"?")
+    os.utime(picture, ns=(time, time))
+    line = refused(capsys, arguments, tmp_path / "out")
+    assert "its pictures, masks, mesh or model have changed since; --force" in line
+    picture.write_bytes(whole)
     synthetic.edit(dataset, lambda data: data["frames"][2].update(timestamp=99))
     assert "a finished dataset of other" in refused(capsys, arguments, tmp_path / "out")
 

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -99,14 +100,16 @@ def import_data(
     axis = parse_up(up)
     given = [path for path in (source, images, masks, mesh) if path]
     options = _resolved(options | {"up": axis})
-    pictures = [
-        path for folder in (images or source, masks) if folder for path in photographs_in(folder)
-    ]
-    model = [path for folder in models_in(source) for path in folder.iterdir()]
-    files = _stamp([*given, *pictures, *model, source / "transforms.json"])
     record = {} if force else _finished(out)
-    _check_same(out, record, options, files if record.get("kind") == PHOTOGRAPHS else None)
+    _check_same(out, record, options)
+    beside = [*given, *(photographs_in(masks) if masks else ())]
+    beside += [path for folder in models_in(source) for path in folder.iterdir()]
+
+    def photographs() -> list[Path]:
+        return [*photographs_in(images or source), source / "transforms.json"]
+
     if record.get("kind") == PHOTOGRAPHS and "files" in record:  # to place them again takes long
+        _check_unchanged(out, record, _stamp([*beside, *photographs()]))
         console.print(f"{out} is finished already; --force makes it again", soft_wrap=True)
         return
     unpacked = Path(f"{os.path.abspath(out)}.unpacked")
@@ -127,6 +130,8 @@ def import_data(
         shots = shots if distance is None else shots.with_distance(distance)
         upward, reason = shots.up_or_estimate() if axis is None else (axis, "as --up says")
         read = [path for shot in shots.shots for path in shot.files]
+        files = _stamp([*beside, *(photographs() if shots.kind == PHOTOGRAPHS else read)])
+        _check_unchanged(out, record, files)
         replaced = Ours(FILES, [*given, *read]) if force else None
         trained, tests = shots.set_apart(test_every)
         how: Any = {"masks": masks, "mesh": mesh, "downscale": downscale, "up": upward}
@@ -202,9 +207,13 @@ def _resolved(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _stamp(files: Sequence[Path]) -> str:
-    """SHA-256 of the paths and times of modification of the files that exist."""
-    about = sorted({(str(p.resolve()), p.stat().st_mtime_ns) for p in files if p.is_file()})
-    return hashlib.sha256(json.dumps(about).encode()).hexdigest()
+    """SHA-256 of the paths and contents of the files that exist."""
+    digest = hashlib.sha256()
+    for path in sorted({path.resolve() for path in files if path.is_file()}):
+        digest.update(os.fsencode(path))
+        with suppress(OSError), path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
 
 
 def _finished(out: Path) -> dict[str, Any]:
@@ -219,11 +228,8 @@ def _finished(out: Path) -> dict[str, Any]:
     return dict(record) if whole else {}
 
 
-def _check_same(
-    out: Path, record: dict[str, Any], options: dict[str, Any], files: str | None
-) -> None:
-    """Raise InputError where a finished import has other options or files, as far as its record
-    says. files: `_stamp`; None: not compared."""
+def _check_same(out: Path, record: dict[str, Any], options: dict[str, Any]) -> None:
+    """Raise InputError where a finished import has other options, as far as its record says."""
     before: Any = record.get("options")
     known: dict[str, Any] = before if isinstance(before, dict) else {}
     for key, value in known.items():
@@ -231,8 +237,12 @@ def _check_same(
         if options.get(key, value) not in same:
             what = key if key == "source" else f"--{key.replace('_', '-')}"
             raise InputError(f"{out}: is finished with another {what}; --force makes it again")
-    if files and record.get("files", files) != files:
-        why = "its photographs, masks, mesh or model have changed since"
+
+
+def _check_unchanged(out: Path, record: dict[str, Any], files: str) -> None:
+    """Raise InputError where a finished import has other files. files: `_stamp`."""
+    if record.get("files", files) != files:
+        why = "its pictures, masks, mesh or model have changed since"
         raise InputError(f"{out}: is finished, and {why}; --force makes it again")
 
 
