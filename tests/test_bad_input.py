@@ -229,7 +229,7 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
     ],
     (synthetic.write_dataset, "import {d} --out {out} --masks {d}/masks"): [
         ("no mask for image kf_0000.png", remove("masks/kf_0000.png")),
-        ("kf_0000.png: is 32x24", png("masks/kf_0000.png", np.ones((24, 32), bool))),
+        ("kf_0000.png: is 32x26", png("masks/kf_0000.png", np.ones((26, 32), bool))),
     ],
     (synthetic.write_dataset, "import {d} --out {out} --masks none"): [("none: no such", nothing)],
     (synthetic.write_dataset, "import {d} --out {out} --masks b --mesh a"): [("one of", nothing)],

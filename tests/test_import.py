@@ -29,7 +29,7 @@ from mgs.data.importers import import_source
 from mgs.data.lens import Lens, fitted, undistorter
 from mgs.data.sources import read_source
 from mgs.files import write_json
-from mgs.images import read_depth, write_png
+from mgs.images import read_depth, read_mask, write_exr, write_png
 
 DISTORTION = np.array([-0.15, 0.04, 0.002, -0.003, 0.0])
 LENS = dict(zip(("k1", "k2", "p1", "p2"), DISTORTION.tolist(), strict=False))
@@ -344,6 +344,30 @@ def test_images_may_be_smaller_than_their_cameras(dataset, tmp_path, kind, capsy
         pixels = [frame.camera.project(point[None])[0] for frame in (one, other)]
         assert np.allclose(pixels[0], 4 * pixels[1])
         assert (other.mask() == one.mask()[2::4, 2::4]).all()
+
+
+@pytest.mark.parametrize("own", [(32, 24), (43, 32), (96, 72)])
+def test_masks_and_depth_of_another_size_give_the_nearest_pixels(dataset, tmp_path, own, capsys):
+    """Of the same proportions, to a pixel; others are refused."""
+    for frame in dataset.frames:
+        depth, mask = (
+            cv2.resize(each, own, interpolation=cv2.INTER_NEAREST)
+            for each in (frame.depth(), np.uint8(frame.mask()))
+        )
+        write_exr(frame.depth_path, {"Z": depth})
+        write_png(frame.mask_path, mask > 0)
+    copy = _import(dataset.root, tmp_path / "copy")
+    for one, other in zip(dataset.frames, copy.frames, strict=True):
+        rows, columns = (
+            ((np.arange(side) + 0.5) * small / side).astype(int)
+            for side, small in zip((48, 64), own[::-1], strict=True)
+        )
+        near = np.ix_(rows, columns)
+        assert np.array_equal(other.depth(), read_depth(one.depth_path)[near])
+        assert np.array_equal(other.mask(), read_mask(one.mask_path)[near])
+    write_exr(dataset.frames[0].depth_path, {"Z": np.ones((own[1] + 2, own[0]), np.float32)})
+    line = refused(capsys, ["import", dataset.root, "--out", tmp_path / "out"])
+    assert "depth of their cameras' size" in line
 
 
 @pytest.mark.parametrize("own", [(34, 25), (33, 26), (80, 61)])

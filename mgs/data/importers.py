@@ -198,7 +198,7 @@ def import_shot(
         reader = partial(read_depth, unit=shot.depth_unit, float_unit=shot.float_unit)
         depth = None
         if shot.depth is not None:
-            depth = read_fitting(reader, shot.depth, shot.camera, shot.turned)
+            depth = read_fitting(reader, shot.depth, shot.camera, shot.turned, resized=True)
         begin()
         if depth_path is not None and depth is not None:
             write_exr(depth_path, {"Z": undo(depth, False)})
@@ -233,7 +233,7 @@ def _mask_and_rock(
         cutout = rgba
     rock = None if cutout is None else undo(premultiplied(cutout), True)
     if shot.mask is not None:
-        mask = read_fitting(read_mask, shot.mask, *about, reduced=True)
+        mask = read_fitting(read_mask, shot.mask, *about, resized=True)
         return undo(mask.astype(np.uint8) * 255, True) >= 128, rock
     return undo(alpha, True) > full // 2 if alpha.min() < full else None, rock
 

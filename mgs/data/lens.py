@@ -225,15 +225,15 @@ def read_fitting(
     path: Path,
     camera: Camera,
     turned: bool = False,
-    reduced: bool = False,
+    resized: bool = False,
 ) -> np.ndarray:
     """Pixels of an image file, turned by its EXIF orientation if `turned`, or if only that fits its
-    camera's size. reduced: a larger one of the same proportions gives the nearest pixels. Raises
-    InputError, before anything is decoded, if neither size fits."""
+    camera's size. resized: one of another size and the same proportions gives the nearest pixels.
+    Raises InputError, before anything is decoded, if neither size fits."""
     size, real = (camera.width, camera.height), image_size(path)
     orientation = exif_orientation(path) if turned or real == size[::-1] != size else 1
     whole = real[::-1] if orientation >= 5 else real
-    if size != whole and not (reduced and is_reduced(size, whole)):
+    if size != whole and not (resized and (is_reduced(size, whole) or is_reduced(whole, size))):
         why = f"is {real[0]}x{real[1]}, but its camera is {camera.width}x{camera.height}"
         raise InputError(f"{path}: {why}; give pictures, masks and depth of their cameras' size")
     pixels = read(path)
