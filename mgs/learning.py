@@ -134,7 +134,7 @@ def surface_information(
     surface = scene.surface(state)
 
     def exact(done: int) -> np.ndarray:  # not kept: used once
-        report(Stage.INFORMATION, done, len(new))
+        report(Stage.SURFACE, done, len(new))
         return surface.exact(surface.cameras[new[done]])
 
     of_views = map(exact, range(len(new)))

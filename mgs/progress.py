@@ -13,6 +13,7 @@ class Stage(StrEnum):
     READ = "reading images"
     FIT = "fitting"
     INFORMATION = "information of the training set"
+    SURFACE = "information of the surface"
     SCORE = "scoring candidates"
     CHECK = "checking"
     EVALUATE = "evaluating"
