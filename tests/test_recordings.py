@@ -379,6 +379,22 @@ def test_cameras_pixels_and_depth_are_those_recorded(dataset, tmp_path, capsys, 
             assert np.abs(one.depth() - other.depth()).max() < 6e-4
 
 
+@pytest.mark.parametrize("size", [(16, 12), (13, 10)])
+def test_reduced_pictures_of_llff_scale_each_axis_of_its_cameras(dataset, tmp_path, size):
+    """In images_4, where they have other names in the same order."""
+    root, out = write_llff(tmp_path / "llff", dataset), tmp_path / "out"
+    (root / "images_4").mkdir()
+    for k, frame in enumerate(dataset.frames):
+        with Image.open(frame.image_path) as image:
+            image.resize(size).save(root / f"images_4/image{k:03d}.png")
+    command("import", root, "--images", root / "images_4", "--up", "0,0,1", "--out", out)
+    for one, other in zip(dataset.frames, load_dataset(out).frames, strict=True):
+        assert (other.camera.width, other.camera.height) == size
+        across, down = np.divide(size, (one.camera.width, one.camera.height))
+        assert np.allclose(other.camera.K, one.camera.K * [[across], [down], [1]])
+        assert np.allclose(one.camera.world_to_camera, other.camera.world_to_camera, atol=1e-6)
+
+
 def opensfm_pixels(root: Path, points: np.ndarray) -> np.ndarray:
     """Pixels of points [N,3] in the first image by OpenSfM's formulas of the brown camera, after
     the lens was made one."""

@@ -337,9 +337,10 @@ def _shot(where: str, view: View, image: Path, name: str, time: float) -> Shot:
     own = image_size(image)
     width, height = view.size or own
     cx, cy = view.centre or (width / 2, height / 2)
-    K, scale = np.array([[view.focal[0], 0, cx], [0, view.focal[1], cy], [0, 0, 1]]), own[0] / width
-    if abs(scale * height - own[1]) <= 1:
-        K, (width, height) = K * [[scale], [scale], [1]], own
+    K = np.array([[view.focal[0], 0, cx], [0, view.focal[1], cy], [0, 0, 1]])
+    across, down = np.divide(own, (width, height)).tolist()
+    if abs(across * height - own[1]) <= 1:
+        K, (width, height) = K * [[across], [down], [1]], own
     pose, mended = orthonormal(view.pose)
     lens = Lens.of(where, view.model, K, view.coefficients)
     try:
