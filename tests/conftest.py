@@ -175,6 +175,18 @@ def coarse_priors():
 
 
 @pytest.fixture
+def plain_figures(monkeypatch):
+    """Nothing is moved to fit into figures, which is half of their cost: for tests that do not look
+    at them."""
+    from matplotlib.figure import Figure
+
+    from mgs import plotting
+
+    plain = lambda width, height, dpi: Figure((width, height), dpi)  # noqa: E731
+    monkeypatch.setattr(plotting, "new_figure", plain)
+
+
+@pytest.fixture
 def short_fits(monkeypatch):
     """Fits of runs have at most two passes: for tests that do not look at their quality."""
     from mgs import scene

@@ -196,8 +196,8 @@ def data(tmp_path_factory, coarse_priors):
 
 
 @pytest.fixture
-def quick(coarse_rocks, coarse_priors, short_fits):
-    """Coarse rocks and priors, and short fits."""
+def quick(coarse_rocks, coarse_priors, short_fits, plain_figures):
+    """Coarse rocks and priors, short fits and plain figures."""
 
 
 @pytest.fixture
