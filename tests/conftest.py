@@ -135,14 +135,17 @@ def features_once():
 
 @pytest.fixture(scope="module")
 def coarse_arena():
-    """Ground and stones of few vertices and texels, since they are most of a scene's cost."""
+    """Ground of few vertices and texels, and one stone in place of 16, since they are most of a
+    scene's cost."""
+    import numpy as np
+
     from mgs.synth import arena
 
-    stone = arena._stone
+    stone = arena._stone(arena.Noise(np.random.default_rng(0)), 0.08)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(arena, "ROWS", 60)
         patched.setattr(arena, "TEXELS", 64)
-        patched.setattr(arena, "_stone", lambda noise, detail: stone(noise, 0.08))
+        patched.setattr(arena, "_stone", lambda *_: stone)
         yield
 
 

@@ -22,12 +22,12 @@ from mgs.synth.rendering import PoseNoise, RenderPreset, synth_orbit
 from mgs.synth.scene_file import Arena, Rock, SceneFile
 from mgs.view.layers import read_subject
 
-TINY = RenderPreset(width=64, height=48, frames=8, spp=2)
+TINY = RenderPreset(width=48, height=36, frames=8, spp=2)
 SCENE = SceneFile(rock=Rock(detail=0.06), arena=Arena(stones=0))
 TOML = "[rock]\ndetail = 0.06\n[arena]\nstones = 0\n"
-RUN = ["--seeds", "3", "--budget", "3", "--set", "train.passes=3", "--set", "evaluate_every=1"]
+RUN = ["--seeds", "3", "--budget", "3", "--set", "train.passes=1", "--set", "evaluate_every=1"]
 RUN += ["--seed", "1"]
-pytestmark = pytest.mark.usefixtures("coarse_arena", "coarse_priors")
+pytestmark = pytest.mark.usefixtures("coarse_arena", "coarse_priors", "plain_figures")
 
 
 @pytest.fixture(scope="module")

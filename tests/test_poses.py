@@ -96,7 +96,7 @@ def test_the_command_refines_the_poses_of_a_run(tmp_path, coarse_priors, capsys)
 @pytest.mark.parametrize("density", ["fixed", "split"])
 def test_a_refinement_with_free_means_is_bitwise_the_same_again(tmp_path, coarse_priors, density):
     write_noisy(tmp_path / "data", synthetic.orbit_cameras(5, 32, 24))
-    fit = ["fit", tmp_path / "data", "--gaussians", 100, "--passes", 2, "--means", "free"]
+    fit = ["fit", tmp_path / "data", "--gaussians", 100, "--passes", 1, "--means", "free"]
     fit += ["--refine-poses", "--set", f"train.density={density}"]
     files = "gaussians.ply", "poses.json", "dataset/transforms.json"
     found = []

@@ -249,7 +249,7 @@ def test_the_images_of_the_last_fit_are_those_of_the_run(run):
 
 def test_a_run_that_learns_means_is_refitted_too(run, tmp_path):
     small = {"gaussians": 150, "budget": 1, "policy": "uniform", "exposure": True}
-    train = {"means": "free", "passes": 10}
+    train = {"means": "free", "passes": 4}
     run_nbv(run.parent / "data", tmp_path / "run", train=train, **small)
     found = refit_run(tmp_path / "run", sh="0")
     assert found.before == 150 * 14
