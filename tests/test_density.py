@@ -188,7 +188,7 @@ def test_an_interrupted_fit_continues_bit_for_bit(scene, monkeypatch, tmp_path, 
     start = replace(truth, sh=np.zeros_like(truth.sh))
     cameras, targets = [camera, camera, camera], [target, 0.9 * target, 0.8 * target]
     rates = RATES | {"mean": 0.01}
-    train = TrainSettings(means="free", density="split", optimiser=optimiser, rates=rates, passes=8)
+    train = TrainSettings(means="free", density="split", optimiser=optimiser, rates=rates, passes=6)
     saves, used = [unfinished.Unfinished(tmp_path / "fit.npz", "these")], []
     given = start, cameras, targets, train
 

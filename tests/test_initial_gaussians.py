@@ -21,7 +21,7 @@ from mgs.run.inputs import prior_digest
 
 @pytest.fixture(scope="module")
 def prior(orbit: Dataset) -> Prior:
-    return build_prior(orbit, PriorSettings(gaussians=2000, backing=0))
+    return build_prior(orbit, PriorSettings(gaussians=2000, backing=0, poisson_depth=5))
 
 
 def test_shapes_scales_and_rotations(prior, orbit):

@@ -132,7 +132,7 @@ def test_candidates_of_one_pose_are_one_and_those_that_see_nothing_none(run, sit
 
 def test_a_model_of_split_gaussians_is_rated_by_all_of_them(tmp_path, site):
     data = synthetic.write_rock(tmp_path / "d", synthetic.orbit_cameras(14, 48, 36)[:8], 300)
-    train = {"means": "free", "density": "split"}
+    train = {"means": "free", "density": "split", "passes": 6}
     split = mgs.resume_nbv(start_fit(data.root, tmp_path / "run", train=train))
     assert len(split.gaussians) > 1.5 * len(split.prior.points)
     found = suggest(split, place_poses("ring", 12, 2.6, (25, 35), site))

@@ -191,7 +191,7 @@ def test_the_survey_is_a_dataset_and_gives_a_prior(dataset, survey, tmp_path):
     assert np.array_equal(result.frames[5].rgb(), dataset.frames[5].rgb())
     for frame in result.frames:  # the masks of the dataset have all rocks, rock.glb the first
         write_png(frame.mask_path, synthetic.cast(frame.camera, ROCKS[:1])[1])
-    prior = build_prior(result, PriorSettings(gaussians=1000, backing=0))
+    prior = build_prior(result, PriorSettings(gaussians=1000, backing=0, poisson_depth=6))
     assert prior.numbers["truth"]["accuracy"] < 0.04
 
 
