@@ -189,6 +189,7 @@ def _map(matcher: Matcher, count: int, out: Path, first: Path | None = None) -> 
     start = image_count(first) if first else 0
     placed = iter(range(start + 2, count * options.max_num_models))
     report("placing photographs", start, count)
+    matcher.check_disk()
     models = pycolmap.incremental_mapping(
         matcher.database,
         matcher.folder,

@@ -26,6 +26,7 @@ WIDEST = 1000  # longer side, pixels, to which larger pictures are reduced for f
 FEATURES = 4096  # most features of a picture
 FEATURE_BYTES = 152  # of a feature in the database
 PICTURES_AT_ONCE, PAIRS_AT_ONCE = 8, 64  # of one call of pycolmap, then progress is reported
+ROOM = 1 << 25  # bytes on disk that one call may take, twice as many as it keeps
 ALIKE = 16  # pictures that each is matched with where poses are known: the most alike by pose
 CLOUD = "sparse.ply"  # file of a dataset with its triangulated points
 POSES = "poses.json"  # in the dataset of a run that refined poses: how far each moved
@@ -100,12 +101,13 @@ class Matcher:
         import pycolmap
 
         every = sorted({(min(pair), max(pair)) for pair in pairs})
-        self._check_disk()
+        self.check_disk(len(self.names))
         self._extract(sorted({place for pair in every for place in pair}))
         options, listed = pycolmap.TwoViewGeometryOptions(), self.folder / "pairs.txt"
         options.ransac.random_seed = 0
         for start in range(0, len(every), PAIRS_AT_ONCE):
             report("matching pictures", start, len(every))
+            self.check_disk()
             lines = [
                 f"{self.names[one]} {self.names[other]}\n"
                 for one, other in every[start : start + PAIRS_AT_ONCE]
@@ -117,14 +119,17 @@ class Matcher:
                 verification_options=options,
             )
 
-    def _check_disk(self) -> None:
-        """Raise InputError where the disk may be too small, since pycolmap aborts the process."""
-        free, need = shutil.disk_usage(self.folder).free, len(self.names) * FEATURES * FEATURE_BYTES
-        free += self.database.stat().st_size if self.database.is_file() else 0
+    def check_disk(self, pictures: int = 0) -> None:
+        """Raise InputError where the disk may be too small for the features of so many pictures, or
+        for one more call of pycolmap, which aborts the process where a disk is full."""
+        free = shutil.disk_usage(self.folder).free
+        if pictures and self.database.is_file():
+            free += self.database.stat().st_size  # it has features of a call before
+        need = ROOM + pictures * FEATURES * FEATURE_BYTES
         if need > free:
             room = f"may take {need / 2**20:,.0f} MiB on disk, {free / 2**20:,.0f} are free"
-            what = f"features of {len(self.names)} pictures"
-            raise InputError(f"{self.folder}: {what} {room}; choose a place with room")
+            cure = "make room and repeat the command, which continues, or choose another place"
+            raise InputError(f"{self.folder}: features and matches {room}; {cure}")
 
     def _extract(self, places: Sequence[int]) -> None:
         import pycolmap
@@ -150,6 +155,7 @@ class Matcher:
             reader = pycolmap.ImageReaderOptions(existing_camera_id=numbers[key])
             for start in range(0, len(members), PICTURES_AT_ONCE):
                 report("features of pictures", done, total)
+                self.check_disk()
                 some = members[start : start + PICTURES_AT_ONCE]
                 files = self.database, self.folder
                 names = [self.names[place] for place in some]
@@ -229,6 +235,7 @@ class Matcher:
         import pycolmap
 
         report("triangulating", 0, 0)
+        self.check_disk()
         model = pycolmap.Reconstruction()
         with closing(pycolmap.Database.open(self.database)) as database:
             for lens in database.read_all_cameras():
