@@ -3,6 +3,7 @@
 import json
 import shutil
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -393,6 +394,18 @@ def test_reduced_pictures_of_llff_scale_each_axis_of_its_cameras(dataset, tmp_pa
         across, down = np.divide(size, (one.camera.width, one.camera.height))
         assert np.allclose(other.camera.K, one.camera.K * [[across], [down], [1]])
         assert np.allclose(one.camera.world_to_camera, other.camera.world_to_camera, atol=1e-6)
+
+
+def test_a_bag_moves_without_turning_or_climbing_far_from_the_origin(dataset, tmp_path):
+    """In UTM, where its steps are small against its coordinates."""
+    turn, frames = dataset.frames[0].camera.world_to_camera[:3, :3], []
+    for k, frame in enumerate(dataset.frames):
+        pose = np.block([[turn, -turn @ [[5e5 + k / 4], [5e6], [3]]], [np.eye(4)[3]]])
+        frames.append(replace(frame, camera=replace(frame.camera, world_to_camera=pose)))
+    bag = write_bag(tmp_path / "bag", replace(dataset, frames=tuple(frames)))
+    shots = read_source(bag, unpack=tmp_path / "unpacked").shots
+    steps = np.diff([shot.camera.position for shot in shots], axis=0)
+    assert np.allclose(steps, [0.25, 0, 0], atol=1e-6)
 
 
 def opensfm_pixels(root: Path, points: np.ndarray) -> np.ndarray:

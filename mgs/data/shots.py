@@ -275,11 +275,6 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts]
 
 
-def poses_agree(a: Sequence[np.ndarray], tolerance: float = 1e-6) -> bool:
-    """Whether all poses are equal."""
-    return all(np.allclose(a[0], pose, atol=tolerance) for pose in a)
-
-
 LONG = 3.0  # time between two samples over the median, beyond which poses are not interpolated
 STILL = 0.01  # change of a pose, metres and radians, below which it is interpolated over any time
 NEARLY_RIGID = 1e-2  # largest error of an entry of a rotation that was rounded, which is mended
