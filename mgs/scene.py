@@ -13,7 +13,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.dataset import Dataset, target_of
-from mgs.data.frames import Frame, as_asked
+from mgs.data.frames import Frame, as_asked, has_masks
 from mgs.errors import InputError
 from mgs.fit.fitting import Fit, fit_gaussians
 from mgs.fit.objective import Target, as_target
@@ -142,7 +142,7 @@ class Scene:
             call = "mgs.Scene(mgs.load_dataset(FOLDER), mgs.load_prior(FOLDER))"
             raise TypeError(f"Scene: needs a dataset and a prior that are loaded: {call}")
         if self.settings is None:
-            weight = ALPHA_WEIGHT if self.dataset.outlined else 0.0
+            weight = ALPHA_WEIGHT if has_masks(self.dataset.frames) else 0.0
             settings = ModelSettings(train=TrainSettings(alpha_weight=weight))
             object.__setattr__(self, "settings", settings)
         own, up = self.prior.world.up, self.dataset.world.up

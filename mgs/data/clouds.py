@@ -1,7 +1,7 @@
 """Triangulated point clouds and their PLY files."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,12 +29,11 @@ class SparseCloud:
     def upright(self, world: World) -> "SparseCloud":
         """The same cloud, of the files of a dataset, in its upright world (`World.enter`)."""
         views = None if self.views is None else world.enter(self.views)
-        points = world.enter(towards(self.points, world.origin))
-        return SparseCloud(points, views, self.track, self.error)
+        return replace(self, points=world.enter(towards(self.points, world.origin)), views=views)
 
     def scaled(self, factor: float) -> "SparseCloud":
         """The same cloud with coordinates multiplied by `factor`."""
-        return SparseCloud(self.points * factor, self.views, self.track, self.error)
+        return replace(self, points=self.points * factor)
 
 
 def towards(points: np.ndarray, origin: Sequence[float]) -> np.ndarray:

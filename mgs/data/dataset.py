@@ -63,11 +63,6 @@ class Dataset:
         return any(frame.on_demand for frame in self.frames)
 
     @property
-    def outlined(self) -> bool:
-        """Whether all frames have a mask or a rock image."""
-        return all(frame.mask_path or frame.rock_path for frame in self.frames)
-
-    @property
     def cameras(self) -> list[Camera]:
         """Cameras of all frames as asked for: a live capture does not change them."""
         return [as_asked(frame).camera for frame in self.frames]

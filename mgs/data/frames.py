@@ -25,12 +25,6 @@ def write_rock_image(path: str | Path, rgba: np.ndarray) -> None:
     write_png(path, np.round(rgba * 255).astype(np.uint8))
 
 
-def read_rock_image(path: str | Path) -> np.ndarray:
-    """Read an sRGB PNG with straight alpha, 8 or 16 bits, as linear RGB premultiplied by alpha, and
-    alpha: float32 [H,W,4]. Raises InputError as `mgs.images.read_rgba`."""
-    return premultiplied(read_rgba(path))
-
-
 def premultiplied(pixels: np.ndarray) -> np.ndarray:
     """sRGB with straight alpha [H,W,4], uint8 or uint16 -> linear RGB premultiplied by alpha, and
     alpha, float32."""
@@ -101,7 +95,7 @@ class Frame:
         With a mask only, alpha is 0 or 1, which is wrong along the outline, so the `boundary` of
         the mask has weight 0. With neither, alpha and weight are 1. Raises InputError as `rgb`."""
         if self.rock_path is not None:
-            rgba = read_rock_image(self._existing(self.rock_path))
+            rgba = premultiplied(read_rgba(self._existing(self.rock_path)))
             return rgba, np.ones(rgba.shape[:2], np.float32)
         one = np.ones((self.camera.height, self.camera.width), np.float32)
         rgba = np.dstack([self.rgb(), one])

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from mgs.colour import srgb_from_linear
-from mgs.data.frames import Frame
+from mgs.data.frames import Frame, has_masks
 from mgs.evaluation import render_view
 from mgs.files import write_text
 from mgs.notebook import data_uri
@@ -173,7 +173,7 @@ def write_page(path: str | Path, folders: Sequence[str | PathLike[str]]) -> int:
         dataset=dataset.root.resolve().name,
         labels=list(runs),
         command="nbv" if any(run.settings.budget for run in runs.values()) else "fit",
-        outlined=dataset.outlined,
+        outlined=has_masks(dataset.frames),
         notes={label: notes(run) for label, run in runs.items()},
         summary=summary_rows(runs),
         settings=setting_rows(runs),

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mgs.data.dataset import Dataset, load_dataset
-from mgs.data.frames import Frame
+from mgs.data.frames import Frame, has_masks
 from mgs.data.structure import POSES
 from mgs.data.world import PLUS_Z, Vector, unit_up
 from mgs.errors import InputError, Notice
@@ -112,7 +112,7 @@ class Run:
     @property
     def of_scene(self) -> bool:
         """Whether its model is of a whole scene, not of one object: no surface and no masks."""
-        return not self.dataset.outlined and self.prior.kind == "random"
+        return not has_masks(self.dataset.frames) and self.prior.kind == "random"
 
     @property
     def shown(self) -> np.ndarray:

@@ -296,7 +296,7 @@ def _settings(dataset: Dataset, policy: Any, values: dict[str, Any]) -> NbvSetti
     train = values.get("train", {})
     train = train.model_dump(exclude_unset=True) if isinstance(train, TrainSettings) else train
     if isinstance(train, Mapping):  # otherwise `validated` refuses it
-        weight = ALPHA_WEIGHT if dataset.outlined else 0.0
+        weight = ALPHA_WEIGHT if has_masks(dataset.frames) else 0.0
         values["train"] = {"alpha_weight": weight, **train}
     settings = validated(NbvSettings, values)
     resolved: dict[str, Any] = {}
