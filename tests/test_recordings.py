@@ -388,7 +388,11 @@ def test_reduced_pictures_of_llff_scale_each_axis_of_its_cameras(dataset, tmp_pa
     for k, frame in enumerate(dataset.frames):
         with Image.open(frame.image_path) as image:
             image.resize(size).save(root / f"images_4/image{k:03d}.png")
-    command("import", root, "--images", root / "images_4", "--up", "0,0,1", "--out", out)
+    (root / "sparse").mkdir()
+    for name in ("cameras.txt", "images.txt", "points3D.txt"):
+        (root / "sparse" / name).touch()  # a model is taken before LLFF, unless this is the source
+    given = root / "poses_bounds.npy", "--images", root / "images_4", "--up", "0,0,1"
+    command("import", *given, "--out", out)
     for one, other in zip(dataset.frames, load_dataset(out).frames, strict=True):
         assert (other.camera.width, other.camera.height) == size
         across, down = np.divide(size, (one.camera.width, one.camera.height))

@@ -62,7 +62,7 @@ def check_alone(source: Path) -> None:
 
 
 def read_photographs(
-    source: Path, paths: Sequence[Path], folder: Path, exclude: Sequence[str] = ()
+    source: Path, paths: Sequence[Path], folder: Path, exclude: Sequence[str]
 ) -> Source:
     """Poses, lenses and points of photographs, of the largest part that hangs together. folder: for
     matches, which a later call continues. exclude: names of photographs to leave out; they do not

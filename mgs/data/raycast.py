@@ -19,9 +19,7 @@ from mgs.memory import padded
 SMALL = 40_000  # pixels of a picture in which a mesh is searched
 
 
-def mesh_in_sight(
-    mesh: Mesh, cameras: Sequence[Camera], world: World, where: object = "mesh"
-) -> Mesh:
+def mesh_in_sight(mesh: Mesh, cameras: Sequence[Camera], world: World, where: object) -> Mesh:
     """Move a mesh to a dataset of this world (`towards`, `World.enter`), and check that it is in
     some picture. where: begins a message. Raises InputError if none of a few cameras sees the mesh,
     or all are inside, as happens with another unit or other axes."""

@@ -128,7 +128,6 @@ def _recognised(
     if source.suffix.lower() in UNREAD and source.is_file():
         raise InputError(f"{source}: is HEIC or raw; convert all photographs to JPEG")
     path = source if source.is_file() else source / "transforms.json"
-    split_path = source / TRAINING
     folder = unpack or Path(f"{os.path.abspath(source)}.unpacked")
     spacing = Spacing.parse(keyframes)
     recording = next((kind for kind, (fits, _) in RECORDINGS.items() if fits(source)), None)
@@ -146,8 +145,8 @@ def _recognised(
     if source.is_file() and source.suffix.lower() != ".json":
         cure = "give a transforms.json, a video or a folder; unpack an archive"
         raise InputError(f"{source}: is no file that can be imported; {cure}")
-    if path.is_file() or split_path.is_file():
-        return _read_transforms(path if path.is_file() else split_path, images)
+    if poses := next((one for one in (path, source / TRAINING) if one.is_file()), None):
+        return _read_transforms(poses, images)
     if models := models_in(source):
         return read_colmap(source, models, images if images is not None else source / "images")
     check_no_part(source)
