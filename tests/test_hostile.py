@@ -154,6 +154,10 @@ def test_a_finished_import_says_so(capsys, dataset, tmp_path):
     os.utime(picture, ns=(time, time))
     line = refused(capsys, arguments, tmp_path / "out")
     assert "its pictures, masks, mesh or model have changed since; --force" in line
+    record = files.read_json(tmp_path / "out/import.json")
+    older = {key: value for key, value in record.items() if key != "sha256_of_files"}
+    files.write_json(tmp_path / "out/import.json", older | {"files": "digest of times"})
+    assert "is finished already" in output(capsys, *arguments)
     picture.write_bytes(whole)
     synthetic.edit(dataset, lambda data: data["frames"][2].update(timestamp=99))
     assert "a finished dataset of other" in refused(capsys, arguments, tmp_path / "out")

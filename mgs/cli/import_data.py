@@ -17,6 +17,7 @@ from mgs.cli.options import parse_up
 from mgs.cli.terminal import Terminal, progress_bar
 from mgs.errors import InputError
 from mgs.files import Ours, read_json, scratch_folder, write_json
+from mgs.progress import report
 
 if TYPE_CHECKING:
     from mgs.data.agreement import Agreement
@@ -109,7 +110,8 @@ def import_data(
         return [*photographs_in(images or source), source / "transforms.json"]
 
     if record.get("kind") == PHOTOGRAPHS and "files" in record:  # to place them again takes long
-        _check_unchanged(out, record, _stamp([*beside, *photographs()]))
+        with progress_bar("reading", console):
+            _check_unchanged(out, record, _stamp([*beside, *photographs()]))
         console.print(f"{out} is finished already; --force makes it again", soft_wrap=True)
         return
     unpacked = Path(f"{os.path.abspath(out)}.unpacked")
@@ -143,7 +145,7 @@ def import_data(
             about = shots, larger, scratch, mesh is None, console if refine else None
             result, fit, cloud = _checked(result, *about)
         if not record:
-            write_json(out / RECORD, read_json(out / RECORD) | {"files": files})
+            write_json(out / RECORD, read_json(out / RECORD) | files)
     if mesh is not None and mesh.suffix.lower() in GLTF:
         console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
     for note in [*shots.notes, *_advice(shots, result)]:
@@ -206,19 +208,21 @@ def _resolved(options: dict[str, Any]) -> dict[str, Any]:
     return resolved
 
 
-def _stamp(files: Sequence[Path]) -> str:
-    """SHA-256 of the paths and contents of the files that exist."""
+def _stamp(files: Sequence[Path]) -> dict[str, Any]:
+    """Number of the files that exist, and SHA-256 of their paths and contents, for the record."""
     digest = hashlib.sha256()
-    for path in sorted({path.resolve() for path in files if path.is_file()}):
+    paths = sorted({path.resolve() for path in files if path.is_file()})
+    for k, path in enumerate(paths):
+        report("reading files", k, len(paths))
         digest.update(os.fsencode(path))
         with suppress(OSError), path.open("rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
-    return digest.hexdigest()
+    return {"files": len(paths), "sha256_of_files": digest.hexdigest()}
 
 
 def _finished(out: Path) -> dict[str, Any]:
     """Record of the finished import in a folder. Empty where there is none. Records of earlier
-    versions have neither options nor files."""
+    versions lack options, files or their digest."""
     from mgs.data.importers import RECORD
 
     if not all((out / name).is_file() for name in (RECORD, "transforms.json")):
@@ -239,9 +243,11 @@ def _check_same(out: Path, record: dict[str, Any], options: dict[str, Any]) -> N
             raise InputError(f"{out}: is finished with another {what}; --force makes it again")
 
 
-def _check_unchanged(out: Path, record: dict[str, Any], files: str) -> None:
-    """Raise InputError where a finished import has other files. files: `_stamp`."""
-    if record.get("files", files) != files:
+def _check_unchanged(out: Path, record: dict[str, Any], files: dict[str, Any]) -> None:
+    """Raise InputError where a finished import has other files, as far as its record says. files:
+    `_stamp`."""
+    key = "sha256_of_files"
+    if record.get(key, files[key]) != files[key]:
         why = "its pictures, masks, mesh or model have changed since"
         raise InputError(f"{out}: is finished, and {why}; --force makes it again")
 
