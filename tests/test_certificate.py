@@ -53,6 +53,21 @@ def case(kind, seed=0, order=None):
     return made, lambda some: criteria.d_optimal(F[list(some)].sum(0), H, lam)
 
 
+def test_weights_of_many_candidates_are_moved_into_a_box_in_little_memory():
+    rng = np.random.default_rng(0)
+    x, (lo, hi) = rng.uniform(0, 1, 4000), np.sort(rng.integers(0, 2, (2, 4000)), axis=0)
+    tracemalloc.start()
+    for k in (lo.sum(), lo.sum() + 20, hi.sum()):
+        moved = certificate._moved(x, lo, hi, k)
+        assert moved.sum() == pytest.approx(k)
+        assert ((lo <= moved) & (moved <= hi)).all()
+        shifts = (moved - x)[(lo < moved) & (moved < hi)]
+        assert shifts.size == 0 or np.ptp(shifts) < 1e-12
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4e6
+
+
 @pytest.mark.parametrize("kind", EVERY)
 @pytest.mark.parametrize("k", [1, 2, 4, POSES])
 def test_every_set_is_below_the_bound_and_branch_and_bound_finds_the_best(kind, k):

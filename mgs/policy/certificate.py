@@ -147,8 +147,10 @@ def _last_view(criterion: Criterion, lo: Floats, hi: Floats, k: int) -> list[int
 
 def _moved(x: Floats, lo: Floats, hi: Floats, k: int) -> Floats:
     """Weights in the box with the sum k, near to x."""
-    shifts = np.sort(np.concatenate([lo - x, hi - x]))  # between them, the sum is linear
-    sums = np.clip(x + shifts[:, None], lo, hi).sum(axis=1)
+    ends = np.concatenate([lo - x, hi - x])
+    order = ends.argsort(kind="stable")
+    shifts, free = ends[order], np.cumsum(np.where(order < len(x), 1, -1))
+    sums = lo.sum() + np.append(0, np.cumsum(free[:-1] * np.diff(shifts)))  # linear between
     return np.clip(x + np.interp(k, sums, shifts), lo, hi)
 
 
