@@ -1,5 +1,6 @@
 """The prior on an analytic scene: every station against what is known exactly."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from mgs.data.frames import visible
 from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.raycast import mesh_depth
 from mgs.prior.build import build_prior, load_prior, outline_error, prior_and_cloud, save_prior
+from mgs.prior.figure import draw_refused
 from mgs.prior.segmentation import Plane, dbscan, ground_plane, rock_cluster
 from mgs.prior.surface import error_to_truth, poisson_mesh, sample_surface
 from mgs.survey.fusion import Cloud, focus
@@ -287,6 +289,17 @@ def test_prior_round_trip_and_determinism(built, orbit, tmp_path):
     assert loaded.spacing == prior.spacing
     assert loaded.depth_tolerance == prior.depth_tolerance
     assert trimesh.load(tmp_path / "prior/mesh.ply").is_watertight
+
+
+@pytest.mark.filterwarnings("error")
+def test_refused_clouds_of_one_point_and_of_many_are_drawn(tmp_path):
+    points = np.random.default_rng(0).normal(size=(2_000_000, 3))
+    draw_refused(tmp_path / "one.png", points[:300], np.arange(300) == 3)
+    tracemalloc.start()
+    draw_refused(tmp_path / "many.png", points, points[:, 2] > 0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 5e8
 
 
 @pytest.mark.parametrize("seed", range(8))

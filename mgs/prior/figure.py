@@ -15,6 +15,7 @@ from mgs.prior.segmentation import SegmentedCloud
 UP = np.array([0.0, 0.0, 1.0])
 BLUE, TAN = [0.15, 0.35, 0.75], [0.85, 0.76, 0.6]
 FRAMED = NO_GRID | {"axes.spines.top": True, "axes.spines.right": True}
+MAX_DOTS = 300_000  # most points drawn in a panel; with more, it looks the same
 PIXELS = 560  # width and height of the image of a panel of dots, somewhat more than the panel has
 LIGHT = np.array([-0.5, 0.4, 0.77])  # direction to the light in picture coordinates, about unit
 
@@ -42,6 +43,9 @@ class _View:
         [N,3], or values [N] for a colour map."""
         if colour.ndim == 1:
             colour = painted(colour, "viridis", colour.min(), colour.max()) / 255
+        if len(points) > MAX_DOTS:
+            subset = np.random.default_rng(0).choice(len(points), MAX_DOTS, replace=False)
+            points, colour = points[subset], colour[subset]
         places, across = self.picture(points), np.arange(size) - size / 2
         order = np.argsort(places[:, 2])
         x, y = PIXELS / 2 * (1 + places[order, :2] / (zoom * self.reach)).T[..., None, None]
@@ -89,7 +93,7 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
 def draw_refused(path: str | Path, points: np.ndarray, rock: np.ndarray) -> None:
     """Write the figure of a cloud [P,3] without surface, from the side and from above, as a PNG.
     rock: [P] bool, taken for the object, blue. Raises InputError if it cannot be written."""
-    object_points = points[rock] if rock.any() else points
+    object_points = points[rock] if rock.sum() > 1 else points
     middle = np.median(object_points, axis=0)
     reach = 1.5 * float(np.quantile(np.linalg.norm(object_points - middle, axis=1), 0.95))
     tint = np.where(rock[:, None], BLUE, TAN)
