@@ -14,7 +14,6 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.gaussians import SH_MAX, Gaussians
-from mgs.memory import padded
 from mgs.rotation import QUAT_MIN
 from mgs.splat.constants import COMPENSATION_MIN, EPS2D, FRUSTUM_MARGIN, LOG_SCALE_RANGE, NEAR
 from mgs.splat.recording import frozen
@@ -83,8 +82,8 @@ def camera_array(camera: Camera) -> Any:
 def _entries(tensor: Any) -> np.ndarray:
     """Entries of a square TensorXf, Float64 [1] each, with their gradients, as an array of objects
     of its shape."""
-    if not dr.is_tensor_v(tensor):
-        flat = mi.Float64(padded(np.ravel(tensor), np.float64))
+    if not dr.is_tensor_v(tensor):  # a list, as in `camera_array`
+        flat = mi.Float64(np.ravel(tensor).tolist())
     else:
         flat = mi.Float64(tensor.array)
     entries = [dr.gather(mi.Float64, flat, mi.UInt32(i)) for i in range(len(flat))]
@@ -112,16 +111,17 @@ def moved(camera: Camera, motion: Any, zoom: Any = 0.0) -> Camera:
     # The inverse of the camera's motion moves the points: R^T (x - shift).
     turn = mi.Matrix3d(1) - sine * cross + cosine * (cross @ cross)
     # Points: x -> R^T (x - shift), so t -> R^T (t - shift) and R_old -> R^T R_old.
-    old = camera.world_to_camera
-    t = turn @ (mi.Vector3d(old[:3, 3].tolist()) - shift)
-    R = turn @ mi.Matrix3d(old[:3, :3].tolist())
+    # As arrays: Python numbers would compile a kernel for every camera.
+    old, K = map(_entries, (camera.world_to_camera, camera.K))
+    t = turn @ (mi.Vector3d(*old[:3, 3]) - shift)
+    R = turn @ mi.Matrix3d(*old[:3, :3].ravel())
     rows = [x for i in range(3) for x in (R[i, 0], R[i, 1], R[i, 2], t[i])]
     pose = dr.concat([mi.Float64(x) for x in (*rows, 0.0, 0.0, 0.0, 1.0)])
     # Focal lengths times e^zoom; entries 0 and 4 of K are fx and fy.
     factor = dr.exp(mi.Float64(zoom))
-    K = [factor * x if i in (0, 4) else mi.Float64(x) for i, x in enumerate(camera.K.ravel())]
+    numbers = [factor * x if i in (0, 4) else x for i, x in enumerate(K.ravel())]
     size = camera.width, camera.height
-    return Camera(mi.TensorXf64(dr.concat(K), (3, 3)), *size, mi.TensorXf64(pose, (4, 4)))
+    return Camera(mi.TensorXf64(dr.concat(numbers), (3, 3)), *size, mi.TensorXf64(pose, (4, 4)))
 
 
 def _numbers(array: Any, first: int, end: int) -> list[Any]:

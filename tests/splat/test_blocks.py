@@ -17,6 +17,7 @@ from mgs.splat import (
     blocks,
     fisher,
     kernels,
+    moved,
     reference,
     render,
     rendering,
@@ -72,15 +73,18 @@ def test_sums_of_splats_of_many_pairs_come_first():
     assert len(set(pairs)) > 10
 
 
-def test_a_new_camera_compiles_nothing():
-    """Though the number of pairs differs from camera to camera."""
-    g = as_drjit(make_gaussians(300, 3, log_scales=(-5.0, -3.0)))
+@pytest.mark.parametrize("by_pose", [False, True])
+def test_a_new_camera_compiles_nothing(by_pose):
+    """Though the number of pairs differs from camera to camera. by_pose: to be differentiated by
+    the pose, too."""
+    g, still = as_drjit(make_gaussians(300, 3, log_scales=(-5.0, -3.0))), mi.Float64([0.0] * 6)
+    dr.enable_grad(still)
     seen = []
     for angle in np.linspace(0, 0.3, 4):
         camera = make_camera(eye=(2 * np.cos(angle), 2 * np.sin(angle), 0.9))
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            dr.eval(render(g, camera).rgb)
+            dr.eval(render(g, moved(camera, still) if by_pose else camera).rgb)
             history = dr.kernel_history()
         seen.append({entry["hash"] for entry in history if entry["type"] == dr.KernelType.JIT})
     assert seen[0]
