@@ -129,7 +129,7 @@ def varied(rock: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 Runs = dict[str, tuple[Checkpoint, Path]]
 
-RUN = {"policy": "uniform", "seeds": 4, "budget": 3, "train": {"passes": 20}}
+RUN = {"policy": "uniform", "seeds": 4, "budget": 3, "train": {"passes": 10}}
 
 
 @pytest.fixture(scope="module")
