@@ -413,7 +413,7 @@ def test_a_process_that_is_asked_to_end_prints_no_stack(frames, tmp_path):
 
 
 def test_photographs_alone_are_one_command_to_the_next_picture(
-    frames, tmp_path, capsys, monkeypatch, coarse_priors
+    frames, tmp_path, capsys, monkeypatch, coarse_priors, plain_figures
 ):
     """Photographs of one side ask for another; one more, first by name, joins the same model."""
     root, site, found = tmp_path / "photos", tmp_path / "photos.site", []
