@@ -14,6 +14,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.gaussians import SH_MAX, Gaussians
+from mgs.memory import padded
 from mgs.rotation import QUAT_MIN
 from mgs.splat.constants import COMPENSATION_MIN, EPS2D, FRUSTUM_MARGIN, LOG_SCALE_RANGE, NEAR
 from mgs.splat.recording import frozen
@@ -82,8 +83,8 @@ def camera_array(camera: Camera) -> Any:
 def _entries(tensor: Any) -> np.ndarray:
     """Entries of a square TensorXf, Float64 [1] each, with their gradients, as an array of objects
     of its shape."""
-    if not dr.is_tensor_v(tensor):  # a list, as in `camera_array`
-        flat = mi.Float64(np.ravel(tensor).tolist())
+    if not dr.is_tensor_v(tensor):
+        flat = mi.Float64(padded(np.ravel(tensor), np.float64))
     else:
         flat = mi.Float64(tensor.array)
     entries = [dr.gather(mi.Float64, flat, mi.UInt32(i)) for i in range(len(flat))]
