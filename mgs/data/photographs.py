@@ -183,6 +183,8 @@ def _map(matcher: Matcher, count: int, out: Path, first: Path | None = None) -> 
     options = pycolmap.IncrementalPipelineOptions(
         min_model_size=FEWEST, extract_colors=False, random_seed=0
     )
+    if count <= EXHAUSTIVE:  # with threads, which of several results comes out is chance
+        options.num_threads = 1
     options.mapper.random_seed = options.triangulation.random_seed = 0
     options.snapshot_path, options.snapshot_frames_freq = matcher.folder / STATES, STEP
     options.snapshot_path.mkdir(exist_ok=True)
