@@ -295,6 +295,18 @@ def test_only_an_image_that_stays_as_it_is_is_copied(dataset, tmp_path, kind):
     assert np.array_equal(copy.rgb(), replace(copy, image_path=path).rgb()) == (kind != "distorted")
 
 
+def test_what_others_add_to_a_model_does_not_change_it(dataset, tmp_path, capsys):
+    """3D Gaussian Splatting writes points3D.ply."""
+    synthetic.write_colmap(dataset, tmp_path / "colmap", binary=True)
+    given = ["import", tmp_path / "colmap", "--out", tmp_path / "copy"]
+    command(*given)
+    (tmp_path / "colmap/sparse/0/points3D.ply").touch()
+    assert "is finished already" in output(capsys, *given)
+    points = tmp_path / "colmap/sparse/0/points3D.bin"
+    points.write_bytes(points.read_bytes() + b"?")
+    assert "model have changed since" in refused(capsys, given, tmp_path / "copy")
+
+
 def test_what_is_missing_is_skipped_and_said(dataset, tmp_path, capsys):
     for frame in dataset.frames[:3]:
         frame.image_path.unlink()

@@ -104,7 +104,8 @@ def import_data(
     record = {} if force else _finished(out)
     _check_same(out, record, options)
     beside = [*given, *(photographs_in(masks) if masks else ())]
-    beside += [path for folder in models_in(source) for path in folder.iterdir()]
+    model = [path for folder in models_in(source) for path in folder.iterdir()]
+    beside += [path for path in model if path.suffix in (".bin", ".txt")]  # others add to it
 
     def photographs() -> list[Path]:
         return [*photographs_in(images or source), source / "transforms.json"]
