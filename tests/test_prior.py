@@ -16,6 +16,7 @@ from mgs.data.meshes import Mesh, distances_to_mesh
 from mgs.data.raycast import mesh_depth
 from mgs.prior.build import build_prior, load_prior, outline_error, prior_and_cloud, save_prior
 from mgs.prior.figure import draw_refused
+from mgs.prior.points import GROWN, GROWN_NEIGHBOURS, _grown
 from mgs.prior.segmentation import Plane, dbscan, ground_plane, rock_cluster
 from mgs.prior.surface import error_to_truth, poisson_mesh, sample_surface
 from mgs.survey.fusion import Cloud, focus
@@ -315,6 +316,22 @@ def test_dbscan_gives_the_labels_of_scikit_learn(seed):
     assert usual.max() >= 0
     assert np.array_equal(dbscan(points, eps, least), usual)
     assert (dbscan(points, 1e-9, 2) == -1).all()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_cluster_grows_as_by_dbscan_in_little_memory(seed):
+    rng = np.random.default_rng(seed)
+    blobs = [rng.normal((x, 0, 0), 0.1, (1500, 3)) for x in (0, 0.7, 1.4, 2.1, 6.3)]
+    points, inside = np.concatenate([*blobs, rng.uniform(-1, 7, (60, 3))]), np.arange(7560) < 3000
+    tracemalloc.start()
+    grown = _grown(points, inside)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    labels = dbscan(points, GROWN * np.ptp(points[inside], axis=0).max(), GROWN_NEIGHBOURS)
+    assert len(set(labels[inside])) == 1
+    assert np.array_equal(grown, labels == labels[0])
+    assert grown.sum() > 1000 + inside.sum()
+    assert peak < 3e6
 
 
 def test_one_frame_with_depth_gives_what_it_saw(tmp_path):

@@ -18,14 +18,7 @@ from mgs.data.frames import Frame, has_masks, mask_share
 from mgs.data.meshes import Mesh
 from mgs.data.structure import CLOUD
 from mgs.errors import InputError
-from mgs.prior.segmentation import (
-    NoSurface,
-    Plane,
-    SegmentedCloud,
-    dbscan,
-    estimate_normals,
-    ground_plane,
-)
+from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud, estimate_normals, ground_plane
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import MOST_GAUSSIANS
 from mgs.progress import report
@@ -176,11 +169,19 @@ def _cluster_looked_at(
 
 
 def _grown(points: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Points [N,3] above the ground in a cluster [N] bool, or joined to it (GROWN)."""
+    """Points [N,3] above the ground in a cluster [N] bool, or joined to it as by DBSCAN (GROWN),
+    but without its list of all pairs of neighbours."""
     eps = GROWN * float(np.ptp(points[inside], axis=0).max())
-    labels = dbscan(points, eps, GROWN_NEIGHBOURS)
-    own = labels[inside & (labels >= 0)]
-    return inside | (labels == np.bincount(own).argmax()) if len(own) else inside
+    away = cKDTree(points).query(points, GROWN_NEIGHBOURS, distance_upper_bound=eps)[0]
+    core, grown = np.isfinite(away[:, -1]), inside.copy()
+    new = points[inside & core]
+    while len(new):
+        rest = np.flatnonzero(~grown)
+        near = cKDTree(new).query(points[rest], distance_upper_bound=eps)[0]
+        added = rest[np.isfinite(near)]
+        grown[added] = True
+        new = points[added[core[added]]]
+    return grown
 
 
 GAUSSIANS = 10_000  # fewest Gaussians where no number is given
