@@ -49,6 +49,10 @@ def from_interrupt(error: BaseException | None) -> bool:
     return error is not None
 
 
+class NoRoom(InputError):
+    """A disk is nearly full; what was done so far is kept."""
+
+
 class Notice(UserWarning):
     """Something that a user should know and that ends nothing. Commands print it as one line."""
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, TextIO
 
-from mgs.errors import InputError
+from mgs.errors import InputError, NoRoom
 from mgs.memory import check_room, decoding
 
 
@@ -429,7 +429,8 @@ def scratch_folder(path: str | Path, resumable: str = "") -> Iterator[Path]:
     """Context manager: a folder for temporary files, removed after the block with all its contents.
 
     resumable: pattern of files worth keeping. Empty: the folder is cleared before and after. Else
-    an interruption keeps it, and a refused input does where it holds such a file or was not empty.
+    an interruption or NoRoom keeps it, and a refused input does where it holds such a file or was
+    not empty.
     Raises InputError if a folder of this name is there that mgs did not make, or that another
     process uses."""
     path = Path(path)
@@ -443,7 +444,7 @@ def scratch_folder(path: str | Path, resumable: str = "") -> Iterator[Path]:
             try:
                 yield path
             except BaseException as error:
-                worth = not isinstance(error, InputError) or before
+                worth = before or isinstance(error, NoRoom) or not isinstance(error, InputError)
                 ended = not (resumable and (worth or any(path.glob(resumable))))
                 raise
             finally:

@@ -393,6 +393,15 @@ def test_a_disk_that_is_too_small_is_one_line(frames, tmp_path, monkeypatch):
     assert len(matcher.between(0, 1)[0]) > 50
 
 
+def test_an_import_that_fills_the_disk_keeps_its_features(frames, tmp_path, capsys, monkeypatch):
+    room = iter((1 << 40, 1 << 40, 1 << 20))
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=next(room)))
+    assert exit_code("import", frames[0].image_path.parent, "--out", tmp_path / "d") == 2
+    assert "repeat the command, which continues" in said(capsys)[1]
+    with closing(pycolmap.Database.open(tmp_path / "d.unpacked/matches/database.db")) as database:
+        assert database.num_keypoints() > 1000
+
+
 def test_given_cameras_that_change_are_not_those_of_matches_before(frames, tmp_path):
     for focal in (300.0, 400.0):
         K = np.array([[focal, 0, WIDTH / 2], [0, focal, WIDTH / 2], [0, 0, 1]])

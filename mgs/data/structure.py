@@ -17,7 +17,7 @@ from mgs.data.clouds import SparseCloud
 from mgs.data.dataset import FILES, TEST_FOLDER, Dataset, load_dataset, write_transforms
 from mgs.data.frames import Frame, moves
 from mgs.data.lens import Lens
-from mgs.errors import InputError
+from mgs.errors import NoRoom
 from mgs.files import below, copy_file, read_leftover, write_json
 from mgs.images import exif_orientation, unlimited_headers
 from mgs.progress import report
@@ -120,7 +120,7 @@ class Matcher:
             )
 
     def check_disk(self, pictures: int = 0) -> None:
-        """Raise InputError where the disk may be too small for the features of so many pictures, or
+        """Raise NoRoom where the disk may be too small for the features of so many pictures, or
         for one more call of pycolmap, which aborts the process where a disk is full."""
         free = shutil.disk_usage(self.folder).free
         if pictures and self.database.is_file():
@@ -129,7 +129,7 @@ class Matcher:
         if need > free:
             room = f"may take {need / 2**20:,.0f} MiB on disk, {free / 2**20:,.0f} are free"
             cure = "make room and repeat the command, which continues, or choose another place"
-            raise InputError(f"{self.folder}: features and matches {room}; {cure}")
+            raise NoRoom(f"{self.folder}: features and matches {room}; {cure}")
 
     def _extract(self, places: Sequence[int]) -> None:
         import pycolmap
