@@ -24,7 +24,7 @@ docs: setup
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "wrote site/: open site/index.html (searching it needs a server: $(BIN)/python -m http.server --directory site)"
 
-# Every number and picture of the pages anew: hours, and a repeated call continues. results-quick: ten studies of one rock.
+# Every number and picture of the pages anew: hours, and a repeated call continues. results-quick: eleven studies of one rock.
 results: setup
 	@$(BIN)/python -m studies.all out/results
 

@@ -27,6 +27,7 @@ STAGES = {
     "certificate": ("certificate", "--rocks", "8"),
     "setups": ("setups", "--rocks", "8"),
     "setups-8": ("setups", "--rocks", "8", "--images", "8"),
+    "pools": ("pools", "--rocks", "8"),
     "oracle": ("oracle", "--rocks", "1"),
     "paper": ("paper", "--rocks", "8"),
     "table1": ("table1",),

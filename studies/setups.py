@@ -416,7 +416,7 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
         low, high = interval(values) or (np.nan, np.nan)
         gain = {"gain": float(np.mean(values)), "gain_low": low, "gain_high": high}
         means.append({"setup": setup, "policy": policy} | gain)
-    title = "PSNR over random views (dB). Bold: the 95 % interval excludes 0"
+    title = "PSNR over random views (dB)\nBold: the 95 % interval excludes 0"
     draw_matrix(path, Panel("setup", "gain", "set-up", "", "policy", title=title), means)
 
 

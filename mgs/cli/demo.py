@@ -25,7 +25,7 @@ BUDGET = 8  # views beyond the four seeds, the same for every policy
 
 
 def demo(out: Annotated[Path, typer.Argument()] = Path("demo"), seed: Seed = 0) -> None:
-    """Run all steps in a minute: render a rock orbit, build the prior, choose views by three
+    """Run all steps in a minute or two: render a rock orbit, build the prior, choose views by three
     policies, compare, draw. Every command is shown as it is run.
 
     - out: Folder for everything; the same command again continues or shows it."""
