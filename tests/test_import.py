@@ -377,9 +377,10 @@ def test_masks_and_depth_of_another_size_give_the_nearest_pixels(dataset, tmp_pa
         near = np.ix_(rows, columns)
         assert np.array_equal(other.depth(), read_depth(one.depth_path)[near])
         assert np.array_equal(other.mask(), read_mask(one.mask_path)[near])
-    write_exr(dataset.frames[0].depth_path, {"Z": np.ones((own[1] + 2, own[0]), np.float32)})
-    line = refused(capsys, ["import", dataset.root, "--out", tmp_path / "out"])
-    assert "depth of their cameras' size" in line
+    for shape in ((own[1] + 2, own[0]), (1, 1), (2, 3)):
+        write_exr(dataset.frames[0].depth_path, {"Z": np.ones(shape, np.float32)})
+        line = refused(capsys, ["import", dataset.root, "--out", tmp_path / "out"])
+        assert "depth of their cameras' size" in line
 
 
 @pytest.mark.parametrize("own", [(34, 25), (33, 26), (80, 61)])

@@ -25,6 +25,7 @@ GENERAL = {  # camera models that are cases of a more general one, which takes t
 }
 
 FARTHEST = np.tan(np.radians(60))  # largest tangent in an undistorted image; fisheyes are cut
+COARSEST = 16  # most pixels of a picture across one of its mask or depth
 HALVED = (2, 4, 8)  # factors by which programs reduce pictures, each side rounded up or down
 REDUCED = 1.5  # least factor of smaller pictures: undistorted ones may be a little smaller, too
 BLOCK = 1 << 20  # pixels that are mapped at once
@@ -228,12 +229,14 @@ def read_fitting(
     resized: bool = False,
 ) -> np.ndarray:
     """Pixels of an image file, turned by its EXIF orientation if `turned`, or if only that fits its
-    camera's size. resized: one of another size and the same proportions gives the nearest pixels.
-    Raises InputError, before anything is decoded, if neither size fits."""
+    camera's size. resized: one of another size and the same proportions gives the nearest pixels,
+    if it is not smaller by more than COARSEST. Raises InputError, before anything is decoded, if
+    neither size fits."""
     size, real = (camera.width, camera.height), image_size(path)
     orientation = exif_orientation(path) if turned or real == size[::-1] != size else 1
     whole = real[::-1] if orientation >= 5 else real
-    if size != whole and not (resized and (is_reduced(size, whole) or is_reduced(whole, size))):
+    similar = is_reduced(size, whole) or is_reduced(whole, size)
+    if size != whole and not (resized and similar and COARSEST * max(whole) >= max(size)):
         why = f"is {real[0]}x{real[1]}, but its camera is {camera.width}x{camera.height}"
         raise InputError(f"{path}: {why}; give pictures, masks and depth of their cameras' size")
     pixels = read(path)
