@@ -17,8 +17,6 @@ from studies import parsimony
 from studies.frame.output import read_rows
 from studies.setups import SetupSize
 
-pytestmark = pytest.mark.usefixtures("coarse_priors")
-
 
 def square():
     """The unit square in the plane z = 0, made of triangles that face upwards."""
