@@ -16,7 +16,7 @@ UP = np.array([0.0, 0.0, 1.0])
 BLUE, TAN = [0.15, 0.35, 0.75], [0.85, 0.76, 0.6]
 FRAMED = NO_GRID | {"axes.spines.top": True, "axes.spines.right": True}
 MAX_DOTS = 300_000  # most points drawn in a panel; with more, it looks the same
-PIXELS = 560  # width and height of the image of a panel of dots, somewhat more than the panel has
+PIXELS = 440  # width and height of the image of a panel of dots, about those of the panel
 LIGHT = np.array([-0.5, 0.4, 0.77])  # direction to the light in picture coordinates, about unit
 
 
@@ -55,7 +55,7 @@ class _View:
         image = np.ones((PIXELS, PIXELS, 3))
         image[row[inside].astype(int), column[inside].astype(int)] = colours[inside]
         limits = (-zoom * self.reach, zoom * self.reach)
-        axis.imshow(image, extent=limits * 2, origin="lower")
+        axis.imshow(image, extent=limits * 2, origin="lower", interpolation="nearest")
         self.frame(axis, zoom)
 
 
