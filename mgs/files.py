@@ -430,9 +430,8 @@ def scratch_folder(path: str | Path, resumable: str = "") -> Iterator[Path]:
 
     resumable: pattern of files worth keeping. Empty: the folder is cleared before and after. Else
     an interruption or NoRoom keeps it, and a refused input does where it holds such a file or was
-    not empty.
-    Raises InputError if a folder of this name is there that mgs did not make, or that another
-    process uses."""
+    not empty. Raises InputError if a folder of this name is there that mgs did not make, or that
+    another process uses."""
     path = Path(path)
     check_leftover(path)
     ended = True

@@ -360,7 +360,7 @@ def test_images_may_be_smaller_than_their_cameras(dataset, tmp_path, kind, capsy
 
 @pytest.mark.parametrize("own", [(32, 24), (43, 32), (96, 72)])
 def test_masks_and_depth_of_another_size_give_the_nearest_pixels(dataset, tmp_path, own, capsys):
-    """Of the same proportions, to a pixel; others are refused."""
+    """Proportions may differ by a pixel; other sizes are refused."""
     for frame in dataset.frames:
         depth, mask = (
             cv2.resize(each, own, interpolation=cv2.INTER_NEAREST)

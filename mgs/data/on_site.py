@@ -26,7 +26,7 @@ from mgs.files import (
 from mgs.images import unlimited_headers
 
 COPIES, DATASET = "photographs", "dataset"  # folders of a site: reduced copies, their dataset
-RECORD = "copies.json"  # names of the copies: they make a folder a site, and are all that it loses
+RECORD = "copies.json"  # names of the copies; marks a site, where only these are ever removed
 DOWNSCALE = 3  # width of the copies over that of the dataset's images, which rate candidates
 
 

@@ -78,8 +78,8 @@ class Unfinished:
         self._since = time.monotonic()
 
     def load(self, new: FitState) -> FitState | None:
-        """Read the state of this fit; None where there is none, with a Notice where there is that
-        of another. new: its state before any step."""
+        """Read the state of this fit; None where there is no file, and with a Notice where it is of
+        another fit or damaged. new: state before any step."""
         if not self.path.is_file():
             return None
         with (

@@ -97,7 +97,9 @@ def of_points(views: Views, some: slice) -> Views:
 
 
 def in_parts(count: int, part: Callable[[slice], Result]) -> list[Result]:
-    """Results of `part` for slices of CHUNK out of `count`, in order, from threads."""
+    """Results of `part` for slices of CHUNK out of `count`, in order, from threads.
+
+    `part` must not call this function: it would wait for its own thread."""
     chunks = [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
     if len(chunks) < 2:
         return [part(some) for some in chunks]

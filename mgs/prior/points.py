@@ -169,8 +169,9 @@ def _cluster_looked_at(
 
 
 def _grown(points: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Points [N,3] above the ground in a cluster [N] bool, or joined to it as by DBSCAN (GROWN),
-    but without its list of all pairs of neighbours."""
+    """Whether points [N,3] above the ground are in a cluster [N] bool, or joined to it (GROWN) [N].
+
+    Joined as by DBSCAN, but without a list of all pairs of neighbours."""
     eps = GROWN * float(np.ptp(points[inside], axis=0).max())
     away = cKDTree(points).query(points, GROWN_NEIGHBOURS, distance_upper_bound=eps)[0]
     core, grown = np.isfinite(away[:, -1]), inside.copy()
