@@ -185,13 +185,15 @@ def test_a_wall_near_a_long_object_hides_what_is_behind(site):
     assert refusals(poses, taken, behind) == ["behind what the images show", ""]
 
 
-def test_nothing_is_taken_from_behind_a_facade(site):
-    facade = replace(site.prior, normals=np.tile([0.6, 0.0, 0.8], (len(site.prior.points), 1)))
+@pytest.mark.parametrize("walls", [[[0.6, 0.0, 0.8]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]])
+def test_nothing_is_taken_from_behind_a_facade(site, walls):
+    """A leaning wall, and the corner of two."""
+    facade = replace(site.prior, normals=np.resize(walls, site.prior.normals.shape))
     ring = place_poses("ring", 12, 2.6, (25, 35), site)
     taken = [site.like]
     why = refusals(ring, taken, replace(site, prior=facade))
     eyes = np.stack([camera.position for _, camera in ring]) - site.centre
-    assert [bool(reason) for reason in why] == list(eyes @ [0.6, 0, 0.8] < 0)
+    assert [bool(reason) for reason in why] == list((eyes @ np.transpose(walls) < 1e-6).all(1))
     assert set(why) == {"", "behind a surface that faces one way"}
     assert sum(map(bool, why)) < 6
     assert not any(refusals(ring, taken, site))

@@ -152,7 +152,7 @@ def suggest(
         for path in plan or ():
             _write_plan(path, run, result, place, asked.flight)
     _print(console, result, run, crossed, place)
-    for written in [*([out] if out else []), *(plan or ())]:
+    for written in [*([f"{out}: {', '.join(FILES)}"] if out else []), *(plan or ())]:
         console.print(f"wrote {written}", soft_wrap=True)
 
 
@@ -263,26 +263,26 @@ def _print(console: Terminal, result: Suggestion, run: Run, crossed: str, place:
         console.print(f"{lacks}, and gains are no guide; {cure}", soft_wrap=True)
     for reason, count in result.dropped.items():
         console.print(f"candidates left out: {count} {reason}")
-    rows = result.plan if len(result.plan) > 1 else result.ranking[:SHOWN]
+    rows, unit = result.plan if len(result.plan) > 1 else result.ranking[:SHOWN], run.dataset.unit
     table = Table(box=None)
-    numbers = ("score", "gain", "distance", "azimuth", "elevation", "unseen", "unknown")
+    length = f"distance ({unit})"
+    numbers = ("score", "gain", length, "azimuth", "elevation", "unseen", "unknown")
     for heading in ("", "pose", *numbers):
         table.add_column(heading, justify="left" if heading == "pose" else "right", overflow="fold")
     for number, view in enumerate(rows, 1):
-        table.add_row(str(number), view.name, *_cells(view, run.dataset.unit))
+        table.add_row(str(number), view.name, *_cells(view))
     console.print(table)
     north = place.bearing if place else 0.0
     for number, view in enumerate(result.plan, 1):
         bearing, _ = Stop(view.camera.position, "", view.camera).heading_and_pitch(north)
         facing = f"; bearing {bearing:.0f}°" if place else ""
-        moved = f"; moved {view.moved:.2f} {run.dataset.unit}" if result.refined else ""
+        moved = f"; moved {view.moved:.2f} {unit}" if result.refined else ""
         console.print(f"{number}: {view.way}{facing}{moved}", soft_wrap=True)
-    unit = run.dataset.unit
+    time = f" and {result.seconds:.0f} s" if unit == "m" else ""  # its speed is in metres
     plan = f"{len(result.plan)} view{'s' if len(result.plan) > 1 else ''}"
     console.print(
         f"gain: Eq. 7, {GAIN_UNIT}; unseen, unknown: shares of what the picture shows\n"
-        f"flight: {result.metres:.1f} {unit} and {result.seconds:.0f} s from the first image "
-        f"through {plan} and back"
+        f"flight: {result.metres:.1f} {unit}{time} from the first image through {plan} and back"
     )
     if result.refined:
         console.print("refined: gain of the plan from {:.4f} to {:.4f}".format(*result.refined))
@@ -292,11 +292,11 @@ def _print(console: Terminal, result: Suggestion, run: Run, crossed: str, place:
         console.print(f"{crossed}; give flight.no_fly to plan around it")
 
 
-def _cells(view: View, unit: str) -> tuple[str, ...]:
+def _cells(view: View) -> tuple[str, ...]:
     return (
         f"{view.score:.4g}",
         f"{view.information_gain:.4f}",
-        f"{view.distance:.2f} {unit}",
+        f"{view.distance:.2f}",
         f"{view.azimuth:.0f}°",
         f"{view.elevation:.0f}°",
         f"{100 * view.unseen:.1f} %",

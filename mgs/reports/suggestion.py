@@ -25,6 +25,7 @@ CONVENTION = (
     "nerfstudio"
 )
 
+CHOSEN = "#d1495b"  # colour of the planned views, and of the image from which the way is told
 MOST_PICTURES, PICTURE_WIDTH = 6, 200  # views in the figure, and pixels of the width of a picture
 
 
@@ -126,7 +127,9 @@ def _from_above(axis: Any, run: Run, suggestion: Suggestion) -> None:
             x, y = place - min(np.concatenate(stops), key=lambda stop: np.linalg.norm(stop - place))
             side = {"ha": "left" if x > 0 else "right", "va": "bottom" if y > 0 else "top"}
             apart = (7 if x > 0 else -7, 5 if y > 0 else -5)  # from its mark and the nearest stop
-            axis.annotate(frame.name, place, apart, textcoords="offset points", fontsize=7, **side)
+            about = {"textcoords": "offset points", "fontsize": 7, "color": CHOSEN, **side}
+            axis.annotate(frame.name, place, apart, **about)
+            axis.scatter(*place, marker="^", s=26, color=CHOSEN, zorder=3)
     ranked = level([view.camera.position for view in suggestion.ranking])
     gains, label = [view.information_gain for view in suggestion.ranking], f"gain ({GAIN_UNIT})"
     if suggestion.certificate:
@@ -138,8 +141,8 @@ def _from_above(axis: Any, run: Run, suggestion: Suggestion) -> None:
     way = [images[:1]]
     for corners, stop in zip(suggestion.corners, [*stops, images[:1]], strict=True):
         way += [level(corners)] * (len(corners) > 0) + [stop]
-    axis.plot(*np.concatenate(way).T, color="#d1495b", linewidth=1.2)
-    axis.scatter(*np.concatenate(stops).T, s=110, color="#d1495b", zorder=3, label="to take next")
+    axis.plot(*np.concatenate(way).T, color=CHOSEN, linewidth=1.2)
+    axis.scatter(*np.concatenate(stops).T, s=110, color=CHOSEN, zorder=3, label="to take next")
     for k, stop in enumerate(stops, 1):
         axis.text(*stop[0], str(k), color="white", fontsize=8, ha="center", va="center", zorder=4)
     unit = run.dataset.unit

@@ -35,7 +35,9 @@ SAME_PLACE, SAME_VIEW = 1e-3, 1.0  # share of the distance, and degrees: counts 
 # on all sides. Images in which a place is judged by them. Chosen constants.
 AROUND, REACH, WITNESSES = 32, 0.2, 2
 OWN = 0.3  # distance from the surface, over the radius, within which points are its own. Chosen
-ONE_SIDED = 0.75  # least mean normal of a surface that has a back, as a facade; half a ball: 0.5
+# Least share of the surface's area, projected along the view, that faces a pose: less is behind an
+# open surface, as a facade. Closed ones have half. Normals by which it is judged. Chosen.
+FACING, NORMALS = 0.2, 1000
 FELT = 0.05  # least move that is named, over the distance from the object; as an angle, radians
 
 Named = tuple[str, Camera]
@@ -161,28 +163,31 @@ def place_poses(
 
 
 def way_to(camera: Camera, images: Sequence[Frame], site: Site, unit: str) -> str:
-    """Words by which a person finds a pose: the images around it, and the way from the nearest.
+    """Words by which a person finds a pose: the way from the nearest image, towards another if any.
     Lengths are in metres, or of another unit in percent of that image's distance from the object.
     """
     eyes = np.stack([frame.camera.position for frame in images]) - camera.position
     away = np.linalg.norm(eyes, axis=1)
     near = int(away.argmin())
-    where, words = images[near].name, list[str]()
+    where, words = f"from {images[near].name}", list[str]()
     opposite = eyes @ eyes[near] < -away * away[near] / 2
     if opposite.any():
-        where = f"between {where} and {images[int(np.where(opposite, away, np.inf).argmin())].name}"
+        where += f" towards {images[int(np.where(opposite, away, np.inf).argmin())].name}"
     start, end = images[near].camera.position - site.centre, camera.position - site.centre
     far = float(np.linalg.norm(start))
     turn = np.arctan2(start[0] * end[1] - start[1] * end[0], start[:2] @ end[:2])
     if abs(turn) >= FELT:
         side = "right" if turn > 0 else "left"
         words.append(f"{abs(np.degrees(turn)):.0f}° round the object to the {side}")
-    nearer = far - np.linalg.norm(end), "nearer", "farther"
-    for length, positive, negative in (nearer, (end[2] - start[2], "higher", "lower")):
+    nearer = far - np.linalg.norm(end), "", "nearer", "farther"
+    for length, of, up, down in (
+        nearer,
+        (end[2] - start[2], " of the distance", "higher", "lower"),
+    ):
         if abs(length) >= FELT * far:
-            size = f"{abs(length):.1f} m" if unit == "m" else f"{abs(length) / far:.0%}"
-            words.append(f"{size} {positive if length > 0 else negative}")
-    return f"{where}: {', '.join(words) or 'there'}"
+            size = f"{abs(length):.1f} m" if unit == "m" else f"{abs(length) / far:.0%}{of}"
+            words.append(f"{size} {up if length > 0 else down}")
+    return f"{where}: {', '.join(words) or 'hardly a step'}"
 
 
 def _lattice(count: int, radius: float, elevations: tuple[float, float]) -> NDArray[np.float64]:
@@ -264,8 +269,9 @@ def refusals(
     if walls is not None:  # an object alone hides no place: its far side is what to suggest
         own = OWN * np.linalg.norm(site.prior.points - centre, axis=1).max()
         walls = walls[cKDTree(site.prior.points).query(walls)[0] > own]
-    facing = site.prior.normals.mean(axis=0)
-    back = (offset @ facing < 0) & (np.linalg.norm(facing) > ONE_SIDED)
+    normals = site.prior.normals[:: -(-len(site.prior.normals) // NORMALS)]
+    towards_eye = normals @ offset.T
+    back = np.maximum(towards_eye, 0).sum(0) < FACING * np.abs(towards_eye).sum(0)
     within, keys = inside(mesh, eyes), [camera.world_to_camera.tobytes() for _, camera in poses]
     reasons = {
         "inside the object": within,
