@@ -249,7 +249,8 @@ def _view(label: str, run: Run, k: int, frame: Frame) -> dict[str, Any]:
     """Facts, pictures (name in the album, caption, alternative text) of the k-th view taken."""
     seeds, view, quality = run.settings.seeds, frame.name, psnr_of(run, frame.name)
     step = run.steps[max(0, k - seeds + 1)]
-    role = f"seed {k + 1} of {seeds}" if k < seeds else f"step {step['step']}"
+    first = "seed" if run.settings.budget else "image"
+    role = f"{first} {k + 1} of {seeds}" if k < seeds else f"step {step['step']}"
     facts = [("view", view), ("taken as", role)]
     # The numbers are known after the last of the seeds.
     facts += step_facts(step) if k >= seeds - 1 else [("images", str(k + 1))]
@@ -299,17 +300,22 @@ def _plots(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     of_steps = {"uncertainty": left}
     for key in dict.fromkeys(key for step in steps for key in measured(step)):
         of_steps[key] = f"{METRIC_NAMES[key]} after each step", METRIC_NAMES[key], False
-    of_steps["loss"] = ("Loss at the end of each fit", "mean squared error", True)
+    of_steps["loss"] = ("Loss at the end of each fit", "loss", True)
     for key, (title, axis, zero) in of_steps.items():
         plots.append((title, step_curves(runs, key), axis, zero))
-    drawn = [line_plot(title, curves, axis, zero) for title, curves, axis, zero in plots if curves]
+    drawn = [
+        line_plot(title, curves, axis, zero)
+        for title, curves, axis, zero in plots
+        if any(len(xs) > 1 for xs, _ in curves.values())  # a fit has one step
+    ]
     for label, run in runs.items():
         certificate = run.steps[0].get("certificate", {})
         if certificate.get("curve"):
             drawn.append(curve_plot(label, certificate))
     views = {label: measured_views(run) for label, run in runs.items() if run.measured}
     if views:
-        masked = all(any(one.get("psnr_mask") is not None for one in of) for of in views.values())
+        values = [[(one["psnr"], one.get("psnr_mask")) for one in of] for of in views.values()]
+        masked = all(any(inside not in (None, whole) for whole, inside in of) for of in values)
         drawn.append(views_plot("psnr_mask" if masked else "psnr", views))
     return drawn
 
