@@ -96,6 +96,7 @@ def test_noisy_poses_are_adjusted_to_the_pictures(frames, tmp_path, capsys, monk
     write_transforms(root, noisy)
     options = ["--refine-poses", "--up", "0,0,1", "--test-every", "4"]
     command("import", root, "--out", tmp_path / "whole", *options)
+    assert "given poses compared" in said(capsys)[0]
 
     def written_and_stopped(*arguments):
         write_transforms(*arguments)
@@ -119,6 +120,15 @@ def test_noisy_poses_are_adjusted_to_the_pictures(frames, tmp_path, capsys, monk
 
     assert error(noisy) > 0.4
     assert error(after) < 0.1
+
+
+def test_poses_that_are_a_little_wrong_are_named(frames, tmp_path, capsys):
+    rng, root = np.random.default_rng(0), frames[0].image_path.parent.parent
+    noise = rng.normal(0, [0.01] * 3 + [0.02] * 3, (len(frames), 6))
+    noisy = [replace(f, camera=displaced(f.camera, n)) for f, n in zip(frames, noise, strict=True)]
+    write_transforms(root, noisy)
+    command("import", root, "--out", tmp_path / "d")
+    assert "--refine-poses adjusts them" in said(capsys)[1]
 
 
 def test_a_survey_that_looks_at_no_one_place_starts_from_its_points(tmp_path):

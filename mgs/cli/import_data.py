@@ -152,9 +152,15 @@ def import_data(
     for note in [*shots.notes, *_advice(shots, result)]:
         notes.print(f"mgs: {note}", soft_wrap=True)
     if fit and fit.problem:
-        notes.print(f"mgs: the poses {fit.problem} ({_evidence(fit)})", soft_wrap=True)
-    world = f"{_evidence(fit, cloud)}; up {_numbers(upward)}, {reason}"
-    _print_summary(console, shots, tests, result, world)
+        cure = "correct them, and import with --force"
+        notes.print(f"mgs: the poses {fit.problem} ({_evidence(fit)}); {cure}", soft_wrap=True)
+    elif not refine_poses and _is_loose(fit, result):
+        cure = "--refine-poses adjusts them, with --force"
+        notes.print(f"mgs: the poses are a little wrong ({_evidence(fit)}); {cure}", soft_wrap=True)
+    alone = shots.kind == PHOTOGRAPHS  # whose poses follow from their points, in a world of its own
+    evidence = _points(cloud) if alone and cloud else _evidence(fit, cloud, refine_poses)
+    upward_at = "" if alone and axis is None else f" {_numbers(upward)},"
+    _print_summary(console, shots, tests, result, [evidence, f"up{upward_at} {reason}"])
     console.print(f"{out} is finished already" if record else f"wrote {out}", soft_wrap=True)
 
 
@@ -182,7 +188,7 @@ def _checked(
         return result, fit, source.sparse
     if refining:
         result, cloud, moves = refined(result, scratch / "every")
-        refining.print(moves_in_words(moves, result.unit))
+        refining.print(moves_in_words(moves, result.unit), soft_wrap=True)
     elif lacks_points(result):
         cloud = _triangulated(result, matcher, larger, scratch / "source")
     if cloud is None:
@@ -191,12 +197,24 @@ def _checked(
     return result, fit, cloud
 
 
-def _evidence(fit: Agreement | None, cloud: SparseCloud | None = None) -> str:
-    """How poses were compared with pictures, after the points."""
+def _is_loose(fit: Agreement | None, result: Dataset) -> bool:
+    """Whether points matched in pictures of a dataset are farther from its poses than those of
+    right poses, which are found to a pixel of WIDEST."""
+    from mgs.data.agreement import MATCHED
+    from mgs.data.structure import WIDEST
+
+    right = max(1.0, result.frames[0].camera.width / WIDEST)
+    return bool(fit and fit.error and fit.evidence.endswith(MATCHED) and fit.error > right)
+
+
+def _evidence(
+    fit: Agreement | None, cloud: SparseCloud | None = None, refined: bool = False
+) -> str:
+    """How poses were compared with pictures, after the points. refined: they are others now."""
     text = "poses not compared with the pictures, which share too few points"
     if fit:
         error = "" if fit.error is None else f": reprojection error {fit.error:.2f} pixels"
-        text = f"poses compared by {fit.evidence}{error}"
+        text = f"{'given ' if refined else ''}poses compared by {fit.evidence}{error}"
     return text if cloud is None else f"{_points(cloud)}; {text}"
 
 
@@ -307,10 +325,14 @@ def _advice(source: Source, result: Dataset) -> Iterator[str]:
 
 
 def _print_summary(
-    console: Terminal, source: Source, tests: Source | None, result: Dataset, more: str
+    console: Terminal, source: Source, tests: Source | None, result: Dataset, more: Sequence[str]
 ) -> None:
+    from mgs.data.photographs import KIND as PHOTOGRAPHS
+
     frames, apart = result.frames, len(tests.shots) if tests else 0
-    total = len(source.shots) + source.left_out.total()
+    total, alone = len(source.shots) + source.left_out.total(), source.kind == PHOTOGRAPHS
+    placed = f"{len(source.shots)} of {total} photographs placed"
+    scale = "--distance A,B,METRES" if alone else "--unit"
     without = ", ".join(f"{count} {reason}" for reason, count in source.left_out.items())
     counts = {
         "with mask": sum(frame.mask_path is not None for frame in frames),
@@ -319,15 +341,15 @@ def _print_summary(
         "undistorted": sum(shot.lens is not None for shot in source.shots),
         "turned by EXIF": sum(shot.turned for shot in source.shots),
     }
-    lengths = "metres" if result.unit == "m" else f"{result.unit}s (give --unit)"
+    lengths = "metres" if result.unit == "m" else f"{result.unit}s ({scale} gives metres)"
     parts = [
-        f"{source.kind}: {len(frames)} frames of {total} images",
+        placed if alone else f"{source.kind}: {len(frames)} frames of {total} images",
         *([f"{apart} test views, which are never fitted"] if apart else []),
         *([f"left out {without}"] if without else []),
         *(f"{count} {what}" for what, count in counts.items() if count),
-        more,
+        *more,
         f"lengths in {lengths}",
-        f"origin {_numbers(source.origin)}",
+        *([f"origin {_numbers(source.origin)}"] if any(source.origin) else []),
     ]
     console.print("; ".join(parts), soft_wrap=True)
 

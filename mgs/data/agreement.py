@@ -30,6 +30,8 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL's camera axes to OpenCV's,
 # From a body's axes (x forward, y left, z up) to OpenCV's.
 BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
+MATCHED = "points matched in neighbouring pictures"  # end of the evidence of `agreement`
+
 Convention = Callable[[np.ndarray], np.ndarray]
 
 INVERSE = "are the inverse: world-to-camera in place of camera-to-world, or the reverse"
@@ -84,9 +86,7 @@ def agreement(frames: Sequence[Frame], matcher: Matcher, masked: bool = True) ->
             each = [np.median(_epipolar_error(*pair, convention, zoom)) for pair in matched]
             return float(np.quantile(each, SOUND, method="higher"))
 
-        verdicts.append(
-            _judged(by_matches, f"{count:,} points matched in neighbouring pictures", limit)
-        )
+        verdicts.append(_judged(by_matches, f"{count:,} {MATCHED}", limit))
     if all(frame.depth_path for pair in pairs for frame in pair) and pairs:
         measured = [(one, one.depth(), other, other.depth()) for one, other in pairs]
 
