@@ -225,11 +225,3 @@ def test_the_whole_paper_in_a_few_calls(tmp_path, monkeypatch):
     assert mgs.diagnose(run)
     written = mgs.report("runs", "paper")
     assert {"table.md", "comparison.png"} <= {path.name for path in written}
-
-    mission, state = mgs.Mission(seeds=4, budget=1), mgs.learn(scene, scene.seeds(4))
-    while len(state.taken) < 5:
-        view, _ = mgs.choose(scene, state, mgs.DOptimal(), mission)
-        state = mgs.learn(scene, (*state.taken, view), before=state)
-    chosen = mgs.open_run("runs/d-optimal").state
-    assert list(state.taken) == chosen.taken
-    assert state.gaussians == chosen.gaussians

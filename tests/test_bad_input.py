@@ -51,10 +51,6 @@ def remove(name: str) -> Change:
     return lambda root: (root / name).unlink()
 
 
-def png(name: str, values: np.ndarray) -> Change:
-    return lambda root: write_png(root / name, values)
-
-
 def without_images(root):
     shutil.rmtree(root / "images")
 
@@ -197,9 +193,6 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
     (synthetic.write_dataset, "import {d} --images {d}/none --out {out}"): [
         ("none: no such folder", nothing)
     ],
-    (synthetic.write_dataset, "import {d} --keyframes 5 --out {out}"): [
-        ("expected seconds or metres", nothing)
-    ],
     (lambda d: d.symlink_to(d), "import {d} --out {out}"): [("no such file or folder", nothing)],
     (Path.mkdir, "suggest {d}"): [("d: holds no transforms.json; make", nothing)],
     (synthetic.write_dataset, "import {d} --out /"): [("/: is there already", nothing)],
@@ -228,10 +221,8 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
         ("kf_0000.png is in it and is read", nothing)
     ],
     (synthetic.write_dataset, "import {d} --out {out} --masks {d}/masks"): [
-        ("no mask for image kf_0000.png", remove("masks/kf_0000.png")),
-        ("kf_0000.png: is 32x26", png("masks/kf_0000.png", np.ones((26, 32), bool))),
+        ("is 32x26", lambda d: write_png(d / "masks/kf_0000.png", np.ones((26, 32), bool)))
     ],
-    (synthetic.write_dataset, "import {d} --out {out} --masks none"): [("none: no such", nothing)],
     (synthetic.write_dataset, "import {d} --out {out} --masks b --mesh a"): [("one of", nothing)],
     (synthetic.write_dataset, "import {d} --out {out} --mesh {d}/mm.ply"): [
         ("the mesh is in no picture", millimetres),
@@ -282,17 +273,10 @@ def test_bad_input_is_one_line_and_leaves_nothing(capsys, tmp_path, world, comma
     assert words in refused(capsys, given, kept)
 
 
-BROKEN = {
-    "kf_0000.png": text("images/kf_0000.png", "no pixels"),
-    "7x5": png("images/kf_0000.png", np.zeros((5, 7, 3), np.float32)),
-}
-
-
-@pytest.mark.parametrize("words", BROKEN)
-def test_broken_pixels(capsys, dataset, prior, tmp_path, words):
-    BROKEN[words](dataset)
+def test_broken_pixels(capsys, dataset, prior, tmp_path):
+    (dataset / "images/kf_0000.png").write_text("no pixels")
     arguments = ["nbv", dataset, "--out", tmp_path / "out", "--prior", prior, "--budget", 1]
-    assert words in refused(capsys, arguments)
+    assert "kf_0000.png" in refused(capsys, arguments)
     assert not (tmp_path / "out/steps.jsonl").exists()
 
 

@@ -47,10 +47,6 @@ def scene(seed, points=5, poses=POSES, dome=5):
     return surface, random_views(rng, poses, points), random_views(rng, dome, points)
 
 
-def some(pool, frames):
-    return Views(pool.positions[frames], pool.seen[frames])
-
-
 seeds, degrees = st.integers(0, 10_000), st.integers(0, 3)
 taus = st.sampled_from([0.03, 0.1, 0.3, 1.0])
 
@@ -76,13 +72,13 @@ def posterior(points, views, degree, tau):
 def test_a_rank_one_update_gives_what_full_inverses_give(seed, degree, tau):
     """D: 1.5 times the fall of log det S. I: fall of the variance summed over the dome."""
     points, pool, dome = scene(seed)
-    taken, candidates = some(pool, [0, 1, 2]), [3, 4, 5, 6]
+    taken, candidates = pool.of([0, 1, 2]), [3, 4, 5, 6]
     before = posterior(points, taken, degree, tau)
     predicted = directional.information(points, dome, degree)
-    d = gains(points, LAM, degree, tau, taken, some(pool, candidates))
-    i = gains(points, LAM, degree, tau, taken, some(pool, candidates), dome)
+    d = gains(points, LAM, degree, tau, taken, pool.of(candidates))
+    i = gains(points, LAM, degree, tau, taken, pool.of(candidates), dome)
     for c, candidate in enumerate(candidates):
-        after = posterior(points, some(pool, [0, 1, 2, candidate]), degree, tau)
+        after = posterior(points, pool.of([0, 1, 2, candidate]), degree, tau)
         expected = 1.5 * (np.linalg.slogdet(before)[1] - np.linalg.slogdet(after)[1]).sum()
         assert d[c] == pytest.approx(expected, rel=1e-6, abs=1e-8)
         fall, whole = (np.einsum("nkl,nlk->", predicted, S) for S in (before - after, before))
@@ -91,7 +87,7 @@ def test_a_rank_one_update_gives_what_full_inverses_give(seed, degree, tau):
 
 def test_gaussians_in_parts_add_up(monkeypatch):
     points, pool, dome = scene(0)
-    taken, candidates = some(pool, [0, 1, 2]), some(pool, [3, 4, 5, 6])
+    taken, candidates = pool.of([0, 1, 2]), pool.of([3, 4, 5, 6])
     whole = [gains(points, LAM, 2, 0.3, taken, candidates, views) for views in (None, dome)]
     monkeypatch.setattr(directional, "CHUNK", 3)
     parts = [gains(points, LAM, 2, 0.3, taken, candidates, views) for views in (None, dome)]
@@ -133,7 +129,7 @@ def updated(points, pool, dome):
 
 def anew(points, pool, dome, taken, left, degree, tau, over_dome):
     around = dome if over_dome else None
-    return gains(points, LAM, degree, tau, some(pool, taken), some(pool, left), around)
+    return gains(points, LAM, degree, tau, pool.of(taken), pool.of(left), around)
 
 
 @settings(max_examples=40)

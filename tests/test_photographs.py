@@ -366,22 +366,27 @@ def test_upright_is_the_rotation_that_turns_up_to_z(vector):
     assert np.array_equal(levelled((0.0, 0.0, 1.0)), np.eye(3))
 
 
+def turned(rng: np.random.Generator) -> np.ndarray:
+    """A random rotation [3,3], from the upright world to another one."""
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    return turn * np.linalg.det(turn)
+
+
+def held(angle: float, altitude: float, roll: float, turn: np.ndarray) -> Camera:
+    """A camera on a circle of 3 m that looks at the origin of a turned world. roll: degrees."""
+    pose = look_at([3 * np.cos(angle), 3 * np.sin(angle), altitude], [0, 0, 0])
+    pose[:3] = Rotation.from_euler("z", roll, degrees=True).as_matrix() @ pose[:3]
+    pose[:3, :3] = pose[:3, :3] @ turn.T
+    return Camera(np.diag([50.0, 50.0, 1.0]), 64, 48, pose)
+
+
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), altitude=st.floats(0.2, 5), arc=st.floats(1.0, 6.28))
 def test_up_is_found_in_a_turned_world_of_cameras_held_nearly_level(seed, altitude, arc):
     rng = np.random.default_rng(seed)
-    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-    turn *= np.linalg.det(turn)
-    cameras = []
-    for angle in np.linspace(0, arc, 20):
-        pose = look_at([3 * np.cos(angle), 3 * np.sin(angle), altitude], [0, 0, 0])
-        roll = np.radians(rng.normal(0, 2))
-        c, s = np.cos(roll), np.sin(roll)
-        pose[:3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ pose[:3]
-        pose[:3, :3] = pose[:3, :3] @ turn.T
-        cameras.append(Camera(np.diag([50.0, 50.0, 1.0]), 64, 48, pose))
-    up = turn @ [0, 0, 1]
-    assert degrees_between(up_of_cameras(cameras), unit_up(up)) < 5
+    turn = turned(rng)
+    cameras = [held(angle, altitude, rng.normal(0, 2), turn) for angle in np.linspace(0, arc, 20)]
+    assert degrees_between(up_of_cameras(cameras), unit_up(turn[:, 2])) < 5
 
 
 @pytest.mark.parametrize("quarter", [1, 3])
@@ -389,31 +394,22 @@ def test_up_is_found_in_a_turned_world_of_cameras_held_nearly_level(seed, altitu
 def test_up_of_pictures_that_lie_on_their_side(arc, quarter):
     """As a phone's that was held upright, and whose EXIF is lost."""
     rng = np.random.default_rng(0)
-    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-    turn *= np.linalg.det(turn)
-    cameras = []
-    for angle, altitude in zip(np.linspace(0, arc, 20), rng.uniform(1, 2.5, 20), strict=True):
-        pose = look_at([3 * np.cos(angle), 3 * np.sin(angle), altitude], [0, 0, 0])
-        roll = np.radians(rng.normal(90 * quarter, 4))
-        c, s = np.cos(roll), np.sin(roll)
-        pose[:3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ pose[:3]
-        pose[:3, :3] = pose[:3, :3] @ turn.T
-        cameras.append(Camera(np.diag([50.0, 50.0, 1.0]), 64, 48, pose))
-    assert degrees_between(up_of_cameras(cameras), unit_up(turn @ [0, 0, 1])) < 5
+    turn = turned(rng)
+    places = zip(np.linspace(0, arc, 20), rng.uniform(1, 2.5, 20), strict=True)
+    cameras = [held(*place, rng.normal(90 * quarter, 4), turn) for place in places]
+    assert degrees_between(up_of_cameras(cameras), unit_up(turn[:, 2])) < 5
 
 
 @pytest.mark.parametrize("lines", [2, 3])
 def test_a_survey_from_above_looks_down(lines):
     """Lines there and back: the axes that point up in the pictures cancel."""
-    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
-    turn *= np.linalg.det(turn)
-    cameras = []
+    turn, cameras = turned(np.random.default_rng(0)), []
     for line, at in product(range(lines), range(6)):
         pose, heading = np.eye(4), (-1) ** line
         pose[:3, :3] = np.diag([heading, -heading, -1]) @ turn.T
         pose[:3, 3] = -pose[:3, :3] @ turn @ [line, at, 5 + 0.01 * at]
         cameras.append(Camera(np.diag([50.0, 50.0, 1.0]), 64, 48, pose))
-    assert degrees_between(up_of_cameras(cameras), unit_up(turn @ [0, 0, 1])) < 2
+    assert degrees_between(up_of_cameras(cameras), unit_up(turn[:, 2])) < 2
 
 
 @pytest.mark.parametrize("tag", [3, 6, 8])
@@ -421,14 +417,11 @@ def test_up_is_that_of_the_picture_as_it_was_held(tag, tmp_path):
     """Cameras of stored pictures that EXIF turns, as COLMAP has them."""
     shots = []
     for k, angle in enumerate(np.linspace(0, 5, 8)):
-        level = look_at([3 * np.cos(angle), 3 * np.sin(angle), 1], [0, 0, 0])
-        roll = Rotation.from_euler("z", {3: 180, 6: 90, 8: -90}[tag], degrees=True).as_matrix()
-        level[:3] = roll.T @ level[:3]
+        camera = held(angle, 1, {3: 180, 6: -90, 8: 90}[tag], np.eye(3))
         exif = Image.Exif()
         exif[0x0112] = tag
         path = tmp_path / f"{k}.jpg"
         Image.new("RGB", (64, 48)).save(path, exif=exif)
-        camera = Camera(np.diag([50.0, 50.0, 1.0]), 64, 48, level)
         shots.append(Shot(f"{k}", camera, None, k, path))
     assert degrees_between(Source("COLMAP", shots).up_or_estimate()[0], (0, 0, 1)) < 1
 

@@ -153,14 +153,18 @@ def test_policies_use_their_own_estimator():
     assert POLICIES["paper"](scene, state, [1, 2, 3]) == pytest.approx(paper)
 
 
+def seen_from(eyes, model):
+    """Cameras at these places, and a state in which the first has seen the model."""
+    cameras = [make_camera((24, 18), 30.0, eye) for eye in eyes]
+    frames = tuple(SimpleNamespace(camera=camera) for camera in cameras)
+    return cameras, mgs.State(frames, (0,), 1, model, np.zeros((len(model), 11)), np.zeros(0))
+
+
 def test_full_d_is_the_gain_of_the_whole_matrix(monkeypatch):
     """Against dense float64 Jacobians; by the blocks it is 6 and 8 % larger."""
     monkeypatch.setattr(studied, "PROBES", 8)
     model = make_gaussians(12, 3, log_scales=(-1.5, -0.8))
-    eyes = [(2.0, 0.4, 1.1), (1.9, 0.9, 0.8), (-1.9, 0.3, 1.0)]
-    cameras = [make_camera((24, 18), 30.0, eye) for eye in eyes]
-    state = mgs.State((), (0,), 1, model, np.zeros((12, 11)), np.zeros(0))
-    state = replace(state, frames=tuple(SimpleNamespace(camera=camera) for camera in cameras))
+    cameras, state = seen_from([(2.0, 0.4, 1.1), (1.9, 0.9, 0.8), (-1.9, 0.3, 1.0)], model)
     settings = SimpleNamespace(train=SimpleNamespace(means="frozen"))
     scene = SimpleNamespace(settings=settings, cache=mgs.ListCache(), lam=LAM)
     J = [reference.jacobian(model, camera).reshape(-1, 132) for camera in cameras]
@@ -174,10 +178,7 @@ def test_full_d_is_the_gain_of_the_whole_matrix(monkeypatch):
 def test_fisherrf_code_squares_the_gradient_of_each_pixel():
     """Channels are summed first, and activations enter once (its CUDA kernel and PyTorch)."""
     model = make_gaussians(5, 3, colour=0.4)
-    eyes = [(2.0, 0.4, 1.1), (0.2, 2.1, 0.8), (-1.9, 0.3, 1.0)]
-    cameras = [make_camera((24, 18), 30.0, eye) for eye in eyes]
-    state = mgs.State((), (0,), 1, model, np.zeros(0), np.zeros(0))
-    state = replace(state, frames=tuple(SimpleNamespace(camera=camera) for camera in cameras))
+    cameras, state = seen_from([(2.0, 0.4, 1.1), (0.2, 2.1, 0.8), (-1.9, 0.3, 1.0)], model)
     o = 1 / (1 + np.exp(-model.logit_opacities.astype(np.float64)))
 
     def F(camera):
@@ -223,9 +224,7 @@ def test_visibility_baselines_prefer_the_other_side():
     """One Gaussian, seen from +X: a pose beside it is worth less than one beyond it."""
     model = replace(make_gaussians(1, 0), means=np.zeros((1, 3), np.float32))
     model = replace(model, logit_opacities=np.full(1, 3, np.float32))
-    eyes = [(2.0, 0, 0.5), (1.9, 0.3, 0.5), (-2.0, 0, 0.5)]
-    frames = tuple(SimpleNamespace(camera=make_camera((24, 18), 30.0, eye)) for eye in eyes)
-    state = mgs.State(frames, (0,), 1, model, np.zeros(0), np.zeros(0))
+    _, state = seen_from([(2.0, 0, 0.5), (1.9, 0.3, 0.5), (-2.0, 0, 0.5)], model)
     scene = SimpleNamespace(cache=None, lam=LAM, settings=SimpleNamespace(pixel_noise=0.02))
     scene.information = lambda state, view: np.full((1, 11), 1e3)
     for policy in (studied.cover_gym, studied.gavis_like):

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from mgs.run.live import Live
     from mgs.scene import Scene
 
-NAMES = f"Names (docs/nbv.md): {', '.join(POLICIES)}."
+NAMES = f"""Names (docs/nbv.md): {", ".join(POLICIES)}.
+Of views at one distance and in reach, cover and farthest choose as well to 0.1 and 0.2 dB."""
 
 
 class Capture(Frozen):
