@@ -101,9 +101,9 @@ def test_the_page_of_a_fit_without_masks_speaks_of_photographs(page, runs, tmp_p
     parsed, masked = read_page(tmp_path / "fit.html"), read_page(page)
     assert "Run of mgs fit on" in parsed.text
     assert "The truth is the photograph." in parsed.text
-    assert "rock in front of black" not in json.dumps(parsed.data)
+    assert "object in front of black" not in json.dumps(parsed.data)
     assert "Runs of mgs nbv on" in masked.text
-    assert "The truth is the rock alone in front of black." in masked.text
+    assert "The truth is the object alone in front of black." in masked.text
 
 
 def test_links_lead_to_the_files(page):

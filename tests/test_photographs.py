@@ -36,6 +36,7 @@ from mgs.fit import density
 from mgs.images import write_png
 from mgs.prior import hull
 from mgs.prior.build import build_prior, load_prior, prior_and_cloud
+from mgs.prior.figure import UP, _oblique
 from mgs.prior.hull import visual_hull
 from mgs.prior.points import _grown, main_cluster, on_surface, reliable, scattered
 from mgs.prior.segmentation import Plane
@@ -253,6 +254,7 @@ def test_a_front_seen_from_one_side_is_closed_behind_and_is_no_ground(tmp_path):
     away = np.minimum(np.abs(prior.points[:, 1]), np.abs(prior.points[:, 1] + 0.3))
     assert np.quantile(away, 0.9) < 0.2
     assert prior.numbers["sampled_area"] > 12
+    assert _oblique(UP, prior.normals.mean(0))[2] @ [0, -1, 0] > 0.8
 
 
 def test_points_that_poisson_does_not_close_get_a_shell(tmp_path, monkeypatch):

@@ -218,6 +218,7 @@ def _make_masks(path: Path, prior: Path) -> None:
 def _check(path: Path) -> None:
     from mgs.data.check import check_dataset, taken_frames
     from mgs.data.dataset import load_dataset
+    from mgs.data.frames import has_masks
 
     data = load_dataset(path)
     console = Terminal()
@@ -226,11 +227,13 @@ def _check(path: Path) -> None:
     camera, (low, high) = data.frames[0].camera, check.depth_range
     absent = len(data) - len(taken_frames(data))
     waiting = f" ({absent} of them on demand, not taken yet)" if absent else ""
-    rock = f"{camera.width}x{camera.height}, rock on {check.mask_share:.0%} of the pixels"
-    console.print(f"{path}: {len(data)} frames{waiting}, {rock}")
+    size = f"{camera.width}x{camera.height}"
+    if has_masks(data.frames):
+        size += f", object on {check.mask_share:.0%} of the pixels"
+    console.print(f"{path}: {len(data)} frames{waiting}, {size}")
     if high > 0:
         through = f"neighbours see through {check.seen_through:.1%} of it"
-        console.print(f"depth of the rock {low:.2f} to {high:.2f} m; {through}")
+        console.print(f"depth of the object {low:.2f} to {high:.2f} m; {through}")
     if check.problems:
         for problem in check.problems:
             console.print(f"- {problem}", soft_wrap=True, highlight=False)

@@ -48,10 +48,10 @@ ROWS = (
     ),
     (
         "eps",
-        "rock cluster (DBSCAN)",
+        "object's cluster (DBSCAN)",
         "{cluster_size:,} points, of a cloud of {clusters} clusters, eps {eps}",
     ),
-    ("cloud_spacing", "points of the rock", "{cluster_size:,}, {cloud_spacing} apart"),
+    ("cloud_spacing", "points of the object", "{cluster_size:,}, {cloud_spacing} apart"),
     ("hull_cell", "visual hull", "cells of {hull_cell}, fills {hull_fills_masks:.1%} of the masks"),
     ("fit_rms", "cloud to mesh, rms", "{fit_rms}"),
     ("poisson_depth", "octree depth (Poisson)", "{poisson_depth}"),
@@ -121,6 +121,7 @@ def prior(
     from mgs.prior.initial import AGREEMENT, colour_agreement
     from mgs.prior.photographs import choose_source
     from mgs.prior.settings import PriorSettings
+    from mgs.run.nbv import LOOSE
 
     console = Terminal()
     axis = None if up is None else parse_up(up)
@@ -161,8 +162,9 @@ def prior(
     if agreement < AGREEMENT:
         few = f"the photographs agree on only {agreement:.0%} of the surface's colours"
         right = f"on a correct surface on {AGREEMENT:.0%} or more"
-        cure = "so it may be wrong; fit with `--means free`"
-        console.print(f"{few} ({right}), {cure}", soft_wrap=True)
+        of_photographs = "`mgs fit` lets means move for that, `mgs nbv --set train.means=free` too"
+        cure = of_photographs if result.kind in LOOSE else "fit with `--means free`"
+        console.print(f"{few} ({right}), so it may be wrong; {cure}", soft_wrap=True)
     wrong = result.numbers.get("outline_error", 0.0)
     if wrong > OUTLINE:
         many = f"{wrong:.1%} of the covered pixels of the median view (limit {OUTLINE:.0%})"
@@ -203,9 +205,6 @@ def _table(numbers: dict[str, Any]) -> Table:
     for key, label, text in ROWS:
         if key in shown:
             table.add_row(label, text.format(**shown))
-    if "truth" not in numbers:
-        lacks = "not measured: needs depth, and rock.glb in the dataset"
-        table.add_row("distance to the true rock", lacks)
     return table
 
 

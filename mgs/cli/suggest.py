@@ -15,6 +15,7 @@ from mgs.cli.options import Count, Settings, not_none, parse_gaussians, parse_se
 from mgs.cli.terminal import Terminal, progress_bar
 from mgs.data.dataset import load_dataset, read_records
 from mgs.data.flight_plan import Stop, check_plan_path, parse_origin, write_flight_plan
+from mgs.data.structure import CLOUD
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
 from mgs.fit.settings import Frozen
@@ -260,6 +261,8 @@ def _print(console: Terminal, result: Suggestion, run: Run, crossed: str, place:
     if run.prior.kind == "random":
         lacks = "the model has no surface of an object: nothing tells seen from unseen"
         cure = "import with masks or depth, or fit with `prior`"
+        if (run.dataset.root / CLOUD).is_file():
+            cure = f"`mgs suggest {run.dataset.root}` builds one of the points"
         console.print(f"{lacks}, and gains are no guide; {cure}", soft_wrap=True)
     for reason, count in result.dropped.items():
         console.print(f"candidates left out: {count} {reason}")

@@ -15,6 +15,7 @@ from mgs.prior.segmentation import SegmentedCloud
 UP = np.array([0.0, 0.0, 1.0])
 BLUE, TAN = [0.15, 0.35, 0.75], [0.85, 0.76, 0.6]
 FRAMED = NO_GRID | {"axes.spines.top": True, "axes.spines.right": True}
+ONE_SIDED = 0.4  # least level mean normal of a surface with a front; half a ball: 0.5
 MAX_DOTS = 300_000  # most points drawn in a panel; with more, it looks the same
 PIXELS = 440  # width and height of the image of a panel of dots, about those of the panel
 LIGHT = np.array([-0.5, 0.4, 0.77])  # direction to the light in picture coordinates, about unit
@@ -65,7 +66,8 @@ def draw_prior(path: str | Path, prior: Prior, segmented: SegmentedCloud | None)
     plane = None if segmented is None else segmented.plane
     body = prior.mesh.vertices
     reach = 0.5 * float(np.linalg.norm(np.ptp(body, axis=0)))
-    axes_of_view = _oblique(UP if plane is None else plane.normal)
+    up = UP if plane is None else plane.normal
+    axes_of_view = _oblique(up, prior.normals.mean(0))
     view = _View(axes_of_view, (body.min(0) + body.max(0)) / 2, reach)
     truth = prior.numbers.get("truth")
     error = f", accuracy {1e3 * truth['accuracy']:.2f} mm" if truth else ""
@@ -122,19 +124,23 @@ def _cloud_panels(axes, view: _View, segmented: SegmentedCloud) -> None:
     panels = [
         (f"cloud: {len(cloud):,} points\ncoloured by height", cloud[near], height[near], 2.2),
         (f"{label} (tan)\nthe rest in blue", cloud[near], tint, 2.2),
-        (f"rock cluster: {len(rock):,} points", rock, rock[:, 2], 1.0),
+        (f"the object: {len(rock):,} points", rock, rock[:, 2], 1.0),
     ]
     for axis, (title, points, colour, zoom) in zip(axes, panels, strict=True):
         view.dots(axis, points, colour, zoom, 2)
         axis.set_title(title)
 
 
-def _oblique(up: np.ndarray) -> np.ndarray:
-    """Axes of picture coordinates, rows [3,3], of a viewer 30 degrees above the ground."""
+def _oblique(up: np.ndarray, facing: np.ndarray = np.zeros(3)) -> np.ndarray:
+    """Axes of picture coordinates, rows [3,3], of a viewer 30 degrees above the ground, and before
+    the front of a surface that is ONE_SIDED. facing: its mean normal."""
     side = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
     ahead = np.cross(side, up)
     level = np.cos(0.8) * side + np.sin(0.8) * ahead
+    across = facing - (facing @ up) * up
+    if (length := float(np.linalg.norm(across))) > ONE_SIDED:
+        level = across / length
     towards = np.cos(np.pi / 6) * level + np.sin(np.pi / 6) * up
     right = np.cross(up, towards)
     right /= np.linalg.norm(right)

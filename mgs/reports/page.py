@@ -254,7 +254,7 @@ def _view(label: str, run: Run, k: int, frame: Frame) -> dict[str, Any]:
     facts = [("view", view), ("taken as", role)]
     # The numbers are known after the last of the seeds.
     facts += step_facts(step) if k >= seeds - 1 else [("images", str(k + 1))]
-    black = ", the rock in front of black" if frame.mask_path or frame.rock_path else ""
+    black = ", the object in front of black" if frame.mask_path or frame.rock_path else ""
     own, where, bright = f"{view}/{label}", f"seen from {view}", "bright where little is known"
     pictures = [
         (f"truth/{view}", "truth", f"Truth: the image of {view}{black}."),

@@ -231,7 +231,7 @@ DETECTORS: dict[str, Detector] = {
     "pose": Detector(
         1.0,  # good runs: up to 0.96
         "in one view, prior and mask are {value:.1f} times farther apart than the limit, "
-        f"{100 * OFFSET:.0f} % of the rock's size or a pixel of the farthest views; check its "
+        f"{100 * OFFSET:.0f} % of the object's size or a pixel of the farthest views; check its "
         "pose, its mask, and the prior",
     ),
     "outlier": Detector(
