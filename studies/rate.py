@@ -2,8 +2,9 @@
 
 Each rock is fitted with several numbers of Gaussians. Every coder writes each model: whole, pruned
 as by `mgs simplify`, and with 1/2 to 1/16 of its Gaussians, fitted once more as by `mgs export
---bytes`. A coder is judged by the best of its files at each size. What files do not say, as the
-space of colours, is added when they are read back, so only the coding differs.
+--bytes`. What the best files of the format mgs give is fitted and written again, as there. A coder
+is judged by the best of its files at each size. What files do not say, as the space of colours, is
+added when they are read back, so only the coding differs.
 """
 
 import io
@@ -14,7 +15,6 @@ from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,11 @@ from PIL import Image
 
 import mgs
 from mgs.colour import srgb_from_linear
+from mgs.compact.encode import Compact
 from mgs.errors import Notice
 from mgs.evaluation import render_view
 from mgs.plotting import NO_GRID, crop, drawing
-from mgs.reports.compacting import compact_run, encoding, thinned
+from mgs.reports.compacting import ROUNDS, compact_run, encoding, fitted_again, thinned
 from mgs.run.folder import Run
 from mgs.run.nbv import start_fit
 from mgs.splat_files import FORMATS, load_gaussians, write_gaussians
@@ -103,11 +104,16 @@ def code(root: Path, out: Path, dataset: str, prior: str, tool: str) -> dict[str
     g, rows = run.gaussians, [_row("whole model", 0, run.gaussians, data)]
     models = [(g, np.arange(len(g))), *thinned(run, whole=False)]
     for name, shared in ((WITH, True), (ALONE, False)):
-        encoder = encoding(run, shared)
-        for one in starmap(encoder, models):
-            for scale in SCALES:
-                file = one.file(scale)
-                rows.append(_row(name, len(file), file.model, data) | {"scale": scale})
+        encoder, again = encoding(run, shared), fitted_again(run, shared)
+        encoders = [(encoder(*model), model[1]) for model in models]
+        coded = [(one.file(scale), kept) for one, kept in encoders for scale in SCALES]
+        mine = [_row_of(name, file, data) for file, _ in coded]
+        best = pareto_front([row["kB"] for row in mine], [row["psnr"] for row in mine])
+        for (file, kept), chosen in zip(coded, best, strict=True):
+            for _ in range(ROUNDS if chosen else 0):
+                file = again(file, kept).file(file.header.scale)
+                mine.append(_row_of(name, file, data))
+        rows += mine
     # Not every format says in which space colours are blended, or that splats are antialiased.
     marks = partial(replace, linear=g.linear, antialiased=g.antialiased)
     for model, _ in models:
@@ -132,6 +138,11 @@ def _row(coder: str, size: int, model: mgs.Gaussians, dataset: mgs.Dataset) -> R
     found = judge(model, dataset)
     row = {"coder": coder, "gaussians": len(model), "kB": size / 1e3}
     return row | {key: found[key] for key in ("psnr", "psnr_mask", "psnr_inside")}
+
+
+def _row_of(coder: str, file: Compact, dataset: mgs.Dataset) -> Row:
+    """Row of a file of the format mgs."""
+    return _row(coder, len(file), file.model, dataset) | {"scale": file.header.scale}
 
 
 def by_jpeg(root: Path, out: Path, dataset: str, prior: str, quality: int) -> dict[str, Any]:

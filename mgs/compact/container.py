@@ -23,7 +23,7 @@ from mgs.errors import InputError
 from mgs.files import parsing
 from mgs.gaussians import MAX_GAUSSIANS, MAX_SH_DEGREE
 
-MAGIC, MARK, VERSION = b"MGSC", b"\xa7\x5e", 3
+MAGIC, MARK, VERSION = b"MGSC", b"\xa7\x5e", 4
 MOST_LAYERS = 8
 # Magic, version, flags, SH degree, cut of the tree, layers, number of Gaussians, tiles, packets;
 # corner of the grid [3], up and origin of the world of the data [3], step of the grid, inset, scale

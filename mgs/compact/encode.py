@@ -76,7 +76,8 @@ class Encoder:
     g: NumPy fields. gradients: called once with the model. start: of the receiver's prior; None:
     positions are sent. kept: [N] indices of the Gaussians in the start, increasing; None: all.
     layer: [N] 0 or 1, sets of Gaussians of different kinds, where positions are sent. up, origin:
-    of the world of the data (`mgs.data.world.World`); g is upright.
+    of the world of the data (`mgs.data.world.World`); g is upright. placed: of a file whose
+    positions g has; they stay.
     """
 
     def __init__(
@@ -88,8 +89,9 @@ class Encoder:
         layer: np.ndarray | None = None,
         up: Vector = PLUS_Z,
         origin: Vector = (0.0, 0.0, 0.0),
+        placed: Header | None = None,
     ) -> None:
-        self.world = np.array(up), np.array(origin)
+        self.world, self.placed = (np.array(up), np.array(origin)), placed
         self.g, self.start = g, start
         self.kept = np.arange(len(g)) if kept is None else kept
         if start is None:
@@ -100,6 +102,7 @@ class Encoder:
         near = cKDTree(start.means).query(start.means, min(2, len(start.means)))[0].max(axis=-1)
         self.spacing = float(np.median(near)) or 1.0
         self.low, self.extent = start.means.min(0), float(np.ptp(start.means, 0).max())
+        self.low = placed.low if placed else self.low
         self.axes = fixed(colour_axes(g.sh[self._codes(self.extent / 1e6)[0]]), AXES)
         quats = start.quats[self.kept]
         columns = columns_of(g, quats, self.axes)
@@ -123,6 +126,7 @@ class Encoder:
         grid = scale / np.sqrt(self.of_means + 1e-30) if self.start is None else 0.0
         grid = float(np.clip(grid, self.spacing * FINEST, self.spacing * WIDEST))
         grid = max(grid, 2 * self.extent / 2**AXIS_BITS)
+        grid = self.placed.grid if self.placed else grid
         order, codes, among = self._codes(grid)
         least = 8 * TOP if self.start and len(codes) == len(among) else TOP
         depths = [d for d in range(3, DEPTH, 3) if len(np.unique(codes >> d)) * least < len(codes)]

@@ -11,6 +11,8 @@ from mgs.compact.coder import Stream, adaptive
 AXIS_BITS = 20  # bits of a cell's index along an axis
 DEPTH = 3 * AXIS_BITS + 1  # bits of a code: those of three axes, and a leading one for the layer
 MANY = 4  # cells below a node that count as many, in the contexts of `code_descendants`
+ON_SIDE, BESIDE = 3, 4  # neighbours of a node that count as many there, on a side and beside it
+AXES = tuple(sum(1 << (3 * bit + axis) for bit in range(AXIS_BITS)) for axis in range(3))
 BANDS = 12  # kinds of coefficients by the size of their node, each twice as large; then the rest
 
 
@@ -48,30 +50,79 @@ def code_descendants(
     these, to be written; None: they are read. Each node has a left child, a right one, or both.
     among: sorted codes of the cells that can be there; None: all. Raises ValueError if more than
     `most` are read."""
-    # Context of a node: whether its parent forked, and its level; where it is known what can be
-    # there, how many cells each child can have, up to MANY. Counts of the kinds of node by context.
-    counts = np.ones((2 * max(3, MANY**2), 3))
+    # Context of a node: its neighbours; where it is known what can be there, whether its parent
+    # forked, and how many cells each child can have, up to MANY. Counts of the kinds by context.
+    counts = np.ones((max((ON_SIDE + 1) ** 2 * (BESIDE + 1), 2 * MANY**2), 3))
     forked = np.zeros(len(nodes), np.int64)
     for shift in range(depth - 1, -1, -1):
         pairs = np.column_stack([2 * nodes, 2 * nodes + 1])
-        kinds, context = np.zeros(len(nodes), np.int64), forked + 2 * (shift % 3)
-        if among is not None:  # children without a cell need no code
+        kinds, turned = np.zeros(len(nodes), np.int64), np.zeros(len(nodes), bool)
+        if among is None:
+            context, turned = _surroundings(nodes, shift + 1)
+        else:  # children without a cell need no code
             ends = np.searchsorted(among, np.column_stack([pairs, pairs[:, 1] + 1]) << shift)
             left, right = np.minimum(np.diff(ends), MANY).T
             kinds = np.where(left == 0, 1, 0)
             context = forked + 2 * (MANY * (left - 1) + right - 1)
             context[(left == 0) | (right == 0)] = -1  # nothing to code
         if codes is not None:
-            left, right = np.isin(pairs, codes >> shift).T
-            kinds = left + 2 * right - 1
+            left, right = _found(codes >> shift, pairs)[0].T
+            kinds = _mirrored(left + 2 * right - 1, turned)
         for number in np.unique(context[context >= 0]):
             rows = np.flatnonzero(context == number)
             kinds[rows] = adaptive(stream, kinds[rows], counts[number])
+        kinds = _mirrored(kinds, turned)
         there = np.column_stack([kinds != 1, kinds != 0])
         nodes, forked = pairs[there], np.repeat(kinds == 2, 1 + (kinds == 2)).astype(np.int64)
         if len(nodes) > most:
             raise ValueError(f"more than {most} cells")
     return nodes
+
+
+def _mirrored(kinds: np.ndarray, turned: np.ndarray) -> np.ndarray:
+    """Kinds of nodes, 0: left child, 1: right child, 2: both; where `turned`, 0 and 1 exchanged."""
+    return np.where(turned & (kinds < 2), 1 - kinds, kinds)
+
+
+def _found(nodes: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whether each of `wanted` is among sorted nodes, and its place where it is."""
+    place = np.minimum(np.searchsorted(nodes, wanted), len(nodes) - 1)
+    return nodes[place] == wanted, place
+
+
+def _surroundings(nodes: np.ndarray, shift: int) -> tuple[np.ndarray, np.ndarray]:
+    """Context [M] of sorted nodes that are `shift` levels above the cells, and whether its two
+    sides, left and right along the axis that divides the node, are exchanged.
+
+    A context counts the neighbours across a face or an edge on the side that has more, on the
+    other, and those beside the node."""
+    left, right, beside = np.zeros((3, len(nodes)), np.int64)
+    if shift == DEPTH:  # what divides it is no axis but the layer
+        return left, left > right
+    axis, *across = (shift - 1) % 3, (shift + 1) % 3, shift % 3
+    cells = nodes << shift
+
+    def moved(cells: np.ndarray, axis: int, steps: int) -> np.ndarray:
+        """Cells of the neighbours along an axis, -1 where there is none."""
+        mask, unit = AXES[axis], 1 << (3 * ((shift + 2 - axis) // 3) + axis)
+        along = cells & mask
+        there = ((along | ~mask) + unit if steps > 0 else along - unit) & mask
+        inside = (cells >= 0) & ((there > along) == (steps > 0)) & (there != along)
+        return np.where(inside, (cells & ~mask) | there, -1)
+
+    ahead = moved(cells, axis, 1)
+    aslant = [moved(ahead, other, steps) for other in across for steps in (-1, 1)]
+    for neighbour in (ahead, *aslant):
+        found, place = _found(nodes, neighbour >> shift)
+        right += found
+        left[place[found]] += 1
+    for other in across:
+        found, place = _found(nodes, moved(cells, other, 1) >> shift)
+        beside += found
+        beside[place[found]] += 1
+    more, fewer = np.maximum(left, right), np.minimum(left, right)
+    sides = np.minimum(more, ON_SIDE) * (ON_SIDE + 1) + np.minimum(fewer, ON_SIDE)
+    return sides * (BESIDE + 1) + np.minimum(beside, BESIDE), right > left
 
 
 @dataclass(frozen=True)

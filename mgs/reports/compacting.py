@@ -5,11 +5,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 
 from mgs.colour import srgb_from_linear
 from mgs.compact.columns import Start, start_of
+from mgs.compact.container import Header
 from mgs.compact.encode import Compact, Encoder
 from mgs.errors import InputError
 from mgs.evaluation import psnr_over
@@ -30,6 +32,7 @@ STEP = 1e-4  # linear RGB, by which the slope of sRGB is measured
 CLOSE = 50  # searches for a PSNR end at numbers of Gaussians that differ by 1/CLOSE
 THINNINGS = 4  # times that half of the Gaussians are removed
 AGAIN = 0.3  # learning rates of a further fit over those of a first one, which leave its optimum
+ROUNDS = 2  # most further fits of what the best file gives
 
 
 @dataclass(frozen=True)
@@ -50,23 +53,47 @@ def compact_run(
     shared: the receiver has the run's prior, which gives positions. Raises InputError if
     neither can be reached, for a shared prior whose Gaussians were moved or changed by the fit, and
     as `Run.state`."""
-    measured = _measure(run)
-    before, files = measured(run.gaussians), list[tuple[float, Compact]]()
+    measured, encoder = _measure(run), encoding(run, shared)
+    before = measured(run.gaussians)
     _check_reachable(str(run.folder), psnr, before)
-    encoder = encoding(run, shared)
     enough = None if psnr is None else lambda model: measured(model) >= psnr
-    for some, kept in thinned(run, whole=shared):
+
+    def coded(encoder: Encoder, kept: np.ndarray) -> _Coded | None:
         report("choosing steps")
-        file = _fitted(encoder(some, kept), size, enough)
-        if file is not None:
-            files.append((measured(file.model) if size else -len(file), file))
-            if size and file.header.scale < 1.02 * SCALES[0]:  # all fits at the finest steps
+        file = _fitted(encoder, size, enough)
+        if file is None:
+            return None
+        return _Coded(measured(file.model) if size else -len(file), file, kept)
+
+    best: _Coded | None = None
+    for some, kept in thinned(run, whole=shared):
+        one = coded(encoder(some, kept), kept)
+        if one is not None:
+            best = max(best or one, one, key=lambda coded: coded.worth)
+            if size and one.file.header.scale < 1.02 * SCALES[0]:  # all fits at the finest steps
                 break
-    if not files:
+    if best is None:
         least = "it takes more bytes to place its Gaussians" if size else "no steps are fine enough"
         raise InputError(f"{run.folder}: {least}; ask for more bytes or a lower psnr")
-    file = max(files, key=lambda pair: pair[0])[1]
-    return Compacted(bytes(file), len(file.model), (before, measured(file.model)))
+    again = fitted_again(run, shared) if run.settings.prior.is_dir() else None
+    for _ in range(ROUNDS):
+        if again is None or len(best.file.model) < len(best.kept):  # one stands for several
+            break
+        report("fitting what the file gives")
+        one = coded(again(best.file, best.kept), best.kept)
+        if one is None or one.worth <= best.worth:
+            break
+        best = one
+    return Compacted(bytes(best.file), len(best.file.model), (before, measured(best.file.model)))
+
+
+class _Coded(NamedTuple):
+    """A file, the indices of its Gaussians in the run's, and what it is worth: PSNR in dB, or how
+    few bytes it has."""
+
+    worth: float
+    file: Compact
+    kept: np.ndarray
 
 
 def _measure(run: Run) -> Callable[[Gaussians], float]:
@@ -83,6 +110,12 @@ def _check_reachable(model: str, psnr: float | None, most: float) -> None:
     if psnr is not None and not psnr < most:
         own = f"{model} has {most:.2f} dB in the views taken"
         raise InputError(f"psnr {psnr:g}: {own}; ask for less")
+
+
+def fitted_again(run: Run, shared: bool) -> Callable[[Compact, np.ndarray], Encoder]:
+    """A function (file, its indices) -> encoder of what the file gives, fitted once more."""
+    again, encoder = refitting(run), encoding(run, shared)
+    return lambda file, kept: encoder(again(file.model), kept, file.header)
 
 
 def refitting(run: Run) -> Callable[[Gaussians], Gaussians]:
@@ -172,9 +205,9 @@ def thinned(run: Run, whole: bool) -> Iterator[tuple[Gaussians, np.ndarray]]:
         yield g, kept
 
 
-def encoding(run: Run, shared: bool) -> Callable[[Gaussians, np.ndarray], Encoder]:
-    """A function (model, indices in the run's) -> encoder of models of `thinned`. Raises InputError
-    as `compact_run`."""
+def encoding(run: Run, shared: bool) -> Callable[..., Encoder]:
+    """A function (model, indices in the run's, header of the file whose positions it has or None)
+    -> encoder of models of `thinned`. Raises InputError as `compact_run`."""
     g, place = run.state.gaussians, (run.dataset.world.up, run.dataset.world.origin)
     start = _start(run, g) if shared or run.settings.prior.is_dir() else None
     gradients = partial(_gradients, run)
@@ -182,9 +215,15 @@ def encoding(run: Run, shared: bool) -> Callable[[Gaussians, np.ndarray], Encode
         if start is None:
             moved = "its fit moved the Gaussians of its prior or has others"
             raise InputError(f"{run.folder}: {moved}; leave out `shared_prior`")
-        return lambda some, kept: Encoder(some, gradients, start, kept, None, *place)
+        return lambda some, kept, placed=None: Encoder(some, gradients, start, kept, None, *place)
     layer = start.layer if start else np.zeros(len(g), np.int64)
-    return lambda some, kept: Encoder(some, gradients, None, None, layer[kept], *place)
+
+    def alone(some: Gaussians, kept: np.ndarray, placed: Header | None = None) -> Encoder:
+        # What a file gives is in the order of its codes, whose first bit is the layer.
+        layers = np.sort(layer[kept]) if placed else layer[kept]
+        return Encoder(some, gradients, None, None, layers, *place, placed)
+
+    return alone
 
 
 def _start(run: Run, g: Gaussians) -> Start | None:
