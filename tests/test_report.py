@@ -315,15 +315,22 @@ def test_values_in_masks_stand_only_where_there_are_masks(inside, shown):
     row = {f"test.psnr{end}": value for end, value in ends.items()} | {"exposure": True}
     expected = dict.fromkeys(["test.psnr", f"test.psnr{shown}", f"test.psnr{shown}_corrected"])
     assert tables.table_columns([row]) == list(expected)
+    fit = {key.replace("test.", "all."): value for key, value in row.items()}
+    assert tables.table_columns([fit]) == [key.replace("test.", "all.") for key in expected]
 
 
-@pytest.mark.parametrize("tested", [True, False])
-def test_a_long_name_cuts_no_number_and_is_not_cut(tested):
+@pytest.mark.parametrize("exposure", [False, True])
+@pytest.mark.parametrize("views", terminal.SHOWN)
+def test_a_long_name_cuts_no_number_and_is_not_cut(views, exposure):
     name = "random (a [second] run in a folder with a long name" + "x" * 80 + ")"
     console = Terminal(width=80, record=True, file=io.StringIO())
-    shown = enumerate(terminal.SHOWN[tested])
-    row = {key: i / 8 if "ssim" in key else 30.125 + i for i, key in shown} | {"coverage": 100.0}
-    rows = [{"policy": policy, "images": 12} | row for policy in (name, "random")]
+    end = "_corrected" if exposure else ""
+    shown = [key if "ssim" in key else key + end for key in terminal.SHOWN[views]]
+    values = enumerate(shown)
+    row = {key: i / 8 if "ssim" in key else 30.125 + i for i, key in values} | {"coverage": 100.0}
+    about = {"images": 12, "exposure": exposure, "held_out.count": int(views != "all")}
+    about |= {key: i for i, key in enumerate(terminal.SHOWN[views])}  # with the exposure as it is
+    rows = [{"policy": policy, **about, **row} for policy in (name, "random")]
     terminal.print_quality(console, rows)
     text = console.export_text()
     assert all(text.count(tables.table_cell(key, value)) == 2 for key, value in row.items())

@@ -99,13 +99,15 @@ def progress_bar(stage: str = "reading", console: Terminal | None = None) -> Ite
 GROUPS = {"test": "test", "all": "all", "held_out": "held out"}  # in headings of `print_quality`
 
 SHOWN = {
-    True: ("test.psnr", "test.ssim", "test.psnr_mask", "held_out.psnr", "held_out.psnr_mask"),
-    False: (
+    "test": ("test.psnr", "test.ssim", "test.psnr_mask", "held_out.psnr", "held_out.psnr_mask"),
+    "held_out": (
         *("all.psnr", "all.ssim", "held_out.psnr", "held_out.ssim"),
         *("held_out.psnr_mask", "held_out.ssim_mask"),
     ),
+    "all": ("all.psnr", "all.ssim", "all.psnr_mask", "all.ssim_mask"),
 }
-"""Columns of `print_quality` with and without test views: as many as fit into 80 characters."""
+"""Columns of `print_quality` with test views, else with held-out views, and with neither: as many
+as fit into 80 characters."""
 
 MOST_NAMES = 8  # most seed views that are named in a line, not counted
 
@@ -130,10 +132,13 @@ def print_quality(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> None:
     from mgs.reports.tables import has_held_out, is_masked, table_cell
 
     tested, new = any("test.psnr" in row for row in rows), has_held_out(rows)
-    metrics = [key for key in SHOWN[tested] if new or not key.startswith("held_out.")]
+    views = "test" if tested else "held_out" if new else "all"
+    metrics = [key for key in SHOWN[views] if new or not key.startswith("held_out.")]
     metrics = [key for key in metrics if is_masked(rows) or "mask" not in key]
+    if exposure := any(row.get("exposure") for row in rows):
+        metrics = [f"{key}_corrected" if "psnr" in key else key for key in metrics]
     keys = ["images", *metrics, "coverage"]
-    caption = "n: images; PSNR in dB, coverage in %"
+    caption = f"n: images; PSNR in dB{' with fitted gains' if exposure else ''}, coverage in %"
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=caption)
     table.add_column("policy", overflow="fold")
     for key in keys:
@@ -147,9 +152,9 @@ def _heading(key: str, new: bool) -> str:
     views, _, metric = key.partition(".")
     if not metric:
         return {"coverage": "cover", "images": "n"}[key]
-    name, _, mask = metric.partition("_")
-    group = GROUPS[views] if new or views != "all" else "training"
-    return ("masked\n" if mask else "") + f"{name.upper()}\n{group}"
+    name, group = metric.partition("_")[0], GROUPS[views]
+    group = group if new or views != "all" else "training"
+    return ("masked\n" if "mask" in metric else "") + f"{name.upper()}\n{group}"
 
 
 def print_run(out: Path, state: "Checkpoint", metrics: dict[str, Any], console: Terminal) -> None:
@@ -158,6 +163,7 @@ def print_run(out: Path, state: "Checkpoint", metrics: dict[str, Any], console: 
 
     last = state.steps[-1]
     row = metrics_row(metrics["policy"], metrics) | {"coverage": 100 * last["coverage"]}
+    row |= {"exposure": bool(last.get("exposure"))}
     print_quality(console, [row])
     if "ended" in last and (last["ended"]["views"] or last["ended"]["reason"] != RunEnd.BUDGET):
         console.print(f"the run has ended: {why_ended(last['ended'])}", soft_wrap=True)

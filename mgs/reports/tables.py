@@ -94,6 +94,7 @@ def least_trained(runs: Iterable[Run], frames: Sequence[Frame]) -> list[Frame]:
 
 
 SETS = {"test": "test views", "all": "all views", "held_out": "held-out views"}
+TOLD_APART = ("test", "held_out")  # SETS of views that no run, or not each, was trained on
 WHOLE = {"psnr": "PSNR, {} (dB)", "ssim": "SSIM, {}"}
 OTHERS = {
     "psnr_corrected": "PSNR, {}, exposure fitted (dB)",
@@ -105,7 +106,7 @@ HEADERS = {"policy": "policy", "images": "images"}
 HEADERS |= {
     f"{key}.{metric}": heading.format(views)
     for key, views in SETS.items()
-    for metric, heading in (WHOLE if key == "all" else WHOLE | OTHERS).items()
+    for metric, heading in (WHOLE | OTHERS).items()
 }
 HEADERS |= {"coverage": "coverage (%)", "path": "path ({unit})", "ended": "ended by"}
 """Columns of the table: key in a row of `comparison_rows` -> heading."""
@@ -143,12 +144,16 @@ def metrics_row(label: str, metrics: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Keys of HEADERS of which some row has a value, in order."""
+    """Keys of HEADERS of which some row has a value, in order. Of all views only WHOLE, where some
+    are others than those that runs were trained on."""
     exposure, masked = any(row.get("exposure") for row in rows), is_masked(rows)
+    others = any(row.get(f"{views}.psnr") is not None for row in rows for views in TOLD_APART)
+    short = {f"all.{metric}" for metric in OTHERS if others}
     return [
         key
         for key in HEADERS
         if any(row.get(key) is not None for row in rows)
+        and key not in short
         and (masked or "mask" not in key)
         and ("corrected" not in key or (exposure and masked == ("mask" in key)))
     ]
@@ -156,7 +161,7 @@ def table_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def is_masked(rows: Sequence[Mapping[str, Any]]) -> bool:
     """Whether values in masks differ from those of whole images in some row."""
-    sets = [f"{views}.psnr" for views in ("test", "held_out")]
+    sets = [f"{views}.psnr" for views in SETS]
     return any(row.get(key) != row.get(f"{key}_mask") for row in rows for key in sets)
 
 
