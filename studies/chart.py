@@ -258,7 +258,7 @@ def sized(size: ChartSize, options: Namespace) -> ChartSize:
     rocks = rocks_of(options, ROCK_COUNT)
     if given:
         check_dataset(given)
-        if options.rocks or options.training or options.mesh:
+        if options.rocks or options.training or options.mesh or options.scene:
             raise mgs.InputError("--dataset: takes the place of rocks; leave out one of the two")
         rocks = (Rock(given.name),)
     kinds, repeats = tuple(names_of(options.only, KINDS)), options.repeats or size.repeats

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 import synthetic
 from program import study
-from refusals import occupied, refused
+from refusals import fails, occupied, refused
 
 from mgs.files import read_json, write_json
 from mgs.fit.settings import ALPHA_WEIGHT
@@ -222,6 +223,25 @@ def test_rocks_of_ones_own_take_the_place_of_the_others(tmp_path, capsys, monkey
     again = done(capsys, "setups", out, *options, **few)
     assert "dataset/one-" in again, "another file is another rock"
     assert "/two-" not in again
+
+
+def test_three_rocks_of_a_scene_take_the_place_of_the_others(tmp_path):
+    mine = tmp_path / "mine.toml"
+    mine.write_text('description = "mine"')
+    chosen = Namespace(mesh=[], scene=["henge", str(mine)], rocks=None, training=False)
+    rocks = case.rocks_of(chosen, 8)
+    assert [(rock.scene, rock.seed, rock.index, rock.mesh) for rock in rocks] == [
+        (scene, seed, 3 * k + i, None)
+        for k, scene in enumerate(("henge", "mine"))
+        for i, seed in enumerate((11, 12, 13))
+    ]
+    assert len({rock.name for rock in rocks}) == 6
+    made = Case(rocks[3], Size(8, 6, 2, 0)).cells()[0].arguments
+    assert (made["scene"], made["seed"], made["mesh"]) == (str(mine), 11, None)
+    chosen.scene = ["henge", "henge"]
+    fails("leave it out", case.rocks_of, chosen, 8)
+    chosen.scene = ["no-such"]
+    fails("choose one of", case.rocks_of, chosen, 8)
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from typing import Any
 
 import mgs
 from mgs.files import atomic_folder
+from mgs.resources import scene_path
 from mgs.run.inputs import file_digest
 from studies.frame.program import Options, at_least
 from studies.frame.statistics import MOST_ROCKS
@@ -25,21 +26,28 @@ MESH_SCENE = "boulder"
 
 @dataclass(frozen=True)
 class Rock:
-    """A scene file and the seed of its rock, or a mesh file and its hash in MESH_SCENE.
+    """A scene and the seed of its rock, or a mesh file in MESH_SCENE.
 
-    index: place among the rocks of a study, and seed of its runs.
+    index: place among the rocks of a study, and seed of its runs. file, digest: of a scene or mesh
+    of the options, which `scene` names, and its hash.
     """
 
     scene: str
     seed: int = 0
     index: int = 0
-    mesh: Path | None = None
+    file: Path | None = None
     digest: str = ""
+
+    @property
+    def mesh(self) -> Path | None:
+        """Mesh file; None: a rock of the scene."""
+        return self.file if self.file and self.file.suffix != ".toml" else None
 
     @property
     def name(self) -> str:
         """Folder name."""
-        return f"{self.scene}-{self.digest[:8] if self.mesh else self.seed}"
+        parts = self.scene, self.digest[:8], "" if self.mesh else str(self.seed)
+        return "-".join(filter(None, parts))
 
 
 _SEEDS = {
@@ -85,25 +93,38 @@ ROCKS: Options = {
         "type": Path,
         "help": "A rock of your own in place of the procedural ones; repeatable.",
     },
+    "--scene": {
+        "action": "append",
+        "default": [],
+        "help": "Three rocks of this scene (a name, or a .toml file) in their place; repeatable.",
+    },
 }
+
+SCENE_SEEDS = (11, 12, 13)
+"""Rocks of a scene of the options."""
 
 
 def rocks_of(options: Namespace, count: int) -> tuple[Rock, ...]:
-    """Rocks of the options --rocks, --training and --mesh; `count` of FRESH by default.
+    """Rocks of the options --rocks, --training, --mesh and --scene; `count` of FRESH by default.
 
-    Raises InputError if there are fewer, two meshes have one name, or a mesh cannot be read or is
+    Raises InputError if there are fewer, two files have one name, or a file cannot be read or is
     one too many.
     """
-    if len(options.mesh) > MOST_ROCKS:
+    own: list[tuple[str, Path, Sequence[int]]]
+    own = [("--mesh", mesh, [0]) for mesh in options.mesh]
+    own += [("--scene", scene_path(scene), SCENE_SEEDS) for scene in options.scene]
+    if len(own) > MOST_ROCKS:
         raise mgs.InputError(
-            f"--mesh: {len(options.mesh)} files; differences are tested over {MOST_ROCKS} rocks at "
+            f"--mesh, --scene: {len(own)} files; differences are tested over {MOST_ROCKS} at "
             "most, leave some out"
         )
     rocks: list[Rock] = []
-    for k, mesh in enumerate(options.mesh):
-        if mesh.stem in [rock.scene for rock in rocks]:
-            raise mgs.InputError(f"--mesh {mesh}: {NAMESAKE}")
-        rocks.append(Rock(mesh.stem, 0, k, mesh.resolve(), file_digest(mesh)))
+    for option, path, seeds in own:
+        if path.stem in [rock.scene for rock in rocks]:
+            raise mgs.InputError(f"{option} {path}: {NAMESAKE}")
+        for seed in seeds:
+            about = seed, len(rocks), path.resolve(), file_digest(path)
+            rocks.append(Rock(path.stem, *about))
     these: Sequence[Rock] = rocks or (TRAINING if options.training else FRESH)
     asked = options.rocks or len(rocks) or (len(these) if options.training else count)
     if asked > len(these):
@@ -179,7 +200,7 @@ class Case:
         if not self.given:
             rock = self.rock
             arguments = {
-                "scene": MESH_SCENE if rock.mesh else rock.scene,
+                "scene": MESH_SCENE if rock.mesh else str(rock.file or rock.scene),
                 "seed": rock.seed,
                 "changes": self.changes,
                 "size": asdict(self.size),
