@@ -319,6 +319,12 @@ def test_values_in_masks_stand_only_where_there_are_masks(inside, shown):
     assert tables.table_columns([fit]) == [key.replace("test.", "all.") for key in expected]
 
 
+@pytest.mark.parametrize(("held_out", "apart"), [(0, 10.0), (3, 0.0)])
+def test_test_views_far_behind_those_fitted_are_told_of(held_out, apart):
+    row = {"all.psnr": 30.0, "test.psnr": 20.0, "held_out.count": held_out}
+    assert terminal._apart(row) == apart
+
+
 @pytest.mark.parametrize("exposure", [False, True])
 @pytest.mark.parametrize("views", terminal.SHOWN)
 def test_a_long_name_cuts_no_number_and_is_not_cut(views, exposure):

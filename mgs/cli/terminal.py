@@ -109,6 +109,7 @@ SHOWN = {
 """Columns of `print_quality` with test views, else with held-out views, and with neither: as many
 as fit into 80 characters."""
 
+FAR_APART = 6.0  # dB that test views may have less than those fitted without a word; chosen
 MOST_NAMES = 8  # most seed views that are named in a line, not counted
 
 MEASURED = {
@@ -157,6 +158,13 @@ def _heading(key: str, new: bool) -> str:
     return ("masked\n" if "mask" in metric else "") + f"{name.upper()}\n{group}"
 
 
+def _apart(row: Mapping[str, Any]) -> float:
+    """PSNR of the views fitted less that of test views, dB, of a run that took all images."""
+    metric = "psnr_corrected" if row.get("exposure") else "psnr"
+    fitted, test = row.get(f"all.{metric}"), row.get(f"test.{metric}")
+    return 0.0 if fitted is None or test is None or row.get("held_out.count") else fitted - test
+
+
 def print_run(out: Path, state: "Checkpoint", metrics: dict[str, Any], console: Terminal) -> None:
     from mgs.reports.tables import metrics_row
     from mgs.run.ending import RunEnd, why_ended
@@ -165,6 +173,11 @@ def print_run(out: Path, state: "Checkpoint", metrics: dict[str, Any], console: 
     row = metrics_row(metrics["policy"], metrics) | {"coverage": 100 * last["coverage"]}
     row |= {"exposure": bool(last.get("exposure"))}
     print_quality(console, [row])
+    if (apart := _apart(row)) > FAR_APART:
+        cure = "too few photographs show what they show; take more between them"
+        console.print(
+            f"test views have {apart:.1f} dB less than those fitted: {cure}", soft_wrap=True
+        )
     if "ended" in last and (last["ended"]["views"] or last["ended"]["reason"] != RunEnd.BUDGET):
         console.print(f"the run has ended: {why_ended(last['ended'])}", soft_wrap=True)
     console.print(f"wrote {out}", soft_wrap=True)

@@ -171,7 +171,7 @@ class Source:
         """Up vector and the reason for it: given by the source, by the format, or estimated by
         `up_of_cameras`, whose InputError it raises."""
         if self.up is not None:
-            return self.up, "as the source says"
+            return self.up, "as GPS says" if self.place else "as the source says"
         if self.kind == "NeRF-synthetic":
             return PLUS_Z, "the rule of NeRF-synthetic data"
         estimate = up_of_cameras([_as_held(shot) for shot in self.shots])

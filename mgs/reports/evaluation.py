@@ -67,10 +67,12 @@ def evaluate_run(
 
 
 def drawn_test_view(run: Run, model: Gaussians) -> tuple[Path, float]:
-    """Draw a model in the first test view of a run, or without one in the first view it took, into
-    RUN/renders beside the truth; returns the picture's path and the PSNR, dB."""
+    """Draw a model in the middle test view of a run, or without one in the middle frame, into
+    RUN/renders beside the truth; returns the picture's path and the PSNR, dB. The first is often at
+    the edge of what photographs show."""
     tests, folder = run.dataset.test_views(), run.folder / "renders"
-    frame = tests.frames[0] if tests else run.dataset.frames[0]
+    views = (tests or run.dataset).frames
+    frame = views[len(views) // 2]
     folder = folder / TEST_FOLDER if tests else folder
     with listening(no_progress):  # of the fit at work
         metrics = evaluate_model(model, [frame], [], pictures=folder)
