@@ -238,6 +238,18 @@ def test_photographs_of_one_name_or_none_are_left_out(frames, tmp_path):
     assert (usable, [*dropped]) == (paths[:1], ["a_1.png", r"'b\n.png'"])
 
 
+def test_neighbours_by_gps_are_matched(frames, placed, monkeypatch):
+    """A blank picture, the first by name, has none."""
+    monkeypatch.setattr(photographs, "NEAR", 2)
+    folder = placed[0].root.parent / "again/matches"
+    names = [f"{k:06d}.jpg" for k in range(10)]
+    pairs = photographs._near_by_gps(SimpleNamespace(database=folder / "database.db", names=names))
+    eyes = np.stack([frame.camera.position for frame in frames])
+    apart = np.linalg.norm(eyes[:, None] - eyes, axis=2)
+    ones, others = np.transpose(pairs) - 1
+    assert np.allclose(apart[ones, others], np.sort(apart)[:, 1:3].ravel(), atol=0.01)
+
+
 def test_a_distance_gives_the_scale(placed):
     scaled = placed[1].with_distance("view 00.jpg, view 06.jpg, 10")
     eyes = {shot.name: shot.camera.position for shot in scaled.shots}

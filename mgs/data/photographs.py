@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mgs.data.colmap import image_count, is_whole_model, source_of
 from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, Spacing, frame_name, natural
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 KIND = "photographs"
 FEWEST = 3  # fewest photographs that can be placed
 EXHAUSTIVE = 150  # most photographs of which all pairs are matched; of more, those near in order
-NEAR = 10  # photographs after each in order it is matched with, and at distances of powers of 2
+NEAR = 10  # photographs after each in order it is matched with, at distances of powers of 2, by GPS
 LEAST_FEATURES = 100  # fewest features of a photograph that is neither blurred nor blank
 LEAST_MATCHES = 15  # matches that one epipolar geometry explains, for two photographs to overlap
 GPS_ERROR = 0.1  # largest median distance of cameras from GPS, over the extent, to scale by GPS
@@ -83,6 +84,8 @@ def read_photographs(
         )
     matcher = Matcher(paths, folder)
     matcher.match(_pairs(len(paths)))
+    if len(paths) > EXHAUSTIVE:
+        matcher.match(_near_by_gps(matcher))
     models = _models(matcher, len(paths))
     with closing(pycolmap.Database.open(matcher.database)) as database:
         numbers = {image.name: image.image_id for image in database.read_all_images()}
@@ -143,6 +146,36 @@ def _pairs(count: int) -> list[tuple[int, int]]:
     if count > EXHAUSTIVE:
         steps = [*range(1, NEAR + 1), *(2**k for k in range(4, count.bit_length()))]
     return [(one, one + step) for step in steps for one in range(count - step)]
+
+
+def _near_by_gps(matcher: Matcher) -> list[tuple[int, int]]:
+    """Pairs of photographs that are near by GPS, as neighbouring strips of a survey are: each with
+    the NEAR nearest. The database has their EXIF since they were matched by order."""
+    import pycolmap
+
+    with closing(pycolmap.Database.open(matcher.database)) as database:
+        gps = _gps(database)
+        numbers = {image.name: image.image_id for image in database.read_all_images()}
+    places = [place for place, name in enumerate(matcher.names) if numbers.get(name) in gps]
+    if len(places) < 2:
+        return []
+    geodetic = np.stack([gps[numbers[matcher.names[place]]] for place in places])
+    metres = pycolmap.GPSTransform().ellipsoid_to_enu(geodetic, *geodetic[0])
+    near = cKDTree(metres).query(metres, min(NEAR + 1, len(places)))[1]
+    pairs = [(one, other) for one, row in enumerate(near) for other in row if other != one]
+    return [(places[one], places[other]) for one, other in pairs]
+
+
+def _gps(database: Any) -> dict[int, np.ndarray]:
+    """Latitude, longitude and altitude of the photographs with GPS in their EXIF, by number."""
+    import pycolmap
+
+    wgs84 = pycolmap.PosePriorCoordinateSystem.WGS84
+    return {
+        prior.corr_data_id.id: prior.position.ravel()
+        for prior in database.read_all_pose_priors()
+        if prior.coordinate_system == wgs84 and np.isfinite(prior.position).all()
+    }
 
 
 def _models(matcher: Matcher, count: int) -> list[Any]:
@@ -257,12 +290,7 @@ def _to_gps(model: Any, database: Any) -> str | None:
     in EXIF; latitude, longitude and altitude of that, or None where they do not fit."""
     import pycolmap
 
-    wgs84 = pycolmap.PosePriorCoordinateSystem.WGS84
-    places = {
-        prior.corr_data_id.id: prior.position.ravel()
-        for prior in database.read_all_pose_priors()
-        if prior.coordinate_system == wgs84 and np.isfinite(prior.position).all()
-    }
+    places = _gps(database)
     images = [image for image in model.images.values() if image.has_pose]
     images = [image for image in images if image.image_id in places]
     if len(images) < FEWEST:
