@@ -94,7 +94,8 @@ def draw_suggestion(path: str | Path, run: Run, suggestion: Suggestion) -> None:
             top.imshow(picture(maps)[window])
             top.set_title(f"{k}: {view.name}\n{fill(view.way, 28)}", fontsize=8)
             shown = show_map(below, maps, "uncertainty", window, "cividis", vmin=0, vmax=1)
-            below.set_title(f"unknown {100 * view.unknown:.0f} %, gain {view.information_gain:.3f}")
+            gain = f"gain {view.information_gain:.3f}"
+            below.set_title(f"unknown {100 * view.unknown:.0f} %, {gain}", fontsize=8)
             top.set_axis_off()
             for axis in (top, below):
                 axis.set_anchor("N")
@@ -119,6 +120,7 @@ def _from_above(axis: Any, run: Run, suggestion: Suggestion) -> None:
     def level(points: Any) -> np.ndarray:
         return np.atleast_2d(points)[:, :2]
 
+    axis.margins(0.15)  # for names
     frames = taken_in_order(run)
     images = level([frame.camera.position for frame in frames])
     stops = [level(view.camera.position) for view in suggestion.plan]
