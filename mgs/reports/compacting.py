@@ -32,7 +32,7 @@ STEP = 1e-4  # linear RGB, by which the slope of sRGB is measured
 CLOSE = 50  # searches for a PSNR end at numbers of Gaussians that differ by 1/CLOSE
 THINNINGS = 4  # times that half of the Gaussians are removed
 AGAIN = 0.3  # learning rates of a further fit over those of a first one, which leave its optimum
-ROUNDS = 2  # most further fits of what the best file gives
+ROUNDS = 2  # most further fits of what the best file gives, while it is worse than the run's model
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,9 @@ def compact_run(
         raise InputError(f"{run.folder}: {least}; ask for more bytes or a lower psnr")
     again = fitted_again(run, shared) if run.settings.prior.is_dir() else None
     for _ in range(ROUNDS):
-        if again is None or len(best.file.model) < len(best.kept):  # one stands for several
-            break
+        lost = measured(best.file.model) < before  # what is better already would overfit
+        if again is None or not lost or len(best.file.model) < len(best.kept):
+            break  # or one Gaussian stands for several
         report("fitting what the file gives")
         one = coded(again(best.file, best.kept), best.kept)
         if one is None or one.worth <= best.worth:
