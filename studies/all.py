@@ -28,6 +28,7 @@ STAGES = {
     "setups": ("setups", "--rocks", "8"),
     "setups-8": ("setups", "--rocks", "8", "--images", "8"),
     "pools": ("pools", "--rocks", "8"),
+    "henge": ("pools", "--scene", "henge"),
     "oracle": ("oracle", "--rocks", "1"),
     "paper": ("paper", "--rocks", "8"),
     "table1": ("table1",),
