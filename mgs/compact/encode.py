@@ -76,8 +76,8 @@ class Encoder:
     g: NumPy fields. gradients: called once with the model. start: of the receiver's prior; None:
     positions are sent. kept: [N] indices of the Gaussians in the start, increasing; None: all.
     layer: [N] 0 or 1, sets of Gaussians of different kinds, where positions are sent. up, origin:
-    of the world of the data (`mgs.data.world.World`); g is upright. placed: of a file whose
-    positions g has; they stay.
+    of the world of the data (`mgs.data.world.World`); g is upright. placed: header of
+    the file that g was read from, whose positions it keeps.
     """
 
     def __init__(
@@ -101,8 +101,8 @@ class Encoder:
         self.places = start
         near = cKDTree(start.means).query(start.means, min(2, len(start.means)))[0].max(axis=-1)
         self.spacing = float(np.median(near)) or 1.0
-        self.low, self.extent = start.means.min(0), float(np.ptp(start.means, 0).max())
-        self.low = placed.low if placed else self.low
+        self.low = placed.low if placed else start.means.min(0)
+        self.extent = float(np.ptp(start.means, 0).max())
         self.axes = fixed(colour_axes(g.sh[self._codes(self.extent / 1e6)[0]]), AXES)
         quats = start.quats[self.kept]
         columns = columns_of(g, quats, self.axes)

@@ -28,8 +28,8 @@ MESH_SCENE = "boulder"
 class Rock:
     """A scene and the seed of its rock, or a mesh file in MESH_SCENE.
 
-    index: place among the rocks of a study, and seed of its runs. file, digest: of a scene or mesh
-    of the options, which `scene` names, and its hash.
+    index: place among the rocks of a study, and seed of its runs. file, digest: a scene or mesh
+    of the options and its hash; `scene` is then its name.
     """
 
     scene: str
@@ -96,7 +96,7 @@ ROCKS: Options = {
     "--scene": {
         "action": "append",
         "default": [],
-        "help": "Three rocks of this scene (a name, or a .toml file) in their place; repeatable.",
+        "help": "Three rocks of a scene (its name, or a .toml file) in place of them; repeatable.",
     },
 }
 
