@@ -1,5 +1,6 @@
 """Policies kept for comparison alone, as a user's own: `--policy studies/policies.py:NAME`."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from mgs.gaussians import sh_from_rgb
 from mgs.policy import criteria
 from mgs.policy.criteria import Array, observed
 from mgs.policy.poses import angles
-from mgs.run.policies import Directional, Information, Paper, each
+from mgs.run.policies import Cover, Directional, Information, Paper, each
 from mgs.splat import fisher, groups, render
 from mgs.splat.reference import sh_basis
 
@@ -122,11 +123,27 @@ def near_angle(candidates: Array, taken: Array, centre: Array) -> Array:
     return angle(candidates, taken, centre) + 2 * np.pi * near
 
 
+def _exchanged(views: Sequence[int], count: int, cost: Callable[[list[int]], Array]) -> list[int]:
+    """Plan of at most `count` of `views`: one view at a time is exchanged until nothing changes.
+
+    cost(others): value to be minimised, of the plan of these others and each of `views` [C]."""
+    plan: list[int] = []
+    before = None
+    while plan != before:
+        before = list(plan)
+        for k in range(min(count, len(views))):
+            others = plan[:k] + plan[k + 1 :]
+            costs = np.round(cost(others), 9)
+            costs[[views.index(view) for view in others]] = np.inf
+            plan[k : k + 1] = [views[int(np.argmin(costs))]]
+    return plan
+
+
 class Medoids:
     """Views whose directions represent those of all poses, planned together.
 
-    k-medoids: one view at a time is exchanged as long as that lowers the sum over the pool of the
-    squared angle to the nearest view. Scores are those of `angle`.
+    k-medoids: the sum over the pool of the squared angle to the nearest view is lowered by
+    exchanges. Scores are those of `angle`.
     """
 
     name, needs_fit, geometric = "medoids", False, True
@@ -142,22 +159,56 @@ class Medoids:
         if nearest is not None:
             return views
         positions = scene.positions(state.frames)
-        squared = np.round(angles(positions, positions, scene.centre) ** 2, 9)
+        squared = angles(positions, positions, scene.centre) ** 2
         first = squared[list(state.taken)].min(axis=0)
-        plan: list[int] = []
-        before = None
-        while plan != before:
-            before = list(plan)
-            for k in range(min(count, len(views))):
-                others = plan[:k] + plan[k + 1 :]
-                nearest_other = np.minimum(first, squared[others].min(axis=0, initial=np.inf))
-                cost = np.minimum(nearest_other, squared[views]).sum(axis=1)
-                cost[[views.index(view) for view in others]] = np.inf
-                plan[k : k + 1] = [views[int(np.argmin(cost))]]
-        return plan
+
+        def cost(others: list[int]) -> Array:
+            nearest_other = np.minimum(first, squared[others].min(axis=0, initial=np.inf))
+            return np.asarray(np.minimum(nearest_other, squared[views]).sum(axis=1))
+
+        return _exchanged(views, count, cost)
 
 
 medoids = Medoids()
+
+
+class CoverPlan(Cover):
+    """COVER with its views planned together: after them the whole pool shows least that is new.
+
+    The sum of COVER's scores over all poses is lowered by exchanges. Scores are COVER's."""
+
+    name = "cover-plan"
+
+    def plan(
+        self, scene: mgs.Scene, state: mgs.State, views: list[int], count: int, nearest: int | None
+    ) -> list[int]:
+        """Plan after the views taken; all views if each must be near the one before."""
+        if nearest is not None:
+            return views
+        key = "cover-plan", state.taken[: state.seeds], state.moved
+        novelty, weights = scene.once(key, lambda: _novelty(scene, state))
+        first = novelty[list(state.taken)].min(axis=0)
+
+        def cost(others: list[int]) -> Array:
+            left = np.minimum(first, novelty[others].min(axis=0, initial=1))
+            return np.array([(np.minimum(left, novelty[view]) * weights).sum() for view in views])
+
+        return _exchanged(views, count, cost)
+
+
+def _novelty(scene: mgs.Scene, state: mgs.State) -> tuple[Array, Array]:
+    """COVER's (1 - cos)/2 of each Gaussian in each pose, if another pose alone was taken; 1 where
+    that does not observe it [taken V, pose V, N]. Weights of the Gaussians in each pose [V,N]."""
+    surface, least = scene.surface(state), scene.surface_lam[0] / SH_C0**2
+    seen = np.stack([surface.seen(i) for i in range(len(state.frames))])
+    offset = surface.points - surface.positions[:, None]
+    towards = (offset / np.linalg.norm(offset, axis=2, keepdims=True)).astype(np.float32)
+    apart = np.stack([(1 - (towards * one).sum(axis=2)) / 2 for one in towards])
+    apart = np.where((seen > least)[:, None], apart, np.float32(1))
+    return apart, seen / seen.sum(axis=1, keepdims=True).clip(1e-12)
+
+
+cover_plan = CoverPlan()
 
 
 class Greedy:

@@ -11,7 +11,7 @@ DRAWN = {
 }
 """Set-ups with as many candidates as those they are named after, of twice as many frames."""
 
-POLICIES = (setups.LEADER, "cover", setups.RANDOM, *setups.BASELINES[1:3])
+POLICIES = (setups.LEADER, "cover", setups.RANDOM, *setups.BASELINES[1:4])
 
 tables = setups.tables
 

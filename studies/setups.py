@@ -46,7 +46,7 @@ Results = Mapping[str, Mapping[str, Any]]
 
 BASELINES = tuple(
     f"{Path(__file__).with_name('policies.py')}:{name}"
-    for name in ("greedy", "angle", "near_angle", "medoids")
+    for name in ("greedy", "cover_plan", "angle", "near_angle", "medoids")
 )
 """Rules that could embarrass the default, from `studies.policies`."""
 

@@ -1,6 +1,7 @@
 """Policies: laws of an information gain, and each policy against its formula."""
 
 from dataclasses import replace
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from splat.scenes import make_camera, make_gaussians
+from synthetic import sphere
 
 import mgs
 from mgs.colour import SH_C0, srgb_from_linear
@@ -250,6 +252,29 @@ def test_cover_and_completeness_look_at_what_was_not_observed():
     assert cover(scene, state, [1]) == pytest.approx([(1 - np.cos(0.5)) / 2])
     scene, state = known(surface_H, **given | {"seen": lambda view: np.zeros(2)})
     assert cover(scene, state, [1]) == 0
+
+
+def test_no_exchange_lowers_what_a_plan_of_cover_leaves_new():
+    """What the plan leaves is COVER's own scores, summed over all poses."""
+    rng, eyes = np.random.default_rng(1), sphere(12) * 4
+    seen = rng.random((12, 30)) * (rng.random((12, 30)) < 0.4)
+    scene, state = known(
+        np.zeros((30, 11)), positions=eyes, points=rng.random((30, 3)), seen=lambda view: seen[view]
+    )
+    scene.once = lambda key, make: make()
+    state.seeds, state.moved, state.frames = 1, None, range(12)
+    views = list(range(1, 12))
+
+    def new(plan):
+        after = SimpleNamespace(**vars(state) | {"taken": (0, *plan)})
+        return POLICIES["cover"](scene, after, range(12)).sum()
+
+    plan = studied.cover_plan.plan(scene, state, views, 4, None)
+    assert len(set(plan)) == 4
+    assert new(plan) < new(views[:4])
+    for k, view in product(range(4), sorted(set(views) - set(plan))):
+        assert new([*plan[:k], view, *plan[k + 1 :]]) >= new(plan) - 1e-6
+    assert studied.cover_plan.plan(scene, state, views, 4, nearest=5) == views
 
 
 def test_uniform_leaves_even_gaps_at_every_count():
