@@ -10,7 +10,7 @@ from mgs.colour import SH_C0
 from mgs.data.frames import in_image
 from mgs.gaussians import sh_from_rgb
 from mgs.policy import criteria
-from mgs.policy.criteria import Array, observed
+from mgs.policy.criteria import Array
 from mgs.policy.poses import angles
 from mgs.run.policies import Cover, Directional, Information, Paper, each
 from mgs.splat import fisher, groups, render
@@ -30,34 +30,6 @@ UNSEEN_VARIANCE = 1 / 12
 
 BLOCKS_AT_ONCE = 2048
 """Blocks whose determinants are computed together: 2 MB, which fit into a core's cache."""
-
-
-def t_optimal(F: Array) -> float:
-    """T-optimality, 1/l sum F: growth of the trace of the information; POp-GS calls it A."""
-    return float(F.mean(dtype=np.float64))
-
-
-def e_optimal(F: Array, H: Array, lam: Array) -> float:
-    """Increase of the smallest eigenvalue of H + lam; 0 while any parameter stays unobserved."""
-    return float((H + F + lam).min() - (H + lam).min())
-
-
-def i_optimal(scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
-    """I-optimality over all poses of the dataset (`predicted_variance`) [C]."""
-    H, lam, count = state.H, scene.lam, len(state.frames)
-    others = [i for i in range(count) if i not in state.taken]
-    mean = (H + sum(scene.information(state, i) for i in others)) / count
-    F = scene.information
-    return each(views, lambda i: predicted_variance(F(state, i), H, lam, mean))
-
-
-def predicted_variance(F: Array, H: Array, lam: Array, weight: Array) -> float:
-    """1/l sum weight [1/(H+lam) - 1/(H+F+lam)], the decrease of the predicted variance of a set of
-    views, per parameter (diagonal, linearised).
-
-    weight: mean information of these views [N,P]. With a weight of 1 it is A-optimality.
-    """
-    return float((weight * F / ((H + lam) * (H + F + lam))).mean(dtype=np.float64))
 
 
 def block_d(scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
@@ -221,12 +193,6 @@ class Greedy:
 
 
 greedy = Greedy()
-
-
-def completeness(seen: Array, surface_H: Array, surface_lam: Array) -> np.ndarray:
-    """Completeness after ActiveSplat (2024): squared blending weights of the surface's Gaussians
-    that no view has observed, summed [C]. Zero once all are, as with `coverage`."""
-    return np.asarray(seen[:, ~observed(surface_H, surface_lam)].sum(axis=1))
 
 
 # --- Published policies, as near as we get: see docs/results.md, The published protocol -----------
