@@ -63,12 +63,16 @@ def learn(
 ) -> State:
     """Capture the views that are new in `taken`, fit to all of `taken`, and sum their information.
 
-    before: the last state, where the fit starts; by default it starts at the prior, and all of
-    `taken` are seeds. frames: those of `before`, by default, or as they are before any capture.
-    choices: recorded in the result. surface: `State.surface` after the views in `taken`, if it was
-    measured when they were chosen. Raises DivergedError, and InputError if a frame cannot be read.
-    """
-    taken = tuple(taken)
+    before: the last state, whose views `taken` begins with, and where the fit starts; by default it
+    starts at the prior, and all of `taken` are seeds. frames: those of `before`, by default, or as
+    they are before any capture. choices: recorded in the result. surface: `State.surface` after the
+    views in `taken`, if it was measured when they were chosen. Raises DivergedError, and InputError
+    if `taken` are no different frames, or one cannot be read."""
+    taken, count = tuple(taken), len(scene.frames)
+    if not taken or len(set(taken)) < len(taken) or not set(taken) <= set(range(count)):
+        raise InputError(f"taken {list(taken)}: give different indices of the {count} frames")
+    if before and taken[: len(before.taken)] != before.taken:
+        raise InputError(f"taken {list(taken)}: begin with those of `before`, {before.taken}")
     seeds = before.seeds if before else len(taken)
     if frames is None:
         frames = before.frames if before else scene.frames

@@ -381,7 +381,8 @@ class Scene:
 
         among: indices to choose from, by default all. Raises InputError if they are fewer."""
         views = range(len(self.frames)) if among is None else among
-        if count > len(views):
-            raise InputError(f"scene: {count} seeds of {len(views)} poses; ask for fewer")
+        if not 1 <= count <= len(views):
+            most = len(views)
+            raise InputError(f"scene: {count} seeds of {most} poses; ask for 1 to {most}")
         positions = self.positions([self.frames[i] for i in views])
         return [int(views[k]) for k in poses.seed_views(positions, self.centre, count)]

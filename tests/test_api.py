@@ -1,5 +1,7 @@
 """The public names of `mgs`: present, lazy, typed, silent, and enough for the whole paper."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tiny
@@ -169,6 +171,22 @@ def test_a_loop_in_memory_gives_the_same_views_and_gaussians(dataset, prior, tmp
     np.testing.assert_array_equal(state.H, whole.H)
     np.testing.assert_array_equal(state.surface, whole.surface)
     assert state.gaussians == whole.gaussians
+    for taken in ((), (0, 0), (-1,), (12,)):
+        fails("give different indices of the 12 frames", mgs.learn, scene, taken)
+    fails("begin with those of `before`", mgs.learn, scene, state.taken[::-1], state)
+    fails("0 seeds of 12 poses", scene.seeds, 0)
+
+
+def test_a_loop_in_memory_takes_a_policy_as_a_run_does(dataset, prior):
+    model = mgs.ModelSettings(train={"passes": 1})
+    scene = mgs.Scene(mgs.load_dataset(dataset), mgs.load_prior(prior), model)
+    mission = mgs.Mission(seeds=3, budget=1)
+    *_, state = mgs.select_views(scene, highest, mission)
+    left = [i for i in range(12) if i not in state.taken[:3]]
+    assert state.taken[3] == max(left, key=lambda i: highest(scene.positions(scene.frames))[i])
+    assert mgs.choose(scene, state, "random") == mgs.choose(scene, state, mgs.Random())
+    state = replace(state, taken=tuple(range(12)))
+    fails("no view is left to choose", mgs.choose, scene, state, highest)
 
 
 def test_a_run_from_a_prior_in_memory_goes_on_from_its_folder(dataset, tmp_path):

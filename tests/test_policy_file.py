@@ -72,6 +72,17 @@ class Lost:
     def plan(self, *_):
         return None
 
+def large(views):
+    return [10**400] * len(views)
+
+def changes(F, lam):
+    lam += 1
+    return 0.0
+
+def changes_one(surface_F):
+    surface_F += 1
+    return 0.0
+
 from mgs.run.policies import Coverage
 """
 
@@ -138,6 +149,9 @@ def test_a_policy_that_cannot_be_loaded_is_one_line(dataset, file, tmp_path, nam
         ("broken", r"line 39 of .*mine\.py failed: ZeroDivisionError: division by zero"),
         ("few", r"returned scores of shape \(1,\) for 9 candidates"),
         ("words", r"returned no numbers \(.*'a'\); return one for each candidate"),
+        ("large", r"returned no numbers \(int too large"),
+        ("changes", r"line 66 of .*mine\.py failed: ValueError: output array is read-only"),
+        ("changes_one", r"line 70 of .*mine\.py failed: ValueError: output array is read-only"),
     ],
 )
 def test_a_policy_that_fails_keeps_the_steps_before(loaded, file, tmp_path, function, message):

@@ -67,9 +67,11 @@ def test_a_damaged_model_is_restored_from_the_checkpoint(dataset, prior, tmp_pat
 def test_the_hint_knows_options_with_an_equals_sign(tmp_path):
     (tmp_path / "config.json").touch()
     given = ["nbv", "data", f"--out={tmp_path}", "--capture-command=fly {pose}", "--seed", "3"]
-    again = f"; continue with: mgs nbv --resume {tmp_path} --capture-command 'fly {{pose}}'"
-    assert _hint(given) == again
-    assert _hint(["fit", "data", "--out", str(tmp_path)]) == again.partition(" --capture")[0]
+    again = f"; continue with: mgs nbv --resume {tmp_path}"
+    assert _hint(given) == f"{again} --capture-command 'fly {{pose}}'"
+    assert _hint([*given[:3], "--policy=mine.py:best"]) == f"{again} --policy mine.py:best"
+    assert _hint([*given[:3], "--policy", "random"]) == again
+    assert _hint(["fit", "data", "--out", str(tmp_path)]) == again
 
 
 def test_help_ends_with_the_settings_that_have_no_option(capsys):

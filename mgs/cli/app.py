@@ -178,9 +178,11 @@ def _hint(arguments: Sequence[str]) -> str:
     if command not in ("nbv", "fit") or not runs or not (Path(runs[-1]) / "config.json").is_file():
         return ""
     again = [
-        part  # what a run with live capture needs again
+        part  # what a run with live capture or a user's own policy needs again
         for option, value in pairwise(options)
-        if option.startswith("--capture-") or (option, value[:8]) == ("--set", "capture.")
+        if option.startswith("--capture-")
+        or (option, value[:8]) == ("--set", "capture.")
+        or (option == "--policy" and ".py:" in value)
         for part in (option, value)
     ]
     return f"; continue with: mgs nbv {shlex.join(['--resume', runs[-1], *again])}"

@@ -100,10 +100,7 @@ GROUPS = {"test": "test", "all": "all", "held_out": "held out"}  # in headings o
 
 SHOWN = {
     "test": ("test.psnr", "test.ssim", "test.psnr_mask", "held_out.psnr", "held_out.psnr_mask"),
-    "held_out": (
-        *("all.psnr", "all.ssim", "held_out.psnr", "held_out.ssim"),
-        *("held_out.psnr_mask", "held_out.ssim_mask"),
-    ),
+    "held_out": ("all.psnr", "all.ssim", "held_out.psnr", "held_out.ssim", "held_out.psnr_mask"),
     "all": ("all.psnr", "all.ssim", "all.psnr_mask", "all.ssim_mask"),
 }
 """Columns of `print_quality` with test views, else with held-out views, and with neither: as many

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,21 +12,27 @@ from mgs.policy import poses, tour
 from mgs.progress import Stage, report
 from mgs.run.flight import flight_of, free, reachable, views_left
 from mgs.run.policies import Policy
+from mgs.run.policy_file import policy_of
 from mgs.run.settings import Mission
 from mgs.scene import Scene, State
 
 
 def choose(
-    scene: Scene, state: State, policy: Policy, mission: Mission = Mission()
+    scene: Scene, state: State, policy: Any, mission: Mission = Mission()
 ) -> tuple[int, float]:
     """Choose the next view: (its index, its score), of the largest score / travel cost in reach.
 
     Of equal views, the one farthest from those taken is chosen. A policy with a `plan` chooses
     among the views of its plan. If the flight has a limit, the result is the first stop of
-    `plan_flight`. Raises InputError if the policy returns no valid score."""
+    `plan_flight`.
+
+    policy: a name, an object, or a function (docs/howto/policy.md). Raises InputError if it returns
+    no valid score, or no view is in reach."""
+    policy = policy_of(policy)
+    if not (views := reachable(scene, state, mission)):
+        raise InputError(f"{scene.dataset.root}: no view is left to choose; end the loop before")
     if mission.flies:
         return next(plan_flight(scene, state, policy, mission))
-    views = reachable(scene, state, mission)
     cost: np.ndarray | None = None
     plan = getattr(policy, "plan", None)
     if mission.travel is not None:
@@ -52,7 +59,7 @@ def rated(
     where, returned = f"policy {policy.name}: returned", policy(scene, state, views)
     try:
         scores = np.asarray(returned, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where} no numbers ({error}); return one for each candidate") from None
     if scores.shape != (len(views),):
         wrong = f"scores of shape {scores.shape} for {len(views)} candidates"

@@ -214,7 +214,8 @@ DETECTORS: dict[str, Detector] = {
     "prior": Detector(
         0.006,
         "the prior's outline and the masks disagree in {share:.1f} % of the covered pixels of the "
-        "median view (limit {most:.1f} %); check prior, masks and poses",
+        "median view (limit {most:.1f} %); check prior, masks and poses; if there are no masks, "
+        "make some (`mgs dataset masks`)",
     ),
     "residual": Detector(
         0.145,

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -13,19 +14,21 @@ from mgs.progress import report
 from mgs.run.choosing import choose
 from mgs.run.flight import allowed, reachable, seed_views, views_left
 from mgs.run.policies import Policy
+from mgs.run.policy_file import policy_of
 from mgs.run.settings import Mission
 from mgs.scene import Choice, Scene, State
 
 
 def select_views(
-    scene: Scene, policy: Policy, mission: Mission = Mission(), state: State | None = None
+    scene: Scene, policy: Any, mission: Mission = Mission(), state: State | None = None
 ) -> Iterator[State | Choice]:
     """Run the loop from the seeds, or from a state; yield the state after every fit, and after a
     pose was given up.
 
     The loop ends when the budget is spent, when no pose is in reach, or by `stop_uncertainty` or
-    `stop_gain`. After `stop_gain` the last item is the choice that was refused. Raises InputError
-    as `choose` and `learn`."""
+    `stop_gain`. After `stop_gain` the last item is the choice that was refused. policy: as in
+    `choose`. Raises InputError as `choose` and `learn`."""
+    policy = policy_of(policy)
     if state is None:
         seeds, frames = first_views(scene, mission)
         key = "seeds", tuple(seeds), frames

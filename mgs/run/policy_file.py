@@ -134,6 +134,14 @@ def _executed(path: Path, source: bytes) -> ModuleType:
     return module
 
 
+def _fixed(value: Any) -> Any:
+    """A view of an array that cannot be written, since the run goes on with it."""
+    if isinstance(value, np.ndarray):
+        value = value.view()
+        value.flags.writeable = False
+    return value
+
+
 class Own:
     """A function or an object as a policy; its arguments are passed by parameter name.
 
@@ -168,7 +176,9 @@ class Own:
             return [int(view) for view in result] if name == "plan" else result
 
     def __call__(self, scene: Scene, state: State, views: list[int]) -> Any:
-        shared = {p: ARGUMENTS[p](scene, state, views) for p in self.parameters if p in ARGUMENTS}
+        shared = {
+            p: _fixed(ARGUMENTS[p](scene, state, views)) for p in self.parameters if p in ARGUMENTS
+        }
         if "rng" in self.parameters:
             shared["rng"] = scene.rng(state, self.name)
         single = [p for p in self.parameters if p in OF_ONE]
@@ -178,7 +188,7 @@ class Own:
             scores = []
             for done, i in enumerate(views):
                 report(Stage.SCORE, done, len(views))
-                of_one = {p: OF_ONE[p](scene, state, i) for p in single}
+                of_one = {p: _fixed(OF_ONE[p](scene, state, i)) for p in single}
                 scores.append(self.function(**shared, **of_one))
             return scores
 
