@@ -239,7 +239,7 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
     ],
     (lambda d: synthetic.write_dataset(d, rocks=[]), "prior {d}"): [("no rock", nothing)],
     (nothing, BUILD): [
-        ("7 photographs without depth are too few; take at least 8", photographs(7)),
+        ("too few photographs without depth, 7; take at least 8", photographs(7)),
         ("the photographs are not of one object", apart),
         ("points lie in one cluster above the ground; give masks", no_object),
     ],

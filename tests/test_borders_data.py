@@ -120,7 +120,7 @@ def test_a_transforms_json_is_read_as_its_authors_mean_it(data):
         K = frame.camera.K
         assert np.allclose(shot.camera.K, np.diag([1, 1.25, 1]) @ K * [1, 1, 0] + K * [0, 0, 1])
         assert np.abs(shot.camera.world_to_camera - frame.camera.world_to_camera).max() < 2e-3
-    assert source.notes[0].startswith("12 rotations ")
+    assert source.notes[0] == "rotations that were rounded, and are made orthonormal: 12"
 
 
 @pytest.mark.parametrize("windows", [True, False])
@@ -311,7 +311,7 @@ def test_masks_and_test_views_without_effect_are_noticed(data, tmp_path, capsys)
     command("import", data.root, "--out", tmp_path / "out")
     errors = said(capsys)[1]
     assert "12 of 12 masks looked at are empty" in errors
-    assert "1 test views are no frame, as none" in errors
+    assert "test views that are no frame: 1, as none" in errors
     inverted = np.pad(np.zeros((20, 28), np.uint8), 2, constant_values=255)
     for frame in data.frames:
         Image.fromarray(inverted).save(frame.mask_path)

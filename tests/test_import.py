@@ -350,7 +350,7 @@ def test_images_may_be_smaller_than_their_cameras(dataset, tmp_path, kind, capsy
             image.resize((image.width // 4, image.height // 4)).save(frame.image_path)
     masks = ["--masks", dataset.root / "masks"] if kind == "COLMAP" else []
     command("import", source, "--out", tmp_path / "c", *masks)
-    assert f"{len(dataset)} images are smaller than their cameras" in said(capsys)[1]
+    assert f"cameras scaled to smaller images: {len(dataset)}" in said(capsys)[1]
     for one, other in zip(dataset.frames, load_dataset(tmp_path / "c").frames, strict=True):
         point = one.camera.camera_to_world[:3] @ [0.1, 0.2, 1, 1]
         pixels = [frame.camera.project(point[None])[0] for frame in (one, other)]
@@ -415,7 +415,7 @@ def test_a_pixel_of_all_ones_is_no_depth(tmp_path):
 def test_images_are_set_apart_as_test_views(dataset, tmp_path, capsys):
     arguments = ["import", dataset.root, "--test-every", "3", "--out"]
     out = tmp_path / "out"
-    apart = "3 test views, which are never fitted"
+    apart = "3 set apart as test views, never fitted"
     assert apart in output(capsys, *arguments, out)
     (out / "transforms.json").unlink()  # as if it had been interrupted before its end
     assert apart in output(capsys, *arguments, out)

@@ -221,12 +221,12 @@ def test_photographs_that_are_left_out_are_named_with_the_reason(placed):
     assert sum(placed[1].left_out.values()) == 6
     notes = " ".join(placed[1].notes)
     for names, why in {
-        "view 01.png, z copy.jpg": "are copies",
-        "blank.jpg": "are blurred",
-        "cut off.jpg, half.jpg": "cannot be read: damaged, or neither grey nor RGB",
-        "phone.heic": "are HEIC or raw: convert them to JPEG",
+        "view 01.png, z copy.jpg": "with the content or name of another",
+        "blank.jpg": "blurred or blank",
+        "cut off.jpg, half.jpg": "not readable: damaged, or neither grey nor RGB",
+        "phone.heic": "in HEIC or a raw format: convert to JPEG",
     }.items():
-        assert f"{names}, that {why}" in notes
+        assert f"{names}, {why}" in notes
 
 
 def test_photographs_of_one_name_or_none_are_left_out(frames, tmp_path):
@@ -274,7 +274,7 @@ def test_photographs_that_cannot_be_placed_are_refused(case, frames, tmp_path, c
     source = root / frames[0].image_path.name if case == "file" else root
     assert exit_code("import", source, "--out", tmp_path / "d") == 2
     words = {"one": "1 can be used", "apart": "can be placed", "file": "the folder of all"}
-    words |= {"tripod": "all were taken from one place", "none": "holds no photographs"}
+    words |= {"tripod": "all taken from one place", "none": "holds no photographs"}
     assert words[case] in said(capsys)[1]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]
 
@@ -452,7 +452,9 @@ def test_photographs_alone_are_one_command_to_the_next_picture(
     root.mkdir()
     for frame in frames[:7]:
         shutil.copy(frame.image_path, root)
-    assert f"{root}: 7 photographs" in refused(capsys, ["suggest", root, *few], site)
+    assert f"{root}: too few photographs without depth, 7;" in refused(
+        capsys, ["suggest", root, *few], site
+    )
     shutil.copy(frames[7].image_path, root)
     extract = pycolmap.extract_features
 

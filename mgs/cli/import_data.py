@@ -344,7 +344,7 @@ def _print_summary(
     lengths = "metres" if result.unit == "m" else f"{result.unit}s ({scale} gives metres)"
     parts = [
         placed if alone else f"{source.kind}: {len(frames)} frames of {total} images",
-        *([f"{apart} test views, which are never fitted"] if apart else []),
+        *([f"{apart} set apart as test views, never fitted"] if apart else []),
         *([f"left out {without}"] if without else []),
         *(f"{count} {what}" for what, count in counts.items() if count),
         *more,

@@ -122,19 +122,19 @@ def _usable(source: Path, paths: Sequence[Path]) -> tuple[list[Path], dict[str, 
         report("reading photographs", k, len(paths))
         name = path.relative_to(source).as_posix()
         if path.suffix.lower() in UNREAD:
-            dropped[name] = "that are HEIC or raw: convert them to JPEG"
+            dropped[name] = "in HEIC or a raw format: convert to JPEG"
             continue
         if not name.isprintable():
-            dropped[ascii(name)] = "whose names cannot be printed: rename them"
+            dropped[ascii(name)] = "with a name that cannot be printed: rename"
             continue
         try:
             read_rgba(path)
         except InputError:
-            dropped[name] = "that cannot be read: damaged, or neither grey nor RGB"
+            dropped[name] = "not readable: damaged, or neither grey nor RGB"
             continue
         same = {hashlib.sha256(path.read_bytes()).hexdigest(), frame_name(name)}
         if same & seen:
-            dropped[name] = "that are copies of others, or have their name"
+            dropped[name] = "with the content or name of another"
             continue
         seen |= same
         usable.append(path)
@@ -257,13 +257,13 @@ def _reasons(
         if any(number in others for others in placed[1:]):
             why[name] = "of another scene, or of a part that nothing joins to the largest"
         elif database.num_keypoints_for_image(number) < LEAST_FEATURES:
-            why[name] = "that are blurred or blank"
+            why[name] = "blurred or blank"
         elif number not in overlapping:
-            why[name] = "that overlap with no other"
+            why[name] = "without overlap with any other"
         elif not placed:
-            why[name] = "that share too few points, or all were taken from one place"
+            why[name] = "with too few shared points, or all taken from one place"
         else:
-            why[name] = "that share too few points with those placed"
+            why[name] = "with too few points in common with those placed"
     return why
 
 

@@ -116,7 +116,7 @@ class Source:
             camera, lens = fitted(shot.camera, shot.lens, shot.image)
             count += camera is not shot.camera
             shots.append(replace(shot, camera=camera, lens=lens))
-        note = f"{count} images are smaller than their cameras, which are scaled"
+        note = f"cameras scaled to smaller images: {count}"
         return replace(self, shots=shots, notes=(*self.notes, note)) if count else self
 
     def near_origin(self) -> Source:
@@ -262,8 +262,8 @@ def turned_by_exif(source: Source) -> Source:
         return replace(source, shots=[replace(shot, turned=True) for shot in source.shots])
     if not fits and (count := sum(tag > 1 for tag in tags)):
         note = (
-            f"EXIF turns {count} pictures, and their sizes do not show whether the poses are of "
-            "the turned ones; they are taken as stored"
+            f"pictures that EXIF turns are taken as stored: {count}; their sizes do not show "
+            "whether the poses are of turned ones"
         )
         return replace(source, notes=(*source.notes, note))
     return source
@@ -278,8 +278,8 @@ def natural(path: Path) -> list[tuple[int, int, str]]:
 LONG = 3.0  # time between two samples over the median, beyond which poses are not interpolated
 STILL = 0.01  # change of a pose, metres and radians, below which it is interpolated over any time
 NEARLY_RIGID = 1e-2  # largest error of an entry of a rotation that was rounded, which is mended
-# Note about poses that are NEARLY_RIGID, after their number.
-ROUNDED = "rotations are not quite rotations, as they were rounded; they are made orthonormal"
+# Note about poses that are NEARLY_RIGID, before their number.
+ROUNDED = "rotations that were rounded, and are made orthonormal"
 WITHOUT_POSE = "without a pose at its time"  # reason to leave an image out
 
 

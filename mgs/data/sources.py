@@ -105,7 +105,7 @@ def read_source(
         why = f"a file of it cannot be read ({error.strerror or error})"
         raise InputError(f"{source}: {why}; correct its name") from None
     if count := sum(shot.mended for shot in result.shots):
-        result = replace(result, notes=(f"{count} {ROUNDED}", *result.notes))
+        result = replace(result, notes=(f"{ROUNDED}: {count}", *result.notes))
     if result.kind != PHOTOGRAPHS:
         result = result.without(exclude)
     return turned_by_exif(result.fitted()).near_origin()
@@ -218,7 +218,7 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
     notes = []
     listed = {frame_name(record["file_path"]) for record in records}
     if unknown := {frame_name(name) for name in tests} - listed:
-        notes.append(f"{len(unknown)} test views are no frame, as {min(unknown)}")
+        notes.append(f"test views that are no frame: {len(unknown)}, as {min(unknown)}")
     cloud = path.parent / str(data["ply_file_path"]) if data.get("ply_file_path") else None
     no_cloud = cloud if cloud is not None and not cloud.is_file() else None
     return Source(

@@ -70,7 +70,7 @@ def check_enough(photographs: int, where: str = "prior") -> None:
     """Raise InputError for under LEAST_PHOTOGRAPHS. where: their folder or use, for the message."""
     if photographs < LEAST_PHOTOGRAPHS:
         cure = f"take at least {LEAST_PHOTOGRAPHS}, from all sides"
-        raise InputError(f"{where}: {photographs} photographs without depth are too few; {cure}")
+        raise InputError(f"{where}: too few photographs without depth, {photographs}; {cure}")
 
 
 def check_photographs(frames: Sequence[Frame], of_object: bool) -> None:
