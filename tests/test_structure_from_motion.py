@@ -400,8 +400,25 @@ def test_photographs_added_later_are_taken_with_the_same_camera(frames, tmp_path
         assert len(database.read_all_cameras()) == 1
 
 
+def test_a_call_matches_few_pairs_of_few_pictures(frames, tmp_path, monkeypatch):
+    """Ctrl-C waits for a call, and each indexes its pictures anew."""
+    matcher, calls = Matcher([frames[0].image_path], tmp_path / "m"), []
+    matcher.names = [f"{k}.png" for k in range(40)]
+
+    def listed(_, pairing_options, **options):
+        calls.append(pairing_options.match_list_path.read_text().split())
+
+    monkeypatch.setattr("pycolmap.match_image_pairs", listed)
+    monkeypatch.setattr(matcher, "_extract", lambda places: None)
+    matcher.match(combinations(range(40), 2))
+    assert sum(map(len, calls)) == 40 * 39
+    assert max(map(len, calls)) <= 2 * 16
+    assert sum(len(set(names)) for names in calls) < 12 * len(calls)
+
+
 def test_a_disk_that_is_too_small_is_one_line(frames, tmp_path, monkeypatch):
     """In place of the abort of pycolmap. What was done before is kept."""
+    monkeypatch.setattr("mgs.data.structure.PICTURES_AT_ONCE", 2)
     matcher = Matcher([frame.image_path for frame in frames], tmp_path / "m")
     with monkeypatch.context() as patched:
         patched.setattr("mgs.data.structure.FEATURE_BYTES", 1 << 50)
@@ -416,6 +433,7 @@ def test_a_disk_that_is_too_small_is_one_line(frames, tmp_path, monkeypatch):
 
 
 def test_an_import_that_fills_the_disk_keeps_its_features(frames, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("mgs.data.structure.PICTURES_AT_ONCE", 8)
     room = iter((1 << 40, 1 << 40, 1 << 20))
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=next(room)))
     assert exit_code("import", frames[0].image_path.parent, "--out", tmp_path / "d") == 2

@@ -1,6 +1,7 @@
 """Structure from motion by pycolmap. Seeds are fixed and pictures enter the database in order, so
 results repeat, but bundle adjustments of over 50,000 observations sum in any order."""
 
+import os
 import shutil
 import signal
 from collections import defaultdict
@@ -25,7 +26,9 @@ from mgs.progress import report
 WIDEST = 1000  # longer side, pixels, to which larger pictures are reduced for features
 FEATURES = 4096  # most features of a picture
 FEATURE_BYTES = 152  # of a feature in the database
-PICTURES_AT_ONCE, PAIRS_AT_ONCE = 8, 64  # of one call of pycolmap, then progress is reported
+# In one call of pycolmap, which Ctrl-C waits for: a picture for each core, of at most 8 in memory.
+PICTURES_AT_ONCE, PAIRS_AT_ONCE = min(8, len(os.sched_getaffinity(0))), 16
+TILE = 4  # pictures whose pairs with as many are matched together: a call indexes each once
 ROOM = 1 << 25  # bytes on disk that one call may take, twice as many as it keeps
 ALIKE = 16  # pictures that each is matched with where poses are known: the most alike by pose
 CLOUD = "sparse.ply"  # file of a dataset with its triangulated points
@@ -100,7 +103,8 @@ class Matcher:
         """Match pairs of pictures, given by their places; what is matched already is not again."""
         import pycolmap
 
-        every = sorted({(min(pair), max(pair)) for pair in pairs})
+        ordered = {(min(pair), max(pair)) for pair in pairs}
+        every = sorted(ordered, key=lambda pair: (pair[0] // TILE, pair[1] // TILE, pair))
         self.check_disk(len(self.names))
         self._extract(sorted({place for pair in every for place in pair}))
         options, listed = pycolmap.TwoViewGeometryOptions(), self.folder / "pairs.txt"
