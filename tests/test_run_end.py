@@ -18,6 +18,8 @@ from test_directional import squares
 from tiny import resume, run
 
 from mgs import load_dataset
+from mgs.errors import Notice
+from mgs.files import read_json, write_json
 from mgs.policy import criteria, tour
 from mgs.policy.directional import Views, precision
 from mgs.policy.pool_gains import PoolGains
@@ -157,6 +159,16 @@ def test_a_run_goes_on_where_images_of_candidates_changed(half_done):
     moved = root.rename(root.parent / "elsewhere")
     change_settings(out, dataset=str(moved))
     assert len(tiny.resume(out, load_dataset(moved)).steps) == 6
+
+
+def test_a_run_that_goes_on_with_another_version_says_so(half_done):
+    root, out = half_done
+    config = read_json(out / "config.json")
+    config["versions"] |= {"mgs": "0.0.9", "commit": "0", "python": "3.0"}
+    write_json(out / "config.json", config)
+    with pytest.warns(Notice, match=r"was started with mgs 0\.0\.9; the next steps may differ"):
+        tiny.resume(out, load_dataset(root))
+    tiny.resume(out, load_dataset(root))  # has no step to go, and warnings are errors
 
 
 def test_a_run_does_not_go_on_from_other_initial_gaussians(half_done):

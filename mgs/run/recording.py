@@ -1,7 +1,8 @@
 """Run the loop in a folder: checkpoints, times, warnings and evaluation around `select_views`."""
 
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,18 +11,25 @@ import numpy as np
 
 from mgs.data.dataset import Dataset
 from mgs.data.frames import capture_record
-from mgs.errors import InputError
+from mgs.errors import InputError, Notice
 from mgs.evaluation import psnr_measure
 from mgs.files import remove_file, working_in
 from mgs.fit.stopping import DivergedError
 from mgs.learning import captured
 from mgs.policy import criteria
 from mgs.progress import Progress, Stage, listening, report
+from mgs.provenance import versions
 from mgs.run import inputs
 from mgs.run.checks import Checks
 from mgs.run.ending import RunEnd, diverged, run_end
 from mgs.run.flight import flight_of, free, reachable
-from mgs.run.folder import Checkpoint, read_checkpoint, write_checkpoint, write_steps
+from mgs.run.folder import (
+    Checkpoint,
+    read_checkpoint,
+    read_config,
+    write_checkpoint,
+    write_steps,
+)
 from mgs.run.loop import mean_uncertainty, select_views
 from mgs.run.policies import Policy
 from mgs.run.policy_file import policy_of
@@ -72,10 +80,20 @@ def run(
                 write_checkpoint(out, checkpoint)
             on_step(checkpoint)
         if checkpoint is None or "ended" not in checkpoint.steps[-1]:
+            if other := other_versions(read_config(out).get("versions", {})):
+                text = f"{out}: was started with {other}; the next steps may differ from its own"
+                warnings.warn(Notice(text), stacklevel=2)
             checkpoint = _go_on(out, recorder, state, checkpoint, on_step)
         write_steps(out, checkpoint)
         write_ply(out / "gaussians.ply", to_source(checkpoint.gaussians, scene.dataset.world))
         return checkpoint
+
+
+def other_versions(began: Mapping[str, str]) -> str:
+    """Format those versions that results depend on and that are others now."""
+    now = versions()
+    names = [name for name in began if name not in ("commit", "python")]
+    return ", ".join(f"{name} {began[name]}" for name in names if began[name] != now.get(name))
 
 
 def asked_again(dataset: Dataset) -> Dataset:
