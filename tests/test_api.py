@@ -155,6 +155,11 @@ def test_a_fit_takes_a_loss_of_its_own_and_says_what_is_wrong_with_images(datase
     np.testing.assert_allclose(doubled.losses[0], 2 * usual.losses[0], rtol=1e-5)
     fails(r"target: .*\[12,16", mgs.fit_gaussians, model, cameras[:1], [np.ones((2, 2, 3))])
     fails("there are 2 cameras, but 1 targets", mgs.fit_gaussians, model, cameras, images[:1])
+    for wrong in ((images[0] * 255).astype(np.uint8), images[0] * np.nan):
+        fails("target: is .*give finite floats", mgs.fit_gaussians, model, cameras[:1], [wrong])
+    for option in ("lam", "learns"):
+        typo = {option: {"color": 1.0}}
+        fails("'color': unknown; choose", mgs.fit_gaussians, model, cameras, images, few, **typo)
 
 
 def test_a_loop_in_memory_gives_the_same_views_and_gaussians(dataset, prior, tmp_path):

@@ -157,14 +157,17 @@ def fit_gaussians(
         are at most.
     unfinished: file from which the fit continues, and which is written from time to time.
 
-    Raises InputError if a parameter is not finite, optimiser or loss are unknown, `start` has
-    another shape, means are to move without a rate, or a required alpha is missing.
+    Raises InputError if a parameter or a target is not finite, a target has integers, a name is
+    unknown, `start` has another shape, means are to move without a rate, or a required alpha is
+    missing.
     """
     settings = settings or TrainSettings()
     optimiser = row_named(OPTIMISERS, settings.optimiser, "optimiser")
     density = row_named(DENSITIES, settings.density, "density")
     if density and (settings.means != "free" or learns):
         raise InputError("density: Gaussians can move only where all learn free means")
+    for kind in (*(lam or ()), *(learns or ())):
+        row_named(dict.fromkeys(learned("free").values()), kind, "kind of parameter")
     kinds = learned(settings.means).values()
     if absent := [kind for kind in kinds if kind not in settings.rates]:
         raise InputError(

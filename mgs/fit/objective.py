@@ -294,6 +294,9 @@ def _photo(
         if target.ndim != 3 or target.shape[:2] != (camera.height, camera.width):
             size = f"[{camera.height},{camera.width},3 to 5], that of its camera"
             raise InputError(f"target: has shape {list(target.shape)}, expected {size}")
+        if target.dtype.kind != "f" or not np.isfinite(target).all():
+            cure = "give finite floats, linear RGB from 0 to 1"
+            raise InputError(f"target: is {target.dtype}, or has NaN or infinite values; {cure}")
         target = as_target(target, gaussians.linear, alpha_weight)
     return Photo(camera, camera_array(camera), target)
 
