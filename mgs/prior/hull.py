@@ -64,10 +64,11 @@ class _Contradiction(InputError):
 
     def __init__(self, what: str, frames: Sequence[Frame], odd: tuple[int, float, float]) -> None:
         self.place, self.share, usual = odd
+        name = frames[self.place].name
         super().__init__(
-            f"prior: {what}; frame {frames[self.place].name} cuts away {self.share:.0%} of the "
+            f"prior: {what}; frame {name} cuts away {self.share:.0%} of the "
             f"space that few other frames cut away (the median frame {usual:.0%}); "
-            "correct its mask or pose, or remove its photograph"
+            f"correct its mask or pose, or leave it out with `mgs import --exclude {name}`"
         )
 
 
