@@ -95,11 +95,13 @@ def test_the_page_says_what_the_files_say(page, runs):
 def test_the_page_of_a_fit_without_masks_speaks_of_photographs(page, runs, tmp_path):
     root = tmp_path / "fit"
     shutil.copytree(runs[0].parent, root)
-    change_settings(root / "d-optimal", dataset=str(root / "data"), budget=0)
+    change_settings(root / "d-optimal", dataset=str(root / "data"), seeds=6, budget=0)
     synthetic.edit(root / "data", lambda data: [f.pop("mask_path") for f in data["frames"]])
     write_page(tmp_path / "fit.html", [root / "d-optimal"])
     parsed, masked = read_page(tmp_path / "fit.html"), read_page(page)
     assert "Run of mgs fit on" in parsed.text
+    views = [view["name"] for view in parsed.data["runs"][0]["views"]]
+    assert views == sorted(views) != [frame.name for frame in open_run(runs[0]).taken]
     assert "The truth is the photograph." in parsed.text
     assert "object in front of black" not in json.dumps(parsed.data)
     assert "Runs of mgs nbv on" in masked.text

@@ -39,6 +39,7 @@ from mgs.reports.page_plots import (
 )
 from mgs.reports.tables import compare_runs, least_trained, shown_view, step_curves
 from mgs.run.folder import Run
+from mgs.run.suggest import taken_in_order
 
 PIXELS = 40e6  # most pixels of all pictures of a page: 4 to 8 MB of WebP
 WIDEST = 640  # most pixels across a picture
@@ -125,7 +126,7 @@ def draw_taken(album: Album, label: str, run: Run, tick: Callable[[], None]) -> 
     gaussians = run.gaussians
     lam = run.settings.regularisation(groups(gaussians.sh_degree), surface=True)
     H = np.zeros((len(gaussians), len(lam)))
-    for frame in run.taken:
+    for frame in taken_in_order(run):
         before = uncertainty(H, lam)
         H += fisher(gaussians, frame.camera)
         maps = view_maps(gaussians, frame.camera, {"before": before, "after": uncertainty(H, lam)})
@@ -183,7 +184,7 @@ def write_page(path: str | Path, folders: Sequence[str | PathLike[str]]) -> int:
             "runs": [
                 {
                     "label": label,
-                    "views": [_view(label, run, k, frame) for k, frame in enumerate(run.taken)],
+                    "views": [_view(label, run, *view) for view in enumerate(taken_in_order(run))],
                     "orbit": orbit_plot(label, run),
                     "time": timing_plot(label, run.steps),
                 }
