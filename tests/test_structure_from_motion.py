@@ -336,12 +336,15 @@ def test_an_interrupted_import_keeps_its_matches(frames, tmp_path, capsys, monke
     assert not (tmp_path / "d.unpacked").exists()
     words = [sys.executable, "-m", "mgs", "import", root, "--out", out]  # also in another process
     done = subprocess.run(words, capture_output=True, text=True)
-    assert done.stdout == f"{out} is finished already; --force makes it again\n"
+    cure = "--force makes it again, and places all photographs again"
+    assert done.stdout == f"{out} is finished already; {cure}\n"
     again = ["import", os.path.relpath(root), "--out", out, "--up", "auto", "--downscale", "2"]
     assert "is finished already" in output(capsys, *again)
     options = ["--up", "0,0,1"], ["--masks", root], ["--refine-poses"], ["--downscale", "1"]
     for words in options:
-        assert f"finished with another {words[0]};" in refused(capsys, [*again[:4], *words], out)
+        assert f"finished with another {words[0]}; {cure}" in refused(
+            capsys, [*again[:4], *words], out
+        )
     shutil.copytree(root, tmp_path / "other")
     assert "another source" in refused(capsys, ["import", tmp_path / "other", *again[2:]], out)
     record = read_json(out / "import.json")

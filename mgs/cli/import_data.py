@@ -113,7 +113,7 @@ def import_data(
     if record.get("kind") == PHOTOGRAPHS and "files" in record:  # to place them again takes long
         with progress_bar("reading", console):
             _check_unchanged(out, record, _stamp([*beside, *photographs()]))
-        console.print(f"{out} is finished already; --force makes it again", soft_wrap=True)
+        console.print(f"{out} is finished already; {_again(record)}", soft_wrap=True)
         return
     unpacked = Path(f"{os.path.abspath(out)}.unpacked")
     with (
@@ -259,7 +259,7 @@ def _check_same(out: Path, record: dict[str, Any], options: dict[str, Any]) -> N
         same = value, record.get(key, value)  # of downscale also what the default came to
         if options.get(key, value) not in same:
             what = key if key == "source" else f"--{key.replace('_', '-')}"
-            raise InputError(f"{out}: is finished with another {what}; --force makes it again")
+            raise InputError(f"{out}: is finished with another {what}; {_again(record)}")
 
 
 def _check_unchanged(out: Path, record: dict[str, Any], files: dict[str, Any]) -> None:
@@ -268,7 +268,15 @@ def _check_unchanged(out: Path, record: dict[str, Any], files: dict[str, Any]) -
     key = "sha256_of_files"
     if record.get(key, files[key]) != files[key]:
         why = "its pictures, masks, mesh or model have changed since"
-        raise InputError(f"{out}: is finished, and {why}; --force makes it again")
+        raise InputError(f"{out}: is finished, and {why}; {_again(record)}")
+
+
+def _again(record: dict[str, Any]) -> str:
+    """What --force does to a finished import of this record, in words."""
+    from mgs.data.photographs import KIND as PHOTOGRAPHS
+
+    placed = ", and places all photographs again" if record.get("kind") == PHOTOGRAPHS else ""
+    return f"--force makes it again{placed}"
 
 
 def _triangulated(
