@@ -289,7 +289,7 @@ def _print(console: Terminal, result: Suggestion, run: Run, crossed: str, place:
     )
     if result.refined:
         console.print("refined: gain of the plan from {:.4f} to {:.4f}".format(*result.refined))
-    if result.certificate:
+    if result.certificate and len(result.plan) > 1:  # the best of the table needs no proof
         console.print(result.certificate.sentence(), soft_wrap=True)
     if crossed:
         console.print(f"{crossed}; give flight.no_fly to plan around it")
