@@ -27,7 +27,7 @@ from mgs.compact.encode import Compact
 from mgs.errors import Notice
 from mgs.evaluation import render_view
 from mgs.plotting import NO_GRID, crop, drawing
-from mgs.reports.compacting import ROUNDS, compact_run, encoding, fitted_again, thinned
+from mgs.reports.compacting import ROUNDS, compact_run, encoding, refitting, settled, thinned
 from mgs.run.folder import Run
 from mgs.run.nbv import start_fit
 from mgs.splat_files import FORMATS, load_gaussians, write_gaussians
@@ -102,16 +102,17 @@ def code(root: Path, out: Path, dataset: str, prior: str, tool: str) -> dict[str
     """Task: fit a model; write it by every coder. Returns the rows of its files."""
     run, data = fitted(root, out, dataset, prior), mgs.load_dataset(root / dataset)
     g, rows = run.gaussians, [_row("whole model", 0, run.gaussians, data)]
-    models = [(g, np.arange(len(g))), *thinned(run, whole=False)]
+    models, fit = [(g, np.arange(len(g))), *thinned(run, whole=False)], refitting(run)
     for name, shared in ((WITH, True), (ALONE, False)):
-        encoder, again = encoding(run, shared), fitted_again(run, shared)
+        encoder = encoding(run, shared)
         encoders = [(encoder(*model), model[1]) for model in models]
         coded = [(one.file(scale), kept) for one, kept in encoders for scale in SCALES]
         mine = [_row_of(name, file, data) for file, _ in coded]
         best = pareto_front([row["kB"] for row in mine], [row["psnr"] for row in mine])
         for (file, kept), chosen in zip(coded, best, strict=True):
             for _ in range(ROUNDS if chosen else 0):
-                file = again(file, kept).file(file.header.scale)
+                again = encoder(fit(file.model), kept, file.header)
+                file = settled(again.plan(file.header.scale), fit)
                 mine.append(_row_of(name, file, data))
         rows += mine
     # Not every format says in which space colours are blended, or that splats are antialiased.

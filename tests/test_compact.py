@@ -16,7 +16,7 @@ from refusals import fails, refused
 from test_render_command import CAMERAS, gaussians
 
 import mgs
-from mgs import load_prior, open_run, render, vjp
+from mgs import load_prior, open_run, render, save_prior, vjp
 from mgs.colour import srgb_from_linear
 from mgs.compact import allocate, coder, container, decode
 from mgs.compact.columns import Start, columns_of, gaussians_of, gradient_of, start_of
@@ -28,6 +28,7 @@ from mgs.errors import InputError, Notice
 from mgs.evaluation import render_view
 from mgs.reports import compacting
 from mgs.rotation import rotmat_from_quat
+from mgs.run.nbv import start_fit
 from mgs.splat_files import load_gaussians, upward
 from mgs.splat_places import from_source
 
@@ -447,12 +448,63 @@ def test_what_a_file_gives_is_fitted_and_written_again(dataset, prior, tmp_path,
     models = list(compacting.thinned(run, whole=shared))
     files = [compacting._fitted(encoder(*model), size, None) for model in models]
     made = compacting.compact_run(run, size, shared=shared)
+    assert len(made.data) <= size
     assert made.psnr[1] > max(measured(file.model) for file in files if file) + 0.02
-    again = compacting.fitted_again(run, shared)
+    fit = compacting.refitting(run)
     for file, (_, kept) in zip(files, models, strict=True):
         if file and len(file.model) == len(kept):
-            other = again(file, kept).file(file.header.scale)
-            assert np.array_equal(other.model.means, file.model.means)
+            plan = encoder(fit(file.model), kept, file.header).plan(max(file.header.scale, 0.1))
+            model = plan.file(plan.values).model
+            np.testing.assert_array_equal(model.means, file.model.means)
+            assert plan.model(plan.whole(plan.values)) == model
+            np.testing.assert_allclose(plan.model(plan.values_of(model)).sh, model.sh, atol=1e-3)
+    psnr = made.psnr[0] - 1
+    smaller = compacting.compact_run(run, psnr=psnr, shared=shared)
+    assert psnr <= smaller.psnr[1] < made.psnr[1]
+    assert len(smaller.data) < len(made.data)
+
+
+def test_more_and_more_numbers_are_held_while_the_rest_is_fitted(dataset, prior, tmp_path):
+    """The fit is a change of every number that it may learn."""
+    run, calls = small_run(dataset, prior, tmp_path / "run"), []
+    plan = compacting.encoding(run, shared=True)(run.gaussians, np.arange(40)).plan(0.1)
+    steps = plan.header.last_steps[plan.tree.band]
+
+    def fit(g, rate, learn, passes=None):
+        calls.append((g, rate, tuple(learn), passes))
+        moved = replace(g, sh=g.sh * 1.2, logit_opacities=g.logit_opacities + 0.3)
+        return replace(moved, log_scales=g.log_scales - 0.1 * ("scale" in learn))
+
+    file = compacting.settled(plan, fit)
+    zero = plan.whole(plan.values) == 0
+    assert 0.05 < zero.mean() < 0.95
+    shares = []
+    for g, *_ in calls:
+        values = plan.values_of(g)
+        apart = abs(values - plan.whole(values)) / steps
+        assert apart[zero].max() < 0.01
+        shares.append((apart < 0.01).mean())
+    assert all(np.diff(shares) > 0.02)
+    assert shares[-1] == 1
+    assert all(np.diff([rate for _, rate, *_ in calls[:-1]]) < 0)
+    assert {passes for *_, passes in calls[:-1]} == {1}
+    before, _, learn, _ = calls[-1]
+    assert learn == ("colour", "opacity")
+    np.testing.assert_allclose(file.model.log_scales, before.log_scales, atol=1e-5)
+    assert file.model.logit_opacities.mean() > before.logit_opacities.mean() + 0.1
+
+
+@pytest.mark.slow
+def test_fits_between_roundings_make_files_better(tmp_path):
+    """A rock of 1,500 Gaussians, in as many bytes or fewer."""
+    data = mgs.synth_orbit(tmp_path / "data", frames=12, size=(64, 48), spp=4)
+    prior = save_prior(tmp_path / "prior", mgs.build_prior(data, gaussians=1500))
+    run = mgs.resume_nbv(start_fit(data.root, tmp_path / "run", prior=prior))
+    g, measured = run.gaussians, compacting._measure(run)
+    plan = compacting.encoding(run, shared=True)(g, np.arange(len(g))).plan(0.1)
+    plain, settled = plan.file(plan.values), compacting.settled(plan, compacting.refitting(run))
+    assert len(settled) <= len(plain)
+    assert measured(settled.model) > measured(plain.model) + 0.2
 
 
 def test_thinning_goes_on_from_fitted_gaussians_only_if_half_are_gone(

@@ -23,6 +23,7 @@ LOGITS = (-6.0, 7.0)  # range of opacity logits: 0.0025, below ALPHA_MIN, to 0.9
 FINE = 10  # binary digits of a means' grid below the spacing of a prior
 UNIT = 20  # binary digits of normals. The grids hide the last bits, in which machines differ.
 TINY = 1e-300  # added to a divisor: 0 / TINY is 0
+SHAPE = slice(-7, -1)  # columns of scales and rotation
 SWEEPS = 5  # sweeps of Jacobi's rotations; after so many nothing is left off the diagonal
 # Difference of log-scales below which gradients by a turn are rounding errors. The gradient by M_ij
 # is too small there: 0 for equal scales, where M_ij changes the picture but a turn does not.

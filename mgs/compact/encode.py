@@ -123,6 +123,11 @@ class Encoder:
     def file(self, scale: float) -> Compact:
         """The file whose last layer rounds each coefficient at an expected cost of scale^2 / 12,
         (pixel value)^2."""
+        plan = self.plan(scale)
+        return plan.file(plan.values)
+
+    def plan(self, scale: float) -> "Plan":
+        """Everything about a file of this scale but its whole numbers."""
         grid = scale / np.sqrt(self.of_means + 1e-30) if self.start is None else 0.0
         grid = float(np.clip(grid, self.spacing * FINEST, self.spacing * WIDEST))
         grid = max(grid, 2 * self.extent / 2**AXIS_BITS)
@@ -143,7 +148,6 @@ class Encoder:
         for number in np.unique(layer):
             centres[number] = columns[layer == number].mean(0)
         centres = fixed(centres, CENTRES)
-        values = tree.forward(columns - centres[layer])
         slopes = tree.forward(self.gradients[order].reshape(len(order), -1), adjoint=True)
         h = allocate.sensitivity(slopes.reshape(self.gradients.shape).swapaxes(0, 1), tree.band)
         start, g = self.places, self.g
@@ -158,27 +162,72 @@ class Encoder:
             payloads, moves = _positions(header, codes, among if self.start else None)
         # What stands for a part lies elsewhere: its error, as far as that is linear.
         worth = {key: self.of_means * move for key, move in moves.items()}
-        return self._packed(header, payloads, worth, tree, values, h)
+        means = start.means[self.kept]
+        if self.start is None:  # those of the file
+            means = (self.low + (cells_of(codes)[0] + 0.5) * grid)[np.argsort(order)]
+        return Plan(self, header, payloads, worth, tree, order, means, h)
 
-    def _packed(
-        self,
-        header: Header,
-        payloads: dict[Key, bytes],
-        worth: dict[Key, float],
-        tree: Tree,
-        values: np.ndarray,
-        h: np.ndarray,
-    ) -> Compact:
-        """File of coefficients [N,C]. payloads, worth: of positions; those of the rest are added.
-        h: [BANDS,C]."""
+
+@dataclass(frozen=True)
+class Plan:
+    """Positions, tree and steps of a file, and what its coefficients [N,C] mean.
+
+    payloads, worth: of positions. order: [N] of the encoder's Gaussians along the tree. means:
+    [N,3] of the encoder's Gaussians, as a reader gets them. h: as in
+    `mgs.compact.allocate.sensitivity`."""
+
+    encoder: Encoder
+    header: Header
+    payloads: dict[Key, bytes]
+    worth: dict[Key, float]
+    tree: Tree
+    order: np.ndarray
+    means: np.ndarray
+    h: np.ndarray
+
+    @property
+    def _quats(self) -> np.ndarray:
+        """Axes [N,4] of the columns of the encoder's Gaussians."""
+        return self.encoder.places.quats[self.encoder.kept]
+
+    @property
+    def _centres(self) -> np.ndarray:
+        """Centres [N,C] of their columns."""
+        return self.header.centres[self.encoder.places.layer[self.encoder.kept]]
+
+    @property
+    def values(self) -> np.ndarray:
+        """Coefficients of the encoder's model."""
+        return self.tree.forward((self.encoder.columns - self._centres)[self.order])
+
+    def values_of(self, g: Gaussians) -> np.ndarray:
+        """Coefficients of other values of the encoder's Gaussians."""
+        columns = columns_of(g, self._quats, self.encoder.axes)
+        return self.tree.forward((columns - self._centres)[self.order])
+
+    def model(self, values: np.ndarray) -> Gaussians:
+        """Model of coefficients, where `whole` as a reader gets it, in the encoder's order."""
+        columns = self.tree.inverse(values)[np.argsort(self.order)] + self._centres
+        g = gaussians_of(columns, self.means, self._quats, self.encoder.axes)
+        return replace(g, antialiased=self.encoder.g.antialiased, linear=self.encoder.g.linear)
+
+    def whole(self, values: np.ndarray) -> np.ndarray:
+        """Coefficients as a reader gets them."""
+        steps = self.header.last_steps[self.tree.band]
+        return steps * allocate.rounded(values, steps, 1)[0]
+
+    def file(self, values: np.ndarray) -> Compact:
+        """File of coefficients."""
+        header, tree, h = self.header, self.tree, self.h[self.tree.band]
+        payloads, worth = dict(self.payloads), dict(self.worth)
         steps = header.last_steps[tree.band]
         parts = allocate.rounded(values, steps, header.layers)
         shown = [steps * restored(part, header.layers - 1 - k) for k, part in enumerate(parts)]
-        gains = allocate.gain(values, shown, h[tree.band])
+        gains = allocate.gain(values, shown, h)
         parts = [np.zeros_like(parts[0]), *parts]
         for tile in range(header.tiles + 1):
             rows = rows_of(tree, tile)
-            for group, of in groups(self.g.sh.shape[1]).items():
+            for group, of in groups(self.encoder.g.sh.shape[1]).items():
                 for layer, pair in enumerate(pairwise(parts)):
                     before, numbers = (part[rows, of] for part in pair)
                     if numbers.any():
@@ -187,11 +236,11 @@ class Encoder:
                         worth[key] = float(gains[layer][rows, of].sum())
         sizes = {key: len(packet(key, data)) for key, data in payloads.items()}
         keys = allocate.in_order(worth, sizes)
-        header = replace(header, packets=len(keys))
-        expected = float((h[tree.band] * np.square(values)).sum() - gains.sum())
-        if self.start is None:
-            expected += self.of_means * header.grid**2 / 12 * 3 * header.n
-        return Compact(header, {key: payloads[key] for key in keys}, self.start, expected)
+        header, start = replace(header, packets=len(keys)), self.encoder.start
+        expected = float((h * np.square(values)).sum() - gains.sum())
+        if start is None:
+            expected += self.encoder.of_means * header.grid**2 / 12 * 3 * header.n
+        return Compact(header, {key: payloads[key] for key in keys}, start, expected)
 
 
 def _numbers(numbers: np.ndarray, before: np.ndarray) -> bytes:

@@ -1,6 +1,6 @@
 """A run's model in so many bytes, or with so much quality: `mgs export RUN --bytes`, `--psnr`."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from mgs.colour import srgb_from_linear
-from mgs.compact.columns import Start, start_of
+from mgs.compact.columns import SHAPE, Start, start_of
 from mgs.compact.container import Header
-from mgs.compact.encode import Compact, Encoder
+from mgs.compact.encode import Compact, Encoder, Plan
 from mgs.errors import InputError
 from mgs.evaluation import psnr_over
-from mgs.gaussians import Gaussians
+from mgs.gaussians import KINDS, Gaussians
 from mgs.policy.criteria import PRUNE_NOISE
 from mgs.progress import report
 from mgs.reports.exporting import as_imported, in_srgb, to_y_up
@@ -33,6 +33,10 @@ CLOSE = 50  # searches for a PSNR end at numbers of Gaussians that differ by 1/C
 THINNINGS = 4  # times that half of the Gaussians are removed
 AGAIN = 0.3  # learning rates of a further fit over those of a first one, which leave its optimum
 ROUNDS = 2  # most further fits of what the best file gives, while it is worse than the run's model
+HOLDS = 5  # passes of `settled` in which ever more coefficients are held
+GENTLE = 0.1  # learning rates there over those of a first fit: what is left is as small as a step
+FALL = 0.1  # factor by which they fall in these passes
+SPARE = 0.9  # share of the bytes, or dB, that a settled file spares, which the next one spends
 
 
 @dataclass(frozen=True)
@@ -56,35 +60,42 @@ def compact_run(
     measured, encoder = _measure(run), encoding(run, shared)
     before = measured(run.gaussians)
     _check_reachable(str(run.folder), psnr, before)
-    enough = None if psnr is None else lambda model: measured(model) >= psnr
+    aim = float((size if psnr is None else psnr) or 0)
+    enough = None if psnr is None else lambda model: measured(model) >= aim
 
-    def coded(encoder: Encoder, kept: np.ndarray) -> _Coded | None:
+    def worth(file: Compact) -> float:
+        return measured(file.model) if size else -len(file)
+
+    def steps(encoder: Encoder) -> Compact | None:
         report("choosing steps")
-        file = _fitted(encoder, size, enough)
-        if file is None:
-            return None
-        return _Coded(measured(file.model) if size else -len(file), file, kept)
+        return _fitted(encoder, int(aim) if size else None, enough)
 
     best: _Coded | None = None
     for some, kept in thinned(run, whole=shared):
-        one = coded(encoder(some, kept), kept)
-        if one is not None:
+        if file := steps(encoder(some, kept)):
+            one = _Coded(worth(file), file, kept)
             best = max(best or one, one, key=lambda coded: coded.worth)
-            if size and one.file.header.scale < 1.02 * SCALES[0]:  # all fits at the finest steps
+            if size and file.header.scale < 1.02 * SCALES[0]:  # all fits at the finest steps
                 break
     if best is None:
         least = "it takes more bytes to place its Gaussians" if size else "no steps are fine enough"
         raise InputError(f"{run.folder}: {least}; ask for more bytes or a lower psnr")
-    again = fitted_again(run, shared) if run.settings.prior.is_dir() else None
+    fit = refitting(run) if run.settings.prior.is_dir() else None
     for _ in range(ROUNDS):
         lost = measured(best.file.model) < before  # what is better already would overfit
-        if again is None or not lost or len(best.file.model) < len(best.kept):
+        if fit is None or not lost or len(best.file.model) < len(best.kept):
             break  # or one Gaussian stands for several
         report("fitting what the file gives")
-        one = coded(again(best.file, best.kept), best.kept)
-        if one is None or one.worth <= best.worth:
+        again = encoder(fit(best.file.model), best.kept, best.file.header)
+        if (plain := steps(again)) is None:
             break
-        best = one
+        other, kept = settled(again.plan(plain.header.scale), fit), best.kept
+        for file in (plain, other):  # the latter is larger where steps are much finer than the fit
+            spare = (size or 0) - len(file) if psnr is None else psnr - measured(file.model)
+            file = file.first(size) if size else file
+            if file.payloads if size else spare <= 0:
+                best = max(best, _Coded(worth(file), file, kept), key=lambda coded: coded.worth)
+        aim += SPARE * max(spare, 0.0) if size else SPARE * min(spare, 0.0)
     return Compacted(bytes(best.file), len(best.file.model), (before, measured(best.file.model)))
 
 
@@ -113,23 +124,50 @@ def _check_reachable(model: str, psnr: float | None, most: float) -> None:
         raise InputError(f"psnr {psnr:g}: {own}; ask for less")
 
 
-def fitted_again(run: Run, shared: bool) -> Callable[[Compact, np.ndarray], Encoder]:
-    """A function (file, its indices) -> encoder of what the file gives, fitted once more."""
-    again, encoder = refitting(run), encoding(run, shared)
-    return lambda file, kept: encoder(again(file.model), kept, file.header)
-
-
-def refitting(run: Run) -> Callable[[Gaussians], Gaussians]:
-    """A function that fits Gaussians to the views taken once more, with themselves as the prior."""
+def refitting(run: Run) -> Callable[..., Gaussians]:
+    """A function fit(g, rate, learn, passes) that fits Gaussians to the views taken once more, with
+    themselves as the prior. rate: learning rates over those of a first fit. learn: kinds of
+    parameters that change. passes: most passes; None: as in a first fit."""
     from mgs.fit.fitting import fit_gaussians
 
     scene, frames = Scene(run.dataset, run.prior, run.settings), run.taken
     gains = scene.measured_exposure(frames) if run.settings.exposure else None
     targets, lam = scene.targets(frames, gains), run.settings.lam_by_kind(scene.groups)
-    rates = {kind: AGAIN * rate for kind, rate in run.settings.train.rates.items()}
-    train = run.settings.train.model_copy(update={"density": "fixed", "rates": rates})
-    given = [frame.camera for frame in frames], targets, train
-    return lambda g: fit_gaussians(g, *given, cache=scene.cache, lam=lam).gaussians
+    cameras, train = [frame.camera for frame in frames], run.settings.train
+
+    def fit(
+        g: Gaussians,
+        rate: float = AGAIN,
+        learn: Collection[str] = tuple(train.rates),
+        passes: int | None = None,
+    ) -> Gaussians:
+        rates = {kind: rate * (kind in learn) * first for kind, first in train.rates.items()}
+        changes = {"density": "fixed", "rates": rates, "passes": passes or train.passes}
+        further = train.model_copy(update=changes)
+        return fit_gaussians(g, cameras, targets, further, cache=scene.cache, lam=lam).gaussians
+
+    return fit
+
+
+def settled(plan: Plan, fit: Callable[..., Gaussians]) -> Compact:
+    """File whose coefficients make up for each other's rounding. fit: of `refitting`.
+
+    Zeros, then more of the others in each pass, are held at whole steps, while the rest is fitted.
+    At last colours and opacities are fitted to the shapes of the file."""
+    values = plan.values
+    turn = generator(0, "settled").random(values.shape)  # in which they are held, 0 to 1
+    turn[plan.whole(values) == 0] = 0
+    held = np.zeros(values.shape, bool)
+    for done in range(HOLDS):
+        new = (turn <= done / HOLDS) & ~held
+        values, held = np.where(new, plan.whole(values), values), held | new
+        rate = GENTLE * FALL ** (done / (HOLDS - 1))
+        free = plan.values_of(fit(plan.model(values), rate, KINDS, 1))
+        values = np.where(held, values, free)
+    values = plan.whole(values)
+    free = plan.values_of(fit(plan.model(values), GENTLE, ("colour", "opacity")))
+    free[:, SHAPE] = values[:, SHAPE]
+    return plan.file(free)
 
 
 def thin_run(run: Run, kind: str, size: int | None = None, psnr: float | None = None) -> Compacted:
