@@ -69,8 +69,11 @@ class Lost:
     def __call__(self, views):
         return [0.0] * len(views)
 
-    def plan(self, *_):
-        return None
+    def plan(self, planned, *_):
+        return planned
+
+    def relaxation(self, *_):
+        return 0.0
 
 def large(views):
     return [10**400] * len(views)
@@ -150,8 +153,8 @@ def test_a_policy_that_cannot_be_loaded_is_one_line(dataset, file, tmp_path, nam
         ("few", r"returned scores of shape \(1,\) for 9 candidates"),
         ("words", r"returned no numbers \(.*'a'\); return one for each candidate"),
         ("large", r"returned no numbers \(int too large"),
-        ("changes", r"line 66 of .*mine\.py failed: ValueError: output array is read-only"),
-        ("changes_one", r"line 70 of .*mine\.py failed: ValueError: output array is read-only"),
+        ("changes", r"line 69 of .*mine\.py failed: ValueError: output array is read-only"),
+        ("changes_one", r"line 73 of .*mine\.py failed: ValueError: output array is read-only"),
     ],
 )
 def test_a_policy_that_fails_keeps_the_steps_before(loaded, file, tmp_path, function, message):
@@ -159,8 +162,11 @@ def test_a_policy_that_fails_keeps_the_steps_before(loaded, file, tmp_path, func
     assert len((tmp_path / "run/steps.jsonl").read_text().splitlines()) == 1
 
 
-def test_an_error_in_a_plan_is_one_line(file):
-    fails(r"mine\.py failed: TypeError", policy_of(f"{file}:Lost").plan, None, None, [], 1, None)
+def test_an_error_in_a_plan_or_a_relaxation_is_one_line(file):
+    lost = policy_of(f"{file}:Lost")
+    fails(r"mine\.py failed: TypeError", lost.plan, None, None, [], 1, None)
+    fails("plan returned views that are no candidates", lost.plan, [7], None, [5, 6], 1, None)
+    fails("relaxation returned float, no Relaxation", lost.relaxation, None, None, [5, 6])
 
 
 def test_an_object_in_a_file_keeps_its_bound(loaded, file, tmp_path):

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mgs.errors import InputError, from_interrupt
+from mgs.policy.relaxation import Bounded
 from mgs.progress import Stage, report
 from mgs.run.policies import POLICIES, Policy, policy_named
 
@@ -173,7 +174,13 @@ class Own:
     def _planned(self, name: str, method: Callable[..., Any], *arguments: Any) -> Any:
         with _users_code(self.full, self.path):
             result = method(*arguments)
-            return [int(view) for view in result] if name == "plan" else result
+            if name == "plan":
+                result = [int(view) for view in result]
+                if not set(result) <= set(arguments[2]):
+                    raise TypeError("plan returned views that are no candidates")
+            elif name == "relaxation" and not isinstance(result, Bounded):
+                raise TypeError(f"relaxation returned {type(result).__name__}, no Relaxation")
+            return result
 
     def __call__(self, scene: Scene, state: State, views: list[int]) -> Any:
         shared = {
