@@ -442,7 +442,9 @@ def test_a_small_file_is_better_with_fewer_gaussians_fitted_once_more(
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_what_a_file_gives_is_fitted_and_written_again(dataset, prior, tmp_path, shared):
+def test_what_a_file_gives_is_fitted_and_written_again(
+    dataset, prior, tmp_path, shared, short_searches
+):
     run = small_run(dataset, prior, tmp_path / "run")
     encoder, size, measured = compacting.encoding(run, shared), 900, compacting._measure(run)
     models = list(compacting.thinned(run, whole=shared))
