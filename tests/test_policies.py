@@ -239,7 +239,7 @@ def test_cover_looks_at_what_was_not_observed():
 
 
 def test_no_exchange_lowers_what_a_plan_of_cover_leaves_new():
-    """What the plan leaves is COVER's own scores, summed over all poses."""
+    """Sum COVER's own scores over all poses: the least that an exchange can reach."""
     rng, eyes = np.random.default_rng(1), sphere(12) * 4
     seen = rng.random((12, 30)) * (rng.random((12, 30)) < 0.4)
     scene, state = known(

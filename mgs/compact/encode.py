@@ -206,7 +206,7 @@ class Plan:
         return self.tree.forward((columns - self._centres)[self.order])
 
     def model(self, values: np.ndarray) -> Gaussians:
-        """Model of coefficients, where `whole` as a reader gets it, in the encoder's order."""
+        """Model of coefficients, in the encoder's order. A reader gets that of `whole` ones."""
         columns = self.tree.inverse(values)[np.argsort(self.order)] + self._centres
         g = gaussians_of(columns, self.means, self._quats, self.encoder.axes)
         return replace(g, antialiased=self.encoder.g.antialiased, linear=self.encoder.g.linear)
