@@ -32,7 +32,7 @@ STAGES = {
     "oracle": ("oracle", "--rocks", "1"),
     "paper": ("paper", "--rocks", "8"),
     "table1": ("table1",),
-    "couplings": ("couplings", "--rocks", "4"),
+    "couplings": ("couplings", "--rocks", "6"),
     "flights": ("flights", "--rocks", "8"),
     "survey": ("survey", "--rocks", "8"),
     "parsimony": ("parsimony", "--rocks", "8"),

@@ -20,7 +20,7 @@ from mgs.fit.settings import ALPHA_WEIGHT
 from mgs.run.folder import read_checkpoint
 from mgs.survey import flight
 from mgs.survey.flight import SurveySettings, fly
-from studies import certificate, fits, flights, link, pools, setups, table1
+from studies import certificate, curves, fits, flights, link, pools, setups, table1
 from studies.frame import case
 from studies.frame.case import Case, Rock, Size
 from studies.frame.output import read_rows
@@ -178,6 +178,19 @@ def test_each_draw_has_its_own_pool_and_seeds(tmp_path, capsys, monkeypatch):
     assert [len(set(of)) for of in names] == [8] * 3
     assert names[0] == names[2]
     assert set(names[0]) != set(names[1])
+
+
+def test_each_number_of_images_is_a_run_of_its_own(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(curves, "COUNTS", (5, 6))
+    monkeypatch.setattr(curves, "SOME", {"one seed": SETUPS["one seed"]})
+    monkeypatch.setattr(curves, "POLICIES", ("directional-i", "random"))
+    done(capsys, "curves", tmp_path, "--rocks", 1)
+    rows = {(row["images"], row["policy"]): row for row in read_rows(tmp_path / "curves.csv")}
+    assert list(rows) == [(n, policy) for n in (5, 6) for policy in curves.POLICIES]
+    leads = [f"{rows[n, 'directional-i']['test_gain']:+.2f}" for n in (5, 6)]
+    line = f"| one seed | random | {' | '.join(leads)} |"
+    assert line in (tmp_path / "curves.md").read_text()
+    assert (tmp_path / "curves.png").is_file()
 
 
 @pytest.mark.slow
