@@ -24,7 +24,7 @@ from mgs.run.policies import Policy
 from mgs.run.settings import NbvSettings
 from mgs.seeds import generator
 from studies.faults import IMAGE_FAULTS, PRIOR_FAULTS, captured, pose_noise
-from studies.frame.case import FRESH, ROCKS, judge
+from studies.frame.case import FRESH, MESH_SCENE, ROCKS, Case, judge
 from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
 from studies.frame.program import WORKERS, Study, Work, study_of
 from studies.frame.statistics import Row
@@ -57,12 +57,15 @@ POLICIES: dict[str, Policy] = {"d-optimal": mgs.DOptimal(), "directional-i": mgs
 """Policies whose choice is judged."""
 
 NONE, ANOTHER, SHORT, ONE_POSE = "none", "another rock's prior", "few passes", "one bad pose"
+SUN, SUN_MOVES = "moving sun", (5, 15, 45)
+"""Degrees by which the sun has gone round when the later half of the views is taken."""
 
 FIT_FAULTS = {SHORT: ((5, 2, 1), "{:g}"), ONE_POSE: ((0.25, 1.0, 4.0), "{:g}° and cm")}
 """Sizes of faults of the fit and of a single view, and their words."""
 
 WORDS = {name: fault.words for name, fault in (IMAGE_FAULTS | PRIOR_FAULTS).items()}
-WORDS |= {name: words for name, (_, words) in FIT_FAULTS.items()} | {ANOTHER: "{:g}"}
+WORDS |= {name: words for name, (_, words) in FIT_FAULTS.items()}
+WORDS |= {ANOTHER: "{:g}", SUN: "{:g}°"}
 """Formats of sizes with their units."""
 
 
@@ -73,8 +76,11 @@ def cells_of(size: SetupSize) -> list[Cell]:
     cases = [case_of(rock, SETUPS["hemisphere"], size) for rock in rocks]
     for k, case in enumerate(cases[: len(size.rocks)]):
         others = [cases[(k + step) % len(cases)] for step in (1, 2, 3)]
+        moved = [under_sun(case, degrees) for degrees in SUN_MOVES]
         made = [one for other in others for one in other.cells()]
+        made += [one.cells()[0] for one in moved]
         wrong: dict[str, Any] = {"others": [other.prior for other in others]}
+        wrong["moved"] = [one.dataset for one in moved]
         for part, more in (("faults", wrong), ("few_views", {"counts": FEW})):
             *own, last = case.with_task(f"{part}/{case.rock.name}", f"{__name__}:{part}", **more)
             needs = tuple(dict.fromkeys(one.name for one in (*own, *made)))
@@ -82,6 +88,17 @@ def cells_of(size: SetupSize) -> list[Cell]:
             last = replace(last, needs=needs, about=about)
             cells |= {cell.name: cell for cell in (*own, *made, last)}
     return list(cells.values())
+
+
+def under_sun(case: Case, degrees: float) -> Case:
+    """The same views with the sun so many degrees further round."""
+    from mgs.synth.scene_file import load_scene_file
+
+    rock = case.rock
+    sky = load_scene_file(MESH_SCENE if rock.mesh else str(rock.file or rock.scene)).sky
+    changes = {**case.changes, "sky": {"sun_azimuth": sky.sun_azimuth + degrees}}
+    label, size = f"{case.label}/sun-{degrees:g}", replace(case.size, tests=0)
+    return replace(case, changes=changes, label=label, size=size)
 
 
 def scene_of(data: mgs.Dataset, prior: mgs.Prior, loose: float = 1.0, **train: Any) -> mgs.Scene:
@@ -158,6 +175,12 @@ class Lab:
         rng, frames = self.rng(fault, size), enumerate(self.data.frames)
         return [change(f, size, rng) if i in views else f for i, f in frames]
 
+    def with_later(self, frames: Sequence[mgs.Frame]) -> list[mgs.Frame]:
+        """All frames, the later half of the views taken from others of the same poses."""
+        later = sorted(self.taken)[len(self.taken) // 2 :]
+        pairs = enumerate(zip(self.data.frames, frames, strict=True))
+        return [other if i in later else own for i, (own, other) in pairs]
+
 
 def quality(model: mgs.Gaussians, data: mgs.Dataset) -> dict[str, float]:
     """PSNR on the test views, dB: of whole images (psnr), and inside the rock (psnr_mask)."""
@@ -166,9 +189,10 @@ def quality(model: mgs.Gaussians, data: mgs.Dataset) -> dict[str, float]:
 
 
 def faults(
-    root: Path, out: Path, dataset: str, prior: str, others: Sequence[str]
+    root: Path, out: Path, dataset: str, prior: str, others: Sequence[str], moved: Sequence[str]
 ) -> dict[str, list[Row]]:
-    """Task: rows of every fault at every size. others: priors of other rocks."""
+    """Task: rows of every fault at every size. others: priors of other rocks. moved: datasets of
+    this one under SUN_MOVES."""
     lab = Lab(root, dataset, prior)
     for fault, (change, sizes, _) in IMAGE_FAULTS.items():
         for size in sizes:
@@ -178,6 +202,9 @@ def faults(
             lab.add(fault, size, change(lab.prior, size, lab.rng(fault, size)))
     for k, other in enumerate(others):
         lab.add(ANOTHER, k, mgs.load_prior(root / other))
+    for degrees, folder in zip(SUN_MOVES, moved, strict=True):
+        later = map(captured, mgs.load_dataset(root / folder).frames)
+        lab.add(SUN, degrees, frames=lab.with_later([*later]))
     for passes in FIT_FAULTS[SHORT][0]:
         lab.add(SHORT, passes, passes=passes)
     for size in FIT_FAULTS[ONE_POSE][0]:
@@ -307,9 +334,9 @@ def write(work: Work) -> list[Path]:
 def draw(path: Path, rows: Sequence[Row]) -> None:
     """Draw what faults of the images and of the prior cost."""
     shown = [
-        row | {"label": label_of(row), "of": IMAGES if row["fault"] in IMAGE_FAULTS else PRIOR}
+        row | {"label": label_of(row), "of": PRIOR if row["fault"] in PRIOR_FAULTS else IMAGES}
         for row in rows
-        if row["part"] == "faults" and row["fault"] in IMAGE_FAULTS | PRIOR_FAULTS
+        if row["part"] == "faults" and row["fault"] in (*IMAGE_FAULTS, SUN, *PRIOR_FAULTS)
     ]
     label = "PSNR lost on test views (dB)"
     panels = [

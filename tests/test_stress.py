@@ -48,6 +48,15 @@ def root(tmp_path_factory):
     return folder
 
 
+def test_the_sun_moves_on_over_the_same_views():
+    case = stress.case_of(FRESH[0], stress.SETUPS["hemisphere"], stress.SIZES["quick"])
+    moved = stress.under_sun(case, 15)
+    own, other = (one.cells()[0].arguments for one in (case, moved))
+    assert other["changes"].pop("sky") == {"sun_azimuth": 35 + 15}
+    assert (other["changes"], other["seed"]) == (own["changes"], own["seed"])
+    assert moved.dataset != case.dataset
+
+
 def test_the_wrong_prior_of_one_rock_is_of_the_same_rocks_as_that_of_eight():
     def others(count):
         size = replace(stress.SIZES["quick"], rocks=FRESH[:count])
@@ -112,13 +121,17 @@ def test_faults_are_measured_against_the_fit_without(root):
     shifted = faults.shifted(lab.prior, 0.4, lab.rng("shifted prior", 0.4))
     lab.add("shifted prior", 0.4, shifted)
     lab.add(stress.ANOTHER, 0, load_prior(root / FOLDERS["prior"]))
+    frames = [faults.exposure(frame, 1.0, lab.rng("", 1)) for frame in lab.data.frames]
+    brighter = replace(lab.data, frames=tuple(frames))
     blurred = lab.with_fault(faults.defocus, 2.0, lab.taken, "defocus")
     lab.add("defocus", 2.0, frames=blurred)
-    clean, moved, same, soft = lab.rows
+    lab.add(stress.SUN, 5, frames=lab.with_later(brighter.frames))
+    clean, moved, same, soft, sunny = lab.rows
     assert clean["lost"] == same["lost"] == 0, "the prior of the same rock"
     assert moved["lost"] > stress.FAILURE
     assert moved["sign prior"] > DETECTORS["prior"].limit > clean["sign prior"]
     assert soft["lost"] > 0.1
+    assert sunny["lost"] > stress.FAILURE
     for one in lab.rows:
         assert all(0 < one[f"choice {name}"] <= 1 for name in stress.POLICIES)
     assert clean["choice d-optimal"] == soft["choice directional-i"] == 1, "no image, no change"
