@@ -11,8 +11,11 @@ from studies.frame.program import Work, study_of
 from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
 
-COUNTS = (6, 8, 12, 16, 20)
+COUNTS = (6, 8, 12, 20)
 """Numbers of images, seeds among them, of 36 candidates."""
+
+DRAWS = 3
+"""Runs of `random`, averaged."""
 
 SOME = {name: setups.SETUPS[name] for name in ("hemisphere", "mixed distances")}
 
@@ -24,7 +27,7 @@ def cells_of(size: setups.SetupSize) -> list[Cell]:
     """Cells of every number of images: each is a run of its own, since a plan is for a number."""
     cells: dict[str, Cell] = {}
     for count in COUNTS:
-        for cell in setups.cells_of(replace(size, images=count), POLICIES, SOME):
+        for cell in setups.cells_of(replace(size, images=count, draws=DRAWS), POLICIES, SOME):
             about = dict(cell.about) | {"images": count} if cell.about else cell.about
             cells[cell.name] = replace(cell, about=about)
     return list(cells.values())
