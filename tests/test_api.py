@@ -154,7 +154,10 @@ def test_a_fit_takes_a_loss_of_its_own_and_says_what_is_wrong_with_images(datase
     doubled = mgs.fit_gaussians(model, cameras, images, few, loss=lambda *a: 2 * squared(*a))
     np.testing.assert_allclose(doubled.losses[0], 2 * usual.losses[0], rtol=1e-5)
     fails(r"target: .*\[12,16", mgs.fit_gaussians, model, cameras[:1], [np.ones((2, 2, 3))])
-    fails("there are 2 cameras, but 1 targets", mgs.fit_gaussians, model, cameras, images[:1])
+    fails("there are 2 cameras and 1 targets", mgs.fit_gaussians, model, cameras, images[:1])
+    fails("there are 0 cameras", mgs.fit_gaussians, model, [], [], few)
+    names = few.model_copy(update={"loss": "l1"})  # functions of the fits above are no names
+    fails("choose one of squared, l1-dssim$", mgs.fit_gaussians, model, cameras, images, names)
     for wrong in ((images[0] * 255).astype(np.uint8), images[0] * np.nan):
         fails("target: is .*give finite floats", mgs.fit_gaussians, model, cameras[:1], [wrong])
     for option in ("lam", "learns"):

@@ -13,7 +13,7 @@ from mgs.camera import Camera
 from mgs.colour import SH_C0
 from mgs.errors import InputError, row_named
 from mgs.fit.density import DENSITIES, Density, controlled, slopes_of
-from mgs.fit.losses import LOSSES, Loss, loss_name
+from mgs.fit.losses import Loss, loss_name, loss_named
 from mgs.fit.objective import (
     Objective,
     ParameterPrior,
@@ -94,7 +94,7 @@ def _step(
     """One optimiser step on one image and its share of the prior. Returns the model, the buffers,
     the loss before the step, and the slopes.
 
-    optimiser, error: names in OPTIMISERS and LOSSES.
+    optimiser, error: names, in OPTIMISERS and of `loss_named`.
     buffers, rates, information: for each learned array (`mgs.fit.optimisers.Optimiser`).
     t: UInt32, step number from 1. slopes: sums of `View.slopes`, to which the step's are added; if
         empty, they are not measured.
@@ -103,7 +103,7 @@ def _step(
     dr.enable_grad(shift)
     image = view.rendered(copy, shift).array
     target = view.target
-    values = LOSSES[error](image, target.pixels, target.weights, view.size, model.linear)
+    values = loss_named(error)(image, target.pixels, target.weights, view.size, model.linear)
     loss = dr.mean(dr.detach(values))
     dr.backward(0.5 * dr.sum(values))
     step, after, states = mi.Float(t), {}, []
@@ -157,9 +157,9 @@ def fit_gaussians(
         are at most.
     unfinished: file from which the fit continues, and which is written from time to time.
 
-    Raises InputError if a parameter or a target is not finite, a target has integers, a name is
-    unknown, `start` has another shape, means are to move without a rate, or a required alpha is
-    missing.
+    Raises InputError if there is no camera, a parameter or a target is not finite, a target has
+    integers, a name is unknown, `start` has another shape, means are to move without a rate, or a
+    required alpha is missing.
     """
     settings = settings or TrainSettings()
     optimiser = row_named(OPTIMISERS, settings.optimiser, "optimiser")

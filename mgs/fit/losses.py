@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mgs.errors import row_named
 from mgs.metrics import SSIM_SIGMA, SSIM_WINDOW
 
 DSSIM_SHARE = 0.2  # share of the dissimilarity in `l1_dssim` (Kerbl et al. 2023)
@@ -42,15 +43,21 @@ def l1_dssim(drawn: Any, pixels: Any, weights: Any, size: Size, linear: bool) ->
 
 LOSSES: dict[str, Loss] = {"squared": squared, "l1-dssim": l1_dssim}
 
+_functions: dict[str, Loss] = {}  # losses that are no row of LOSSES, by `loss_name`
+
 
 def loss_name(loss: str | Loss) -> str:
-    """Name of a loss. A function is added to LOSSES, since recorded kernels have a loss by its
-    name."""
+    """Name of a loss. A function is kept, since recorded kernels have a loss by its name."""
     if isinstance(loss, str):
         return loss
     name = f"{getattr(loss, '__name__', 'loss')} {id(loss)}"
-    LOSSES.setdefault(name, loss)
+    _functions.setdefault(name, loss)
     return name
+
+
+def loss_named(name: str) -> Loss:
+    """Loss of a name. Raises InputError, which lists LOSSES, if there is none."""
+    return _functions.get(name) or row_named(LOSSES, name, "loss")
 
 
 def _encoded(values: Any, size: Size) -> Any:

@@ -18,8 +18,8 @@ import numpy as np
 from mgs import runtime
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
-from mgs.errors import InputError, row_named
-from mgs.fit.losses import LOSSES, Size
+from mgs.errors import InputError
+from mgs.fit.losses import Size, loss_named
 from mgs.gaussians import Gaussians, learned
 from mgs.memory import IMAGE_BYTES, Deferred, adopted, kept_within, padded
 from mgs.splat import ListCache, as_drjit, fisher, groups
@@ -152,7 +152,7 @@ class Objective:
     prior: ParameterPrior
     cache: ListCache
     alpha_weight: float = 0.0
-    error: str = "squared"  # a name in LOSSES
+    error: str = "squared"  # as of `loss_named`
 
     def loss(self, model: Gaussians) -> float:
         """2 Phi over the number of pixel values: mean loss plus the prior's part."""
@@ -243,13 +243,14 @@ def objective(
     error: str = "squared",
 ) -> Objective:
     """The objective of `mgs.fit.fitting.fit_gaussians`, from the same arguments and settings.
-    error: a name in LOSSES. Raises InputError if it is unknown, the start does not fit the
-    Gaussians, or `means` is not a name in `mgs.splat.MEANS`. A target without alpha, where alpha
-    has a weight, raises it when it is read."""
+    error: as of `loss_named`. Raises InputError if it is unknown, there is no camera, the start
+    does not fit the Gaussians, or `means` is not a name in `mgs.splat.MEANS`. A target without
+    alpha, where alpha has a weight, raises it when it is read."""
     groups(gaussians.sh_degree, means)  # raises if the name is unknown
-    row_named(LOSSES, error, "loss")
-    if len(cameras) != len(targets):
-        raise InputError(f"fit: there are {len(cameras)} cameras, but {len(targets)} targets")
+    loss_named(error)
+    if len(cameras) != len(targets) or not cameras:
+        what = f"there are {len(cameras)} cameras and {len(targets)} targets"
+        raise InputError(f"fit: {what}; give one target for each camera, and at least one")
 
     def photo(i: int) -> Photo:
         return _photo(gaussians, cameras[i], targets[i], alpha_weight)
@@ -327,8 +328,8 @@ def _rendered(model: Gaussians, photo: Photo, cache: ListCache) -> Any:
 
 @frozen(lambda error, image, target, size, linear: (error, *size, target.stored, linear))
 def _errors(error: str, image: Any, target: Target, size: Size, linear: bool) -> Any:
-    """Loss LOSSES[error] of each pixel value of a render, Float [H*W*C]."""
-    return LOSSES[error](image, target.pixels, target.weights, size, linear)
+    """Loss `error` of each pixel value of a render, Float [H*W*C]."""
+    return loss_named(error)(image, target.pixels, target.weights, size, linear)
 
 
 def with_gradients(model: Gaussians, prior: ParameterPrior) -> Gaussians:
