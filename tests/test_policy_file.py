@@ -87,6 +87,9 @@ def changes_one(surface_F):
     return 0.0
 
 from mgs.run.policies import Coverage
+
+def turned(views):
+    return np.full(len(views), 1 + 2j)
 """
 
 
@@ -153,6 +156,7 @@ def test_a_policy_that_cannot_be_loaded_is_one_line(dataset, file, tmp_path, nam
         ("few", r"returned scores of shape \(1,\) for 9 candidates"),
         ("words", r"returned no numbers \(.*'a'\); return one for each candidate"),
         ("large", r"returned no numbers \(int too large"),
+        ("turned", r"returned no numbers \(they are complex\)"),
         ("changes", r"line 69 of .*mine\.py failed: ValueError: output array is read-only"),
         ("changes_one", r"line 73 of .*mine\.py failed: ValueError: output array is read-only"),
     ],

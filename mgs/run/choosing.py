@@ -58,6 +58,8 @@ def rated(
     report(Stage.SCORE, 0, len(views))
     where, returned = f"policy {policy.name}: returned", policy(scene, state, views)
     try:
+        if np.iscomplexobj(returned):  # which NumPy would cut
+            raise TypeError("they are complex")
         scores = np.asarray(returned, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where} no numbers ({error}); return one for each candidate") from None
