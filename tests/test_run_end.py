@@ -17,14 +17,16 @@ from refusals import fails
 from test_directional import squares
 from tiny import resume, run
 
-from mgs import load_dataset
+from mgs import learn, load_dataset
 from mgs.errors import Notice
 from mgs.files import read_json, write_json
 from mgs.policy import criteria, tour
 from mgs.policy.directional import Views, precision
 from mgs.policy.pool_gains import PoolGains
 from mgs.run import folder as run_folder
+from mgs.run.choosing import planned_flight
 from mgs.run.ending import run_end
+from mgs.run.policies import Directional
 from mgs.run.settings import FlightLimits, NbvSettings
 
 
@@ -299,6 +301,24 @@ def test_a_flight_never_exceeds_its_limits_and_resumes_the_same(loaded, tmp_path
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "part", loaded, on_step=stop_at(2), **given)
     assert tiny.resume(tmp_path / "part", loaded).taken == state.taken
+
+
+def test_a_tour_is_of_its_policy_and_of_the_views_it_may_have(loaded):
+    """Runs that differ in the policy share a scene, and so may missions of one's own."""
+    limits = {"seeds": 3, "flight": {"length": 30.0}}
+    missions = [NbvSettings(dataset=".", prior=".", budget=n, **limits) for n in (9, 9, 1)]
+    shared = tiny.scene(loaded, missions[0])
+    plans = []
+    ours, other = Directional(), Directional(tour=(0, 1.0, False))
+    for mission, policy in zip(missions, (ours, other, ours), strict=True):
+        scenes = shared, tiny.scene(loaded, mission)
+        states = [learn(scene, scene.seeds(3)) for scene in scenes]
+        pairs = zip(scenes, states, strict=True)
+        plan, alone = (planned_flight(*pair, policy, mission) for pair in pairs)
+        assert plan == alone
+        plans.append(plan)
+    assert plans[0] != plans[1]
+    assert len(plans[2]) == 1
 
 
 def test_a_limit_that_binds_nothing_changes_no_view_of_one_step(loaded, tmp_path):

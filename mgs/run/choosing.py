@@ -119,18 +119,18 @@ def planned_flight(scene: Scene, state: State, policy: Policy, mission: Mission)
     for count in (state.seeds, len(state.taken)):
         start, past = state.taken[:count], list(state.taken[count:])
         before = replace(state, taken=start)
-        stops = tuple(reachable(scene, before, mission))
-        if (start, stops) not in flight.tours:
+        stops, most = tuple(reachable(scene, before, mission)), views_left(before, mission)
+        task = id(policy), most, start, stops
+        if task not in flight.tours:
             gains = tour_gains(scene, state)
             if gains is None:
                 return []
             report("planning the flight", 0, 1)
             gains.take(start)
-            most = views_left(before, mission)
             ends, share = [start[-1], flight.home], flight.share_from(start, most)
             way = tour.planned_tour(flight.legs, ends, stops, gains, share, 1 / most)
-            flight.tours[start, stops] = way[1:-1]
-        plan = flight.tours[start, stops]
+            flight.tours[task] = policy, way[1:-1]
+        _, plan = flight.tours[task]
         if plan[: len(past)] == past and plan[len(past) :]:
             return plan[len(past) :]
     return []

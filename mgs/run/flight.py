@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,13 +93,14 @@ class Flight:
     """The legs of a flight, metres [V,V] (`mgs.policy.tour.legs`), and its limits.
 
     home: pose where it ends. skipped: number of views taken before it; it starts at the last one.
-    tours: those planned, by the views taken and the candidates."""
+    tours: policies and the stops that they planned, by policy (`id`), most stops, views taken and
+    candidates."""
 
     limits: FlightLimits
     legs: NDArray[np.float64]
     home: int
     skipped: int = 0
-    tours: dict[tuple[tuple[int, ...], tuple[int, ...]], list[int]] = field(default_factory=dict)
+    tours: dict[Any, tuple[Any, list[int]]] = field(default_factory=dict)
 
     def share(self, metres: float | Array, pictures: int) -> NDArray[np.float64]:
         """Share of the limits that a flight of this length and number of pictures takes."""
