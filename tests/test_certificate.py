@@ -3,6 +3,7 @@
 import tracemalloc
 import weakref
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from mgs.policy import certificate, criteria, relaxation
 from mgs.policy.certificate import added_bound, best_set, least_bound, upper_bound
 from mgs.policy.directional import Views, precision
 from mgs.policy.relaxation import TOLERANCE
+from mgs.run import worth
+from mgs.run.settings import Mission
 
 LAM, POSES, POINTS = 0.02**2, 9, 40
 KINDS = ["d", "i", "eq7"]
@@ -216,3 +219,12 @@ def test_greedy_takes_as_many_views_as_a_share_of_all_needs(kind):
         best = max(gain([*views[:k], v]) for v in range(POSES) if v not in views[:k])
         assert gain(views[: k + 1]) == pytest.approx(best)
     assert sorted(certificate.greedy(made, 1.0)) == list(range(POSES))
+
+
+def test_a_plan_that_adds_nothing_has_no_certificate():
+    """Two views together observe what neither does, of which coverage counts nothing."""
+    made = relaxation.Coverage(np.full((4, 6, 3), 0.4), np.zeros((6, 3)), np.ones(3))
+    policy = SimpleNamespace(name="coverage", relaxation=lambda *_: made)
+    scene, views = SimpleNamespace(cache={}), [0, 1, 2, 3]
+    assert made.gain(views) > made.gain([0, 1]) == 0
+    assert worth.certificate(scene, None, policy, Mission(), [0, 1], views) is None

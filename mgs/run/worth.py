@@ -31,11 +31,11 @@ def certificate(
     views: Sequence[int],
 ) -> Certificate | None:
     """Certify a plan of some of `views` by the policy's criterion. Returns None where the policy
-    has no `relaxation`, the plan has no view or all of them, or no view adds anything."""
+    has no `relaxation`, the plan has no view or all of them, or adds nothing."""
     criterion = _criterion(scene, state, policy, views) if 0 < len(plan) < len(views) else None
-    if criterion is None:
-        return None
     indices, limits = [views.index(i) for i in plan], mission.certificate
+    if criterion is None or criterion.gain(indices) <= 0:
+        return None
     nodes = min(SEARCH_NODES, SEARCH_PAIRS // criterion.pairs)
     nodes = nodes if limits.nodes is None else limits.nodes
     worth = certify(criterion, indices, policy.name, nodes, limits.seconds or np.inf)
