@@ -309,7 +309,7 @@ def test_poses_leave_and_come_in_the_coordinates_of_the_data(run, site, tmp_path
     opened, far = open_run(run), np.array([448262.0, 5411932, 412])
     world = World(unit_up([0.3, -0.8, 0.2]), "m", tuple(far))
     camera = site.camera([1.4, -1.8, 1.2])
-    found, written = suggest(opened, [("a", camera)]), []
+    found, written = suggest(opened, [("$x^$", camera)]), []  # no formula in a figure
     for k, one in enumerate((world.home, world)):
         (tmp_path / str(k)).mkdir()
         monkeypatch.setattr(opened, "dataset", replace(opened.dataset, world=one))
@@ -348,6 +348,7 @@ BAD_CSV = {
     "half a target": ("x,y,z,target_x\n1,2,3,0\n", "lacks the column target_y"),
     "short row": ("x,y,z\n1,2\n", "line 2 has 2 cells, not 3"),
     "zero quaternion": ("x,y,z,qw,qx,qy,qz\n1,2,3,0,0,0,0\n", "its quaternion is zero"),
+    "control": ("x,y,z,name\n3,0,1,a\x1b[2J\n", r"the name 'a\x1b[2J' cannot be printed"),
     "twice": ("x,y,z,name\n3,0,1,a\n0,3,1,a\n", "lists the pose a more than once"),
     "looks at itself": ("x,y,z,target_x,target_y,target_z\n3,0,1,3,0,1\n", "at its own position"),
     "inside": ("x,y,z\n0.1,-0.05,0.3\n", "can be flown (1 inside the object)"),

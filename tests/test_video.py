@@ -14,7 +14,7 @@ from PIL import Image
 from program import change_settings, command
 from refusals import fails, refused
 
-from mgs.reports.video import camera_path, path_among, write_film
+from mgs.reports.video import _left, camera_path, path_among, write_film
 
 
 @pytest.fixture
@@ -106,6 +106,10 @@ def test_the_story_has_a_frame_for_each_view(run, tmp_path, monkeypatch):
     with Image.open(tmp_path / "a.gif") as image:
         assert image.n_frames > 1
         assert image.size[0] > 800
+
+
+def test_nothing_is_unknown_in_a_view_of_nothing():
+    assert _left({"uncertainty": np.ones((2, 2)), "A": np.zeros((2, 2))}) == 0
 
 
 def test_refusals(run, tmp_path, monkeypatch, capsys):

@@ -13,7 +13,7 @@ from mgs.data.dataset import write_transforms
 from mgs.data.frames import Frame
 from mgs.data.world import World
 from mgs.files import write_json
-from mgs.plotting import NO_GRID, crop, drawing
+from mgs.plotting import NO_GRID, crop, drawing, literal
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.reports.diagnostics import VISIBLE, picture, run_scalars, show_map, view_maps
 from mgs.reports.page_plots import CURVES
@@ -92,7 +92,7 @@ def draw_suggestion(path: str | Path, run: Run, suggestion: Suggestion) -> None:
             window = crop(maps["A"] >= VISIBLE)
             top, below = (figure.add_subplot(grid[row, k]) for row in (0, 1))
             top.imshow(picture(maps)[window])
-            top.set_title(f"{k}: {view.name}\n{fill(view.way, 28)}", fontsize=8)
+            top.set_title(literal(f"{k}: {view.name}\n{fill(view.way, 28)}"), fontsize=8)
             shown = show_map(below, maps, "uncertainty", window, "cividis", vmin=0, vmax=1)
             gain = f"gain {view.information_gain:.3f}"
             below.set_title(f"unknown {100 * view.unknown:.0f} %, {gain}", fontsize=8)
@@ -130,7 +130,7 @@ def _from_above(axis: Any, run: Run, suggestion: Suggestion) -> None:
             side = {"ha": "left" if x > 0 else "right", "va": "bottom" if y > 0 else "top"}
             apart = (7 if x > 0 else -7, 5 if y > 0 else -5)  # from its mark and the nearest stop
             about = {"textcoords": "offset points", "fontsize": 7, "color": CHOSEN, **side}
-            axis.annotate(frame.name, place, apart, **about)
+            axis.annotate(literal(frame.name), place, apart, **about)
             axis.scatter(*place, marker="^", s=26, color=CHOSEN, zorder=3)
     ranked = level([view.camera.position for view in suggestion.ranking])
     gains, label = [view.information_gain for view in suggestion.ranking], f"gain ({GAIN_UNIT})"

@@ -21,7 +21,7 @@ from mgs.gaussians import Gaussians
 from mgs.images import write_exr, write_png
 from mgs.learning import learn
 from mgs.metrics import psnr
-from mgs.plotting import NO_GRID, crop, new_figure, painted, styled
+from mgs.plotting import NO_GRID, crop, literal, new_figure, painted, styled
 from mgs.policy import criteria
 from mgs.policy.tour import flying_order, legs
 from mgs.progress import report
@@ -206,8 +206,9 @@ def _shown_view(run: Run, model: State, unknown: dict[str, np.ndarray]) -> Frame
 
 
 def _left(maps: dict[str, np.ndarray]) -> float:
-    """Mean share of the variance that is left, over the pixels that show the model."""
-    return float(maps["uncertainty"][maps["A"] >= VISIBLE].mean())
+    """Mean share of the variance that is left, over the pixels that show the model; 0 without."""
+    shown = maps["uncertainty"][maps["A"] >= VISIBLE]
+    return float(shown.mean()) if len(shown) else 0.0
 
 
 def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], view: Frame) -> np.ndarray:
@@ -222,7 +223,7 @@ def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], view: Frame) -> 
     with styled(NO_GRID | {"font.size": 11}):
         figure = new_figure(*SIZE, dpi=DPI)
         orbit, render, map_ = figure.subplots(1, 3, width_ratios=(1, 1, 1))
-        figure.suptitle(title, fontsize=14, color=NEWEST)
+        figure.suptitle(literal(title), fontsize=14, color=NEWEST)
         eyes = np.array([frame.camera.position for frame in run.dataset.frames])
         views = model.taken[:seeds], model.taken[seeds:]
         draw_cameras(orbit, eyes, model.gaussians.means, *views, model.taken[-1])

@@ -118,6 +118,8 @@ def _csv_pose(where: str, index: int, columns: list[str], row: list[str], site: 
         raise InputError(f"{where} has {len(row)} cells, not {len(columns)}; correct it")
     cells = dict(zip(columns, (cell.strip() for cell in row), strict=True))
     name = cells.pop("name", "") or f"pose_{index:04d}"
+    if not name.isprintable():  # which `read_records` would refuse, too
+        raise InputError(f"{where}: the name {name!r} cannot be printed; rename it")
     numbers = {key: finite_number(where, key, text) for key, text in cells.items()}
     eye = np.array([numbers[key] for key in POSITION])
     if "qw" not in numbers:
