@@ -20,6 +20,7 @@ from synthetic import orbit_cameras, write_dataset
 from mgs import Gaussians, evaluate_run, evaluation, sh_from_rgb, write_ply
 from mgs.colour import linear_from_srgb, srgb_from_linear
 from mgs.evaluation import evaluate_model, write_comparison
+from mgs.files import read_json, write_json
 from mgs.images import write_exr, write_png
 from mgs.metrics import METRICS, OPAQUE, PSNR_LIMIT, SURFACE_METRICS, compare_surface, psnr, ssim
 from mgs.progress import listening
@@ -329,3 +330,6 @@ def test_srgb_models_are_measured_as_they_blend():
 def test_a_run_is_measured_on_its_own_dataset(dataset, prior, tmp_path):
     run = tiny.write_run(tmp_path / "run", dataset, prior)
     fails("is a run, with its own dataset", measuring.evaluate, run, dataset)
+    write_json(run / "config.json", read_json(run / "config.json") | {"settings": {}})
+    write_ply(run / "gaussians.ply", read_checkpoint(run).gaussians)
+    fails("dataset = ", measuring.evaluate, run / "gaussians.ply")

@@ -30,8 +30,9 @@ mgs simplify {run} --method refit: --learn some; --learn all --sh 0; --loss nan;
 mgs nbv: --resume {run} --budget 9; --resume {run} --policy random;
     {data} --prior {prior} --out {run}
 mgs nbv {data} --prior {prior} --seeds 3 --budget 1 --out {out}: --set estimator=block;
-    --set train.optimiser=hope; --set train.rates.colour; --set train.rates.hue=1; --set pases=1;
-    --set passes=1; --set prior_std.scale=inf; --batch 0; --set stop_gain=0;
+    --set train.optimiser=hope; --set train.rates.colour; --set train.rates.hue=1;
+    --set train.rates.colour=1 --set train.rates.colour.x=1; --set train.passes=10000000;
+    --set pases=1; --set passes=1; --set prior_std.scale=inf; --batch 0; --set stop_gain=0;
     --set stop_uncertainty=1; --policy best; --seeds 13; --set train.means=loose;
     --set train.means=free --set estimator=loss-gradient; --set train.means=free --policy paper;
     --set flight.length=9; --set flight.no_fly=4; --set flight.clearance=30;

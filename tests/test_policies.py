@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from refusals import fails
 from splat.scenes import make_camera, make_gaussians
 from synthetic import sphere
 
@@ -78,6 +79,7 @@ def test_regularisation_is_the_priors_information_per_group():
     assert lam == pytest.approx([0.01] * 3 + [0.0025] * 3 + [0.04] * 4 + [0.0001])
     by_kind = {"colour": 0.01, "scale": 0.0025, "rotation": 0.04, "opacity": 0.0001}
     assert criteria.lam_by_kind(lam, groups(0)) == pytest.approx(by_kind)
+    fails("no number for mean", criteria.regularisation, groups(0, "free"), 0.1, tau)
 
 
 def test_coverage_counts_newly_observed_gaussians():

@@ -205,6 +205,7 @@ def test_runs_of_one_policy_are_told_apart_by_their_folders(runs, tmp_path):
     assert list(compare_runs([*runs, other])) == labels
     assert list(compare_runs([runs[0].parent])) == ["d-optimal", "random"]
     fails("same policy and folder name", compare_runs, [runs[1], runs[1]])
+    fails("there are no runs", compare_runs, [])
 
 
 def edit(name, **values):

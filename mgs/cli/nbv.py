@@ -245,7 +245,7 @@ def fit(
     if run.poses_moved:
         console.print(moves_in_words(run.poses_moved, run.dataset.unit))
     if prior is None and (seen := run.prior.numbers.get("triangulated")) is not None:
-        others = run.prior.numbers["n"] - seen
+        others = len(run.prior.points) - seen
         console.print(f"start: {seen:,} points of the cameras and {others:,} random ones")
     resume_and_print(run, console, policy=run.settings.policy)
 

@@ -124,7 +124,7 @@ def parse_settings(pairs: Sequence[str] | None, command: Any) -> dict[str, Any]:
 def _names(key: str, row: str) -> bool:
     """Whether a key is a row of the table, or a kind of a setting that has a number for each."""
     stem = row.removesuffix("KIND")
-    return key == row or (stem != row and key.startswith(stem))
+    return key == row or (stem != row and key.rpartition(".")[0] + "." == stem)
 
 
 def _value(text: str) -> Any:

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from mgs.errors import InputError
 from mgs.policy.criteria import PIXEL_NOISE, PRIOR_STD, lam_by_kind, regularisation
 
 # Learning rates of the optimiser, about the longest step, in the unit of each kind of parameter:
@@ -23,7 +22,7 @@ PASSES, WARM_PASSES = 10, 5
 # constant (docs/fit.md, An opaque surface).
 ALPHA_WEIGHT = 0.1
 
-MOST_OF_FIT = 2**25  # Gaussians of a fit
+MOST_OF_FIT, MOST_PASSES = 2**25, 10**6  # Gaussians and passes of a fit
 
 Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
 # A number that others are divided by, bounded so that the results neither overflow nor vanish.
@@ -62,7 +61,7 @@ class TrainSettings(Frozen):
     values as the model blends them)."""
     optimiser: str = "natural"
     """Optimiser of the fit: natural (gradient divided by Fisher information) or adam."""
-    passes: Annotated[int, Field(ge=1)] = PASSES
+    passes: Annotated[int, Field(ge=1, le=MOST_PASSES)] = PASSES
     """Most passes over the images in a fit."""
     tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.01
     """The fit has settled when two passes in a row lower the loss by less than this share."""
@@ -112,7 +111,7 @@ class ModelSettings(Frozen):
     """Standard deviation of a pixel value's residual; sets lambda, the regularisation."""
     prior_std: dict[str, Scale] = PRIOR_STD
     """Prior standard deviation by kind of parameter; `mean`, in metres, only if means move."""
-    warm_passes: Annotated[int, Field(ge=1)] = WARM_PASSES
+    warm_passes: Annotated[int, Field(ge=1, le=MOST_PASSES)] = WARM_PASSES
     """Most passes of each fit after the first; never more than `passes`."""
     warm_rate: Positive = 1.0
     """Factor on the learning rates of the fits after the first."""
@@ -140,9 +139,7 @@ class ModelSettings(Frozen):
     ) -> NDArray[np.float64]:
         """lambda [P] of the columns of the Fisher information; groups: columns by kind. surface: of
         the Gaussians on the surface before training, which the setting `lam` does not concern.
-        Raises InputError where `prior_std` lacks one of these kinds."""
-        if missing := [kind for kind in groups if kind not in self.prior_std]:
-            raise InputError(f"prior_std: has no number for {missing[0]}; give one, metres")
+        Raises InputError as `criteria.regularisation`."""
         by_kind = regularisation(groups, self.pixel_noise, self.prior_std)
         return by_kind if surface or self.lam is None else np.full_like(by_kind, self.lam)
 

@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from mgs.errors import InputError
+
 Array = NDArray[np.floating]
 
 Score = Callable[[Array, Array, Array], float]
@@ -37,7 +39,10 @@ def regularisation(
     7 is 2/l times the mutual information of the parameters and the new image, nats.
 
     groups: columns of each kind of parameter (`mgs.splat.groups`). prior_std: tau of each kind;
-    that of colour is for degree 0. Higher degrees have DIRECTIONAL_STD."""
+    that of colour is for degree 0. Higher degrees have DIRECTIONAL_STD. Raises InputError where
+    `prior_std` lacks a kind."""
+    if missing := [kind for kind in groups if kind not in prior_std]:
+        raise InputError(f"prior_std: has no number for {missing[0]}; give one, metres")
     lam = np.empty(max(columns.stop for columns in groups.values()))
     for name, columns in groups.items():
         lam[columns] = (pixel_noise / prior_std[name]) ** 2

@@ -373,8 +373,9 @@ def load_prior(folder: str | Path) -> Prior:
             raise ValueError("points.ply has NaN values, or fewer than two points")
         if not (0 < spacing < np.inf and 0 < tolerance < np.inf):
             raise ValueError("prior.json: spacing and depth_tolerance must be positive metres")
-        if not 0 <= backed <= len(columns):
-            raise ValueError("prior.json: backed must be a number of the points")
+        numbered = backed, numbers.get("triangulated", 0)
+        if not all(isinstance(one, int) and 0 <= one <= len(columns) for one in numbered):
+            raise ValueError("prior.json: backed and triangulated must be numbers of the points")
     mesh = read_mesh(folder / "mesh.ply")
     points, normals = columns[:, :3], columns[:, 3:]
     prior = Prior(mesh, points, normals, spacing, tolerance, numbers, backed)

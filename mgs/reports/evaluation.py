@@ -157,8 +157,8 @@ def evaluate(
         subject = load_gaussians(path, prior)
         if holds_run(path.parent):
             root = dataset.root if isinstance(dataset, Dataset) else dataset
-            of_run = Path(read_config(path.parent)["settings"]["dataset"])
-            if root is None or Path(root).resolve() == of_run:
+            of_run = read_config(path.parent)["settings"].get("dataset")
+            if root is None or str(Path(root).resolve()) == of_run:
                 run = open_run(path.parent)
                 dataset = run.dataset
                 trained = list(trained) or [frame.name for frame in run.taken]

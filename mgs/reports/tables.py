@@ -28,6 +28,8 @@ def compare_runs(runs: Sequence[str | PathLike[str]]) -> dict[str, Run]:
     `Run.steps`, `Run.metrics` and `Run.dataset`; if steps.jsonl is not that of the run; if two runs
     have the same policy and folder name; and if the runs are on different datasets."""
     opened = [one for run in runs for one in _opened(run)]
+    if not opened:
+        raise InputError("report: there are no runs; give the folder of one, or of several")
     policies = [run.label for run in opened]
     labelled = {}
     for run in opened:

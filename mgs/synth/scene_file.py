@@ -37,10 +37,10 @@ class Rock(_Strict):
     size: Positive = 1.8  # longest side, metres; a mesh given by `mesh` is scaled to it too
     buried: Annotated[float, Field(ge=0, lt=1)] = 0.12  # share of its height below the ground
     lobes: Annotated[tuple[Lobe, ...], Field(min_length=1)] = (Lobe(radii=(1.0, 0.8, 0.72)),)
-    facets: Annotated[int, Field(ge=0)] = 16  # planes that cut each lobe
+    facets: Annotated[int, Field(ge=0, le=1000)] = 16  # planes that cut each lobe
     relief: Fraction = 0.06  # amplitude of the coarsest displacement, as a share of the size
     cracks: Fraction = 0.012  # depth of cracks, as a share of the size
-    layers: Annotated[int, Field(ge=0)] = 0  # number of strata over the height; 0 for none
+    layers: Annotated[int, Field(ge=0, le=1000)] = 0  # number of strata over the height; 0 for none
     plain_half: bool = False  # leave the half at negative x without albedo texture
     colours: tuple[Colour, Colour] = ((0.30, 0.24, 0.19), (0.14, 0.115, 0.10))  # light, dark
     dust: Colour = (0.42, 0.30, 0.20)  # dust on faces that look up
@@ -54,7 +54,7 @@ class Arena(_Strict):
 
     colour: Colour = (0.36, 0.26, 0.18)
     undulation: Annotated[float, Field(ge=0)] = 0.02  # amplitude near the rock, metres
-    stones: Annotated[int, Field(ge=0)] = 700
+    stones: Annotated[int, Field(ge=0, le=100_000)] = 700
     stone_size: Positive = 0.05  # median diameter, metres; a power law up to `largest_stone`
     largest_stone: Positive = 0.16
     spread: Positive = 12.0  # stones lie within this distance of the rock's axis, metres
