@@ -195,6 +195,11 @@ def shown_as(policy: str) -> str:
     return label.partition(":")[2] if policy in BASELINES else label
 
 
+def worded(policy: str) -> str:
+    """Name of a policy in words, as pages write it: those of files have underscores."""
+    return policy.replace("_", " ")
+
+
 def cells_of(
     size: SetupSize,
     policies: Sequence[str] | None = None,
@@ -415,7 +420,7 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
         values = list(by_scene(rows, setup, policy, "test_gain").values())
         low, high = interval(values) or (np.nan, np.nan)
         gain = {"gain": float(np.mean(values)), "gain_low": low, "gain_high": high}
-        means.append({"setup": setup, "policy": policy} | gain)
+        means.append({"setup": setup, "policy": worded(policy)} | gain)
     title = "PSNR over random views (dB)\nBold: the 95 % interval excludes 0"
     draw_matrix(path, Panel("setup", "gain", "set-up", "", "policy", title=title), means)
 
@@ -437,7 +442,7 @@ def tables(rows: Sequence[Row]) -> str:
         across: Sequence[str] = tuple(setups),
     ) -> str:
         columns = {title: "policy"} | {name: name for name in across}
-        lines = [{"policy": p} | {name: cell(name, p) for name in across} for p in policies]
+        lines = [{"policy": worded(p)} | {n: cell(n, p) for n in across} for p in policies]
         return table(columns, lines)
 
     def gain(key: str) -> Callable[[str, str], str]:

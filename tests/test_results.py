@@ -21,6 +21,7 @@ def test_tables_of_pages_are_of_their_rows():
              if row["variant"] == "--sh 1" and row["pool"] == "hemisphere, 4"]  # fmt: skip
     (line,) = (line for line in shown if line.startswith("| --sh 1 |"))
     assert f"| {sum(gains) / len(gains):+.2f} [" in line
+    assert "| near angle |" in tables_of(RESULTS / "setups/setups.csv")[1]
 
 
 def test_rows_made_anew_are_compared_with_those_of_their_rock(tmp_path):
