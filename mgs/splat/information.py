@@ -99,6 +99,8 @@ def fisher(
         each = [None] * len(camera) if weights is None else weights
         if len(each) != len(camera):  # type: ignore[arg-type]
             raise InputError(f"fisher: weights must be {len(camera)} arrays, one for each camera")
+        if not each:
+            raise InputError("fisher: takes one or more cameras")
         how = estimator, background, cache, means, alpha_weight
         pairs = zip(camera, each, strict=True)  # type: ignore[arg-type]
         return np.stack([fisher(model, one, *how, weight, chosen) for one, weight in pairs])
@@ -116,7 +118,7 @@ def fisher(
             why = f"the estimator {estimator!r} has no means, alpha_weight, weights or chosen"
             raise InputError(f"fisher: {why}; use {' or '.join(EXACT)}")
         options = {"means": means, "alpha_weight": alpha_weight}
-        options["weights"] = _weights(weights, camera, alpha_weight)
+        options["weights"] = weights_of(weights, camera, alpha_weight)
         options["chosen"] = rows = _rows(chosen, len(gaussians))
         n = n if rows is None else len(rows)
     if n == 0:
@@ -136,7 +138,7 @@ def fisher(
     return compute(as_drjit(gaussians), camera, background, cache, **options)
 
 
-def _weights(weights: Any, camera: Camera, alpha_weight: float) -> np.ndarray | None:
+def weights_of(weights: Any, camera: Camera, alpha_weight: float = 0.0) -> np.ndarray | None:
     """Weights of pixels and channels, [H,W,4]; those of alpha are 1 if not given."""
     if weights is None:
         return None

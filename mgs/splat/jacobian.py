@@ -104,6 +104,7 @@ def vjp(
         z = dr.detach(z) if dr.is_array_v(z) else mi.TensorXf(padded(z))
         if tuple(z.shape) != tuple(rgb.shape):
             raise InputError(f"cotangent: has shape {z.shape}, expected {rgb.shape}, the image's")
-        if len(model) > 0:
-            dr.backward_from(dr.sum(rgb * z, axis=None))
+        if len(model) == 0:
+            return {name: np.zeros(value.shape, np.float32) for name, value in values.items()}
+        dr.backward_from(dr.sum(rgb * z, axis=None))
         return {name: np.asarray(dr.grad(value)) for name, value in values.items()}

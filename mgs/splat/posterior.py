@@ -6,6 +6,7 @@ passes a view."""
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import prod
 from typing import Any, NamedTuple
 
 import mitsuba as mi
@@ -16,7 +17,7 @@ from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians, learned
 from mgs.memory import padded
-from mgs.splat.information import fisher, groups
+from mgs.splat.information import fisher, groups, weights_of
 from mgs.splat.jacobian import jvp, vjp
 from mgs.splat.rendering import ListCache, as_drjit
 
@@ -43,8 +44,9 @@ class Information:
     - weights: W of each camera, as in `fisher`, by default 1.
     - cache: pass the same one to all calls, to reuse the block lists of cameras.
 
-    Raises InputError as `fisher`. Sources: Ubaru, Chen and Saad 2017 (stochastic Lanczos
-    quadrature); Papandreou and Yuille 2010 (samples by perturbation)."""
+    Raises InputError as `fisher`, and for vectors and lam of other shapes. Sources: Ubaru, Chen and
+    Saad 2017 (stochastic Lanczos quadrature); Papandreou and Yuille 2010 (samples by
+    perturbation)."""
 
     gaussians: Gaussians
     cameras: Sequence[Camera]
@@ -66,7 +68,22 @@ class Information:
         total: Any = 0.0
         for camera, weight in zip(self.cameras, each, strict=True):
             total = total + fisher(self._model, camera, "block", weights=weight, **how)
-        return np.asarray(total, np.float64)
+        n, size = self._shape
+        return np.asarray(total, np.float64) if self.cameras else np.zeros((n, size, size))
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        """N and P."""
+        columns = groups(self.gaussians.sh_degree, self.means)
+        return len(self.gaussians), list(columns.values())[-1].stop
+
+    def _fitted(self, name: str, values: ArrayLike) -> Floats:
+        """Numbers that broadcast to [N,P]. Raises InputError for others."""
+        try:
+            return np.broadcast_to(np.asarray(values, np.float64), self._shape)
+        except (TypeError, ValueError):
+            why = f"{name} must be numbers of shape {self._shape}, those of the parameters"
+            raise InputError(f"information: {why}") from None
 
     @cached_property
     def _model(self) -> Gaussians:
@@ -74,18 +91,14 @@ class Information:
 
     @cached_property
     def _roots(self) -> list[Any]:
-        """Square root of the weights of each view, None or what broadcasts to [H,W,3]."""
-        if self.weights is None:
-            return [None] * len(self.cameras)
-        roots = [np.sqrt(np.asarray(weight, np.float32)) for weight in self.weights]
-        sizes = [(camera.height, camera.width) for camera in self.cameras]
-        pairs = zip(roots, sizes, strict=True)
-        return [root[..., None] if root.shape == size else root for root, size in pairs]
+        """Square root of the weights of each view, None or [H,W,3]."""
+        each = [None] * len(self.cameras) if self.weights is None else self.weights
+        weights = [weights_of(one, camera) for one, camera in zip(each, self.cameras, strict=True)]
+        return [None if one is None else np.sqrt(one[..., :3]) for one in weights]
 
     def product(self, vector: ArrayLike) -> Floats:
         """H v [N,P] of v [N,P]."""
-        total = np.zeros(np.shape(vector))
-        tangents = self._by_name(np.asarray(vector))
+        total, tangents = np.zeros(self._shape), self._by_name(self._fitted("the vector", vector))
         for camera, root in zip(self.cameras, self._roots, strict=True):
             # J^T W J v, view by view.
             image = np.asarray(jvp(self._model, tangents, camera, self.background, self.cache).rgb)
@@ -99,7 +112,7 @@ class Information:
         whiten, lam = self._whitening(lam)
         # Solve A y = b with A = L^-1 (H + lam) L^-T and b = L^-1 v; the solution is L^-T y.
         # x: y so far; r = b - A y, its residual; p: direction of the next step.
-        b = whiten(np.asarray(vector, np.float64), True)
+        b = whiten(self._fitted("the vector", vector), True)
         x, r, p = np.zeros_like(b), b, b
         square, enough = float((r * r).sum()), tolerance**2 * float((b * b).sum())
         for _ in range(MOST_STEPS):
@@ -130,10 +143,10 @@ class Information:
         whiten, lam = self._whitening(lam)
         rng, traces = np.random.default_rng(seed), []
         for _ in range(probes):
-            z = rng.choice([-1.0, 1.0], self.blocks.shape[:2])
+            z = rng.choice([-1.0, 1.0], self._shape)
             traces.append(z.size * self._log_quadratic(z / np.sqrt(z.size), steps, whiten, lam))
         # log det(H + lam) = log det(L L^T) + trace log A.
-        blocks = np.linalg.slogdet(self.blocks + _diagonal(lam))[1].sum()
+        blocks = np.linalg.slogdet(self._precision(lam))[1].sum()
         error = np.std(traces, ddof=1) / np.sqrt(probes)
         return Estimate(float(blocks + np.mean(traces)), float(error))
 
@@ -143,6 +156,8 @@ class Information:
         # A Q = Q T with orthonormal Q and tridiagonal T: a its diagonal, b beside it.
         # Then q^T log(A) q is about e1^T log(T) e1 = sum over i of u_1i^2 log theta_i, with
         # theta_i the eigenvalues of T and u_1i the first entries of its eigenvectors.
+        if q.size == 0:
+            return 0.0
         basis, a, b = [q], list[float](), list[float]()
         for _ in range(min(steps, q.size)):
             w = self._whitened(basis[-1], whiten, lam)
@@ -170,11 +185,10 @@ class Information:
         tolerance: as in `solve`. pixel_noise: sigma_e, that of lam. Each draw adds (H + lam)^-1
         (J^T W^1/2 e + lam^1/2 n) sigma_e with unit normal e and n, which has this covariance, at
         the cost of one `solve`."""
-        rng, (n, size) = np.random.default_rng(seed), self.blocks.shape[:2]
-        draws = []
+        rng, lam, draws = np.random.default_rng(seed), self._fitted("lam", lam), []
         for _ in range(count):
             # b = lam^1/2 n + J^T W^1/2 e has the covariance H + lam, so (H + lam)^-1 b its inverse.
-            b = rng.standard_normal((n, size)) * np.sqrt(lam)
+            b = rng.standard_normal(self._shape) * np.sqrt(lam)
             for camera, root in zip(self.cameras, self._roots, strict=True):
                 noise = rng.standard_normal((camera.height, camera.width, 3))
                 b += self._transposed(noise if root is None else noise * root, camera)
@@ -194,16 +208,17 @@ class Information:
         """J^T z [N,P] of an image z [H,W,3]."""
         names, z = list(learned(self.means)), mi.TensorXf(padded(image))
         parts = vjp(self._model, z, camera, self.background, self.cache, names).values()
-        return np.concatenate([np.float64(part).reshape(len(part), -1) for part in parts], 1)
+        flat = [np.float64(part).reshape(len(part), prod(part.shape[1:])) for part in parts]
+        return np.concatenate(flat, 1)
 
     def _whitening(self, lam: ArrayLike) -> tuple[Any, Floats]:
         """Return whiten(v, transposed) -> L^-T v or, transposed, L^-1 v of v [N,P], with L L^T the
         blocks of H + lam; and lam."""
-        lam = np.asarray(lam, np.float64)
+        lam = self._fitted("lam", lam)
         if not (lam > 0).all():
             raise InputError("information: lam must be positive, else the precision has no inverse")
         # L^-1 of each block.
-        inverse = np.linalg.inv(np.linalg.cholesky(self.blocks + _diagonal(lam)))
+        inverse = np.linalg.inv(np.linalg.cholesky(self._precision(lam)))
 
         def whiten(v: Floats, transposed: bool) -> Floats:
             return np.einsum("nij,nj->ni" if transposed else "nji,nj->ni", inverse, v)
@@ -215,7 +230,8 @@ class Information:
         inner = whiten(v, False)
         return np.asarray(whiten(self.product(inner) + lam * inner, True))
 
-
-def _diagonal(lam: Floats) -> Floats:
-    """lam [P] or [N,P] as diagonal matrices."""
-    return lam[..., None] * np.eye(lam.shape[-1])
+    def _precision(self, lam: Floats) -> Floats:
+        """Diagonal blocks of H + lam [N,P,P]."""
+        blocks = self.blocks.copy()
+        np.einsum("nii->ni", blocks)[...] += lam  # a view of the diagonals
+        return blocks

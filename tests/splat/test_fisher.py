@@ -320,12 +320,35 @@ def test_reverse_products_are_the_gradient_and_the_transpose(gaussians):
     np.testing.assert_allclose(image, np.stack(alone), rtol=1e-6)
 
 
+def test_without_views_the_prior_is_left_and_without_gaussians_nothing(gaussians):
+    info, b = Information(gaussians, []), np.ones((6, 11))
+    np.testing.assert_allclose(info.solve(b, LAM), b / LAM)
+    np.testing.assert_allclose(info.solve(b, 2.0), b / 2)
+    assert info.log_det(LAM).value == pytest.approx(6 * np.log(LAM).sum())
+    assert len(info.samples(LAM, 1)[0]) == 6
+    none = make_gaussians(0, 0)
+    info = Information(none, CAMERAS)
+    assert info.log_det(LAM) == (0, 0)
+    assert len(info.samples(LAM, 1)[0]) == 0
+    found = vjp(none, np.ones((16, 24, 3)), CAMERAS[0])
+    assert {name: value.shape for name, value in found.items()} == {
+        name: getattr(none, name).shape for name in found
+    }
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda g: vjp(g, np.ones((2, 2, 3)), CAMERAS[0]), "cotangent: has shape"),
         (lambda g: vjp(g, 0, CAMERAS[0], by=["colour"]), "'colour' is no parameter"),
         (lambda g: render(g, []), "one or more cameras of one image size"),
+        (lambda g: fisher(g, []), "takes one or more cameras"),
+        (lambda g: Information(g, CAMERAS).product(np.ones(66)), "vector must be .*[(]6, 11[)]"),
+        (lambda g: Information(g, CAMERAS).solve(np.ones((6, 11)), [1, 2]), "lam must be numbers"),
+        (
+            lambda g: Information(g, CAMERAS, weights=[np.ones(2)] * 2).product(np.ones((6, 11))),
+            "weights of shape",
+        ),
         (lambda g: Information(g, CAMERAS, weights=[1]), "weights must be 2 arrays"),
         (lambda g: Information(g, CAMERAS).log_det(LAM, probes=1), "give at least 2"),
         (lambda g: Information(g, CAMERAS).solve(np.ones((6, 11)), 0 * LAM), "must be positive"),
