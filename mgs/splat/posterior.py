@@ -9,14 +9,12 @@ from functools import cached_property
 from math import prod
 from typing import Any, NamedTuple
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mgs.camera import Camera
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians, learned
-from mgs.memory import padded
 from mgs.splat.information import fisher, groups, weights_of
 from mgs.splat.jacobian import jvp, vjp
 from mgs.splat.rendering import ListCache, as_drjit
@@ -206,8 +204,8 @@ class Information:
 
     def _transposed(self, image: np.ndarray, camera: Camera) -> Floats:
         """J^T z [N,P] of an image z [H,W,3]."""
-        names, z = list(learned(self.means)), mi.TensorXf(padded(image))
-        parts = vjp(self._model, z, camera, self.background, self.cache, names).values()
+        names = list(learned(self.means))
+        parts = vjp(self._model, image, camera, self.background, self.cache, names).values()
         flat = [np.float64(part).reshape(len(part), prod(part.shape[1:])) for part in parts]
         return np.concatenate(flat, 1)
 
