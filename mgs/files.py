@@ -420,8 +420,9 @@ def _is_lock(path: Path, or_empty: bool = False) -> bool:
     """Whether a path is a lock file of mgs, or an empty file."""
     if path.is_symlink() or not path.is_file():
         return False
-    data = path.read_bytes()[: len(MARK) + 20]
-    return data.startswith(MARK.encode()) or (or_empty and not data)
+    with path.open("rb") as file:
+        data = file.read(len(MARK))  # of a file of any length
+    return data == MARK.encode() or (or_empty and not data)
 
 
 @contextmanager
@@ -550,7 +551,7 @@ def _flock(path: Path, file: TextIO) -> None:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         file.seek(0)
-        process = file.read().removeprefix(MARK)
+        process = file.read(len(MARK) + 20).removeprefix(MARK)
         by = f"process {process} works on it"
         raise InputError(f"{path.parent}: {by}; wait until it has ended") from None
 

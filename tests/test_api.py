@@ -99,7 +99,7 @@ def test_a_function_is_a_policy_that_a_resumed_run_asks_for(dataset, prior, tmp_
     assert run.state.taken[3] == max(left, key=lambda i: highest(places)[i])
     assert run.label == "highest"
     fails("parameter view", mgs.start_run, dataset, out / "x", policy=lambda view: 0, **given)
-    (out / "policy.py").write_text("def highest(candidates): ...")
+    (out / "policy.py").write_bytes(b"def highest(candidates): ...\xff")
     fails("policy highest: is not as", mgs.resume_nbv, out, policy=highest)
 
 

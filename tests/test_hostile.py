@@ -447,7 +447,7 @@ def test_nothing_below_a_locked_folder_is_written_through_a_link(outside, tmp_pa
 
 
 @pytest.mark.parametrize("use", [locked, folder_locked])
-@pytest.mark.parametrize("kind", ["link", "text", "folder"])
+@pytest.mark.parametrize("kind", ["link", "text", "huge", "folder"])
 def test_a_lock_that_mgs_did_not_make(outside, tmp_path, use, kind):
     run = tmp_path / "run"
     run.mkdir()
@@ -455,6 +455,7 @@ def test_a_lock_that_mgs_did_not_make(outside, tmp_path, use, kind):
     {
         "link": lambda: lock.symlink_to(outside / "a"),
         "text": lambda: lock.write_text("mine"),
+        "huge": lambda: (lock.touch(), os.truncate(lock, 1 << 40)),
         "folder": lock.mkdir,
     }[kind]()
     with pytest.raises(InputError, match=r"\.lock: is in the way"), use(run):

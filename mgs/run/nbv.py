@@ -14,7 +14,7 @@ from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame, has_masks
 from mgs.data.structure import CLOUD, write_refined
 from mgs.errors import InputError
-from mgs.files import THERE, Ours, atomic_folder, read_leftover, reading
+from mgs.files import THERE, Ours, atomic_folder, read_leftover, read_text
 from mgs.fit.density import GROWTH, split_times
 from mgs.fit.settings import ALPHA_WEIGHT, MOST_OF_FIT, ModelSettings, TrainSettings, as_3dgs
 from mgs.gaussians import MAX_SH_DEGREE, Gaussians
@@ -385,9 +385,7 @@ def check_named(run: Run, policy: str | Callable[..., Any] | None) -> None:
         if policy is None or isinstance(policy, str):
             raise InputError(f"{run.folder}: its policy is a Python function; in Python: {call}")
         file = run.folder / POLICY_SOURCE
-        with reading(file):
-            same = file.read_text(encoding="utf-8") == code_of(policy)
-        if not same:
+        if read_text(file) != code_of(policy):
             raise InputError(f"policy {label(own)}: is not as {file} has it; restore it")
     if in_file(own) and policy is None:
         resume = f"`mgs nbv --resume {run.folder} --policy {own}`"
