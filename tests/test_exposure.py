@@ -17,7 +17,8 @@ from mgs.data.dataset import Dataset, load_dataset, write_transforms
 from mgs.files import read_json
 from mgs.images import exif_exposure, write_png
 from mgs.metrics import colour_corrected
-from mgs.prior.exposure import DARK, GAIN_STD, RATIO_STD, SATURATED, solve_gains
+from mgs.prior.build import load_prior
+from mgs.prior.exposure import DARK, GAIN_STD, RATIO_STD, SATURATED, exposure_of, solve_gains
 from mgs.reports.tables import markdown_table
 from mgs.run.folder import Checkpoint, read_checkpoint
 
@@ -125,6 +126,16 @@ def varied(rock: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for frame, gain in zip(dataset.frames, gain_of(dataset), strict=True):
         write_png(frame.image_path, frame.rgb() * gain.astype(np.float32))
     return root
+
+
+def test_gains_of_refined_poses_are_measured_anew(varied):
+    frames, prior = load_dataset(varied).frames, load_prior(varied / "prior")
+    turned = replace(frames[0].camera, world_to_camera=frames[1].camera.world_to_camera)
+    moved = (replace(frames[0], camera=turned), *frames[1:])
+    gains = exposure_of(prior)
+    before = gains(frames)
+    assert np.array_equal(gains(moved), exposure_of(prior)(moved))
+    assert not np.array_equal(gains(moved), before)
 
 
 Runs = dict[str, tuple[Checkpoint, Path]]

@@ -57,7 +57,7 @@ def exposure_of(prior: Prior) -> Callable[[Sequence[Frame]], np.ndarray]:
     count = prior.numbers.get("triangulated", len(prior.points))
     some = slice(None, count, max(1, -(-count // SAMPLES)))
     points, normals = prior.points[some], prior.normals[some]
-    depth, cache = depth_of(prior), dict[str, tuple[np.ndarray, np.ndarray]]()
+    depth, cache = depth_of(prior), dict[Frame, tuple[np.ndarray, np.ndarray]]()
 
     def shown(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
         colours = np.full((len(points), 3), np.nan)
@@ -69,10 +69,10 @@ def exposure_of(prior: Prior) -> Callable[[Sequence[Frame]], np.ndarray]:
 
     def gains(frames: Sequence[Frame]) -> np.ndarray:
         for frame in frames:
-            if frame.name not in cache:
+            if frame not in cache:  # a frame whose pose was refined is another
                 report(Stage.READ, len(cache), len(frames))
-                cache[frame.name] = shown(frame)
-        colours, weights = zip(*(cache[frame.name] for frame in frames), strict=True)
+                cache[frame] = shown(frame)
+        colours, weights = zip(*(cache[frame] for frame in frames), strict=True)
         return solve_gains(np.stack(colours), np.stack(weights))
 
     return gains
