@@ -26,6 +26,7 @@ from mgs.data.clouds import read_cloud
 from mgs.data.colmap import image_count
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.importers import import_source
+from mgs.data.on_site import dataset_at
 from mgs.data.photographs import sharpest_frames
 from mgs.data.shots import Spacing
 from mgs.data.sources import read_source
@@ -33,7 +34,7 @@ from mgs.data.structure import Matcher
 from mgs.errors import Notice
 from mgs.files import read_json, write_json
 from mgs.fit.poses import displaced, motion_between
-from mgs.images import write_png
+from mgs.images import read_depth, write_exr, write_png
 from mgs.prior.photographs import check_photographs
 from mgs.progress import listening
 
@@ -256,6 +257,108 @@ def test_a_distance_gives_the_scale(placed):
     assert np.linalg.norm(eyes["view 00"] - eyes["view 06"]) == pytest.approx(10)
     for wrong in ("view 00.jpg,10", "view 00.jpg,other,10", "view 00.jpg,view 01.jpg,0"):
         fails("distance", placed[1].with_distance, wrong)
+
+
+def write_depth(frames, folder, change=lambda z, k: z):
+    """Depth images in turn as EXR and as PNG of half the sides, the one that lies on its side as
+    its picture does."""
+    shutil.rmtree(folder, ignore_errors=True)
+    for k, frame in enumerate(frames):
+        depth = change(synthetic.cast(frame.camera, [(synthetic.CENTRE, synthetic.AXES)])[0], k)
+        depth = np.rot90(depth) if k == 3 else depth
+        if k % 2:
+            write_png(folder / f"{frame.name}.png", np.uint16(1000 * depth[1::2, 1::2]))
+        else:
+            write_exr(folder / f"{frame.name}.exr", {"Z": depth})
+
+
+@pytest.fixture
+def deep(placed, monkeypatch):
+    """read(**options): the photographs of `placed` again, as if without GPS unless asked, and the
+    folder of their depth."""
+    root = placed[0].root.parent / "photos"
+
+    def read(gps=False, **options):
+        with monkeypatch.context() as patched:
+            patched.setattr("pycolmap.extract_features", stop_at())
+            if not gps:
+                patched.setattr(photographs, "_to_gps", lambda *_: None)
+            return read_source(root, unpack=root.parent / "again", **options)
+
+    yield read, root / "depth"
+    shutil.rmtree(root / "depth", ignore_errors=True)
+
+
+@pytest.mark.parametrize("given", ["", "GPS", "--distance", "--unit"])
+def test_depth_beside_photographs_gives_the_scale_or_is_made_to_fit(given, frames, deep, tmp_path):
+    """Of one photograph there is none; pictures are as before."""
+    read, folder = deep
+    write_depth(frames[:-1], folder, lambda z, k: 1.05 * z if given == "GPS" else z)
+    options = {"--distance": {"distance": "view 00,view 06,10"}, "--unit": {"unit": 3}}
+    source = read(given == "GPS", **options.get(given, {}))
+    assert (source.unit, len(source.shots)) == ("m", 9)
+    eyes = [{s.name: s.camera.position for s in each}["view 06"] for each in (source.shots, frames)]
+    firsts = [each[0].camera.position for each in (source.shots, frames)]
+    ours, true = (np.linalg.norm(one - two) for one, two in zip(eyes, firsts, strict=True))
+    assert given or ours == pytest.approx(true, rel=0.01)
+    note, factor = source.notes[-1], source.shots[0].depth_factor
+    if given:
+        assert note.startswith(f"{given} gives the scale; the depth of 8 photographs is multiplied")
+        assert f"by {factor:.4g} " in note
+        assert factor == pytest.approx(ours / true / (1.05 if given == "GPS" else 1), rel=0.01)
+    else:
+        assert "m per unit from the depth of 8 photographs, spread 0." in note
+    data = import_source(source, tmp_path / "d")
+    assert [bool(frame.depth_path) for frame in data.frames] == [True] * 8 + [False]
+    points = read_cloud(data.root / "sparse.ply").points
+    for k, frame in enumerate(data.frames[:-1]):
+        pixels, z = data.world.leave(frame.camera).project(points)
+        column, row = pixels.astype(int).T
+        depth = frame.depth()
+        inside = (pixels > 0).all(1) & (column < WIDTH) & (row < HEIGHT)
+        measured = depth[row[inside], column[inside]]
+        assert np.median(np.abs(measured / z[inside] - 1)) < 0.01
+        if not k:  # never blended
+            kept = factor * read_depth(source.shots[k].depth)
+            assert np.isin(depth, kept.astype(np.float32)).all()
+
+
+@pytest.mark.parametrize("fault", ["of each its own", "inverse", "flat", "few"])
+def test_depth_that_gives_no_scale_is_left_out_with_the_reason(fault, frames, deep):
+    changes = {
+        "of each its own": lambda z, k: z * 1.3**k,
+        "inverse": lambda z, k: 3 / np.where(z > 0, z, np.inf),
+        "flat": lambda z, k: z**0.3,
+        "few": lambda z, k: np.where(np.arange(len(z)) < 9, z.T, 0).T,
+    }
+    write_depth(frames, deep[1], changes[fault])
+    source = deep[0]()
+    assert (source.unit, source.depth_scale) == (None, None)
+    assert not any(shot.depth for shot in source.shots)
+    why = "a scale needs 100" if fault == "few" else "it contradicts the distance of their points"
+    assert "depth of 9 photographs is left out: " in source.notes[-1]
+    assert why in source.notes[-1]
+    assert fault != "flat" or "(spread 9 %)" in source.notes[-1]
+
+
+def test_depth_beside_photographs_on_site_is_used(frames, tmp_path):
+    write_depth(frames[:3], tmp_path / "photos/depth")
+    for frame in frames[:3]:
+        shutil.copy(frame.image_path, tmp_path / "photos")
+    data, notes = dataset_at(tmp_path / "photos", tmp_path / "site")
+    assert "from the depth of 3 photographs" in notes[-1]
+    assert data.unit == "m"
+    assert all(frame.depth_path for frame in data.frames)
+
+
+def test_depth_of_other_names_or_kinds_is_refused_before_photographs_are_placed(frames, deep):
+    read, folder = deep
+    folder.mkdir()
+    write_png(folder / "0.png", np.ones((HEIGHT, WIDTH), np.uint16))
+    fails("none of its 1 depth images has the name of a photograph, as blank.png", read)
+    (folder / "0.png").unlink()
+    write_png(folder / "view 04.png", np.ones((HEIGHT, WIDTH), bool))
+    fails("view 04.png: a picture of 8 bits is no depth", read)
 
 
 @pytest.mark.parametrize("case", ["one", "apart", "file", "none", "tripod"])

@@ -74,6 +74,7 @@ def import_data(
     - up: Up direction: X,Y,Z in the source's world, or auto: from how cameras were held.
     - unit: Metres per unit of length of the source. Default: as the source says, if it does.
     - distance A,B,METRES: Distance between the cameras of two images, which gives the scale.
+      Without it, GPS in photographs does, else their depth images, in a folder `depth` beside them.
     - test_every N: Make the first and every further Nth image, by name, a test view; 8 is usual.
     - pose TOPIC: Topic of a bag's poses of the camera, or of the body that carries it.
     - exclude NAME: Leave this image out; repeat for more.
@@ -84,10 +85,11 @@ def import_data(
     options = {key: value for key, value in locals().items() if key not in ("out", "force")}
     from mgs.data.bags import is_bag
     from mgs.data.colmap import models_in
+    from mgs.data.depth_beside import depth_files
     from mgs.data.importers import RECORD, import_source, least_factor
     from mgs.data.meshes import GLTF
     from mgs.data.photographs import KIND as PHOTOGRAPHS
-    from mgs.data.photographs import PLACED, photographs_in
+    from mgs.data.photographs import PLACED, depth_places, photographs_in
     from mgs.data.sources import read_source
 
     console, notes = Terminal(), Terminal(stderr=True)
@@ -108,7 +110,8 @@ def import_data(
     beside += [path for path in model if path.suffix in (".bin", ".txt")]  # others add to it
 
     def photographs() -> list[Path]:
-        return [*photographs_in(images or source), source / "transforms.json"]
+        depth = depth_files(*depth_places(source, images))
+        return [*photographs_in(images or source), *depth, source / "transforms.json"]
 
     if record.get("kind") == PHOTOGRAPHS and "files" in record:  # to place them again takes long
         with progress_bar("reading", console):
@@ -128,9 +131,9 @@ def import_data(
             pose=pose,
             exclude=exclude or [],
             test_split=test_split,
+            unit=unit,
+            distance=distance,
         )
-        shots = shots if unit is None else shots.in_metres(unit)
-        shots = shots if distance is None else shots.with_distance(distance)
         upward, reason = shots.up_or_estimate() if axis is None else (axis, "as --up says")
         read = [path for shot in shots.shots for path in shot.files]
         files = _stamp([*beside, *(photographs() if shots.kind == PHOTOGRAPHS else read)])

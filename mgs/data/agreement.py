@@ -63,6 +63,15 @@ class Agreement:
     problem: str = ""  # what is wrong with the poses; empty if they fit
 
 
+@dataclass(frozen=True)
+class DepthScale:
+    """Length of 1 by depth images: measured depth over that of triangulated points."""
+
+    metres: float  # median
+    spread: float  # half the distance between the quartiles, over the median
+    images: int
+
+
 def agreement(frames: Sequence[Frame], matcher: Matcher, masked: bool = True) -> Agreement | None:
     """Compare poses with what pictures of neighbours in time show: points matched in them, else
     their depth, else the outlines of their masks, else the place that all cameras look at. None

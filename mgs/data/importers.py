@@ -5,7 +5,6 @@ import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from mgs.camera import Camera
 from mgs.data.clouds import write_cloud
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, resumes, write_transforms
+from mgs.data.depth_beside import depth_of
 from mgs.data.frames import Frame, premultiplied, write_rock_image
 from mgs.data.lens import Undo, read_fitting, shrunk, undistorter
 from mgs.data.meshes import Mesh, read_mesh
@@ -30,7 +30,7 @@ from mgs.files import (
     remove_file,
     write_json,
 )
-from mgs.images import PNG_BIT_DEPTH, read_depth, read_mask, read_rgba, write_exr, write_png
+from mgs.images import PNG_BIT_DEPTH, read_mask, read_rgba, write_exr, write_png
 from mgs.progress import report
 
 Silhouette = Callable[[Camera], np.ndarray]  # mask of a camera, bool [H,W]
@@ -164,7 +164,7 @@ def _digest(shots: list[Shot]) -> str:
             shot.camera.world_to_camera.tolist(),
             shot.lens and [shot.lens.model, *shot.lens.parameters],
             shot.timestamp,
-            shot.depth_unit,
+            shot.depth_factor * shot.depth_unit,
             shot.float_unit,
             shot.turned,
             [
@@ -195,10 +195,7 @@ def import_shot(
         mask, rock = silhouette(camera) if silhouette else None, None
         if silhouette is None:
             mask, rock = _mask_and_rock(shot, rgba, undo)
-        reader = partial(read_depth, unit=shot.depth_unit, float_unit=shot.float_unit)
-        depth = None
-        if shot.depth is not None:
-            depth = read_fitting(reader, shot.depth, shot.camera, shot.turned, resized=True)
+        depth = None if shot.depth is None else depth_of(shot)
         begin()
         if depth_path is not None and depth is not None:
             write_exr(depth_path, {"Z": undo(depth, False)})

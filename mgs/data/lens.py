@@ -227,13 +227,16 @@ def read_fitting(
     camera: Camera,
     turned: bool = False,
     resized: bool = False,
+    stored: int = 1,
 ) -> np.ndarray:
     """Pixels of an image file, turned by its EXIF orientation if `turned`, or if only that fits its
     camera's size. resized: one of another size and the same proportions gives the nearest pixels,
-    if it is not smaller by more than COARSEST. Raises InputError, before anything is decoded, if
-    neither size fits."""
+    if it is not smaller by more than COARSEST. stored: EXIF orientation of a file that has none and
+    lies on its side. Raises InputError, before anything is decoded, if neither size fits."""
     size, real = (camera.width, camera.height), image_size(path)
     orientation = exif_orientation(path) if turned or real == size[::-1] != size else 1
+    if orientation == 1 and stored >= 5 and (real[0] > real[1]) != (size[0] > size[1]):
+        orientation = stored
     whole = real[::-1] if orientation >= 5 else real
     similar = is_reduced(size, whole) or is_reduced(whole, size)
     if size != whole and not (resized and similar and COARSEST * max(whole) >= max(size)):

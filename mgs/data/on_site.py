@@ -7,8 +7,9 @@ from pathlib import Path
 from PIL import Image
 
 from mgs.data.dataset import Dataset
+from mgs.data.depth_beside import depth_files
 from mgs.data.importers import import_source
-from mgs.data.photographs import check_alone, photographs_in
+from mgs.data.photographs import check_alone, depth_places, photographs_in
 from mgs.data.sources import read_source
 from mgs.data.structure import WIDEST
 from mgs.files import (
@@ -50,7 +51,8 @@ def dataset_at(folder: Path, site: Path) -> tuple[Dataset, Sequence[str]]:
         root, data = below(site, COPIES), below(site, DATASET)
         with parsing(record, "list of copies", f"delete {site}"):
             before = [str(name) for name in read_json(record)] if record.is_file() else []
-        names = [str(path.relative_to(folder)) for path in photographs_in(folder)]
+        paths = [*photographs_in(folder), *depth_files(*depth_places(folder))]
+        names = [str(path.relative_to(folder)) for path in paths]
         write_json(record, sorted({*before, *names}))
         for name in set(before) - set(names):
             remove_file(root, root / name)

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mgs.data.colmap import image_count, is_whole_model, source_of
+from mgs.data.depth_beside import depth_beside, depth_files, with_depth
 from mgs.data.shots import PICTURE_SUFFIXES, Shot, Source, Spacing, frame_name, natural
 from mgs.data.structure import Matcher
 from mgs.data.world import PLUS_Z
@@ -47,11 +48,17 @@ def pictures_of(source: Path) -> Path:
     return source / "images" if (source / "images").is_dir() else source
 
 
+def depth_places(source: Path, images: Path | None = None) -> list[Path]:
+    """Folders that may hold the depth of photographs, those in `images` or else in `source`."""
+    return [pictures_of(images or source), images or source, source]
+
+
 def photographs_in(source: Path) -> list[Path]:
-    """Pictures in `pictures_of` a folder and the folders in it; none if it is none."""
-    endings = (*PICTURE_SUFFIXES, *UNREAD)
-    paths = [path for path in pictures_of(source).rglob("*") if path.suffix.lower() in endings]
-    return sorted((path for path in paths if path.is_file()), key=natural)
+    """Pictures in `pictures_of` a folder and the folders in it, without `depth_files`; none if it
+    is none."""
+    endings, root = (*PICTURE_SUFFIXES, *UNREAD), pictures_of(source)
+    paths = {path for path in root.rglob("*") if path.suffix.lower() in endings}
+    return sorted((path for path in paths - {*depth_files(root)} if path.is_file()), key=natural)
 
 
 def check_alone(source: Path) -> None:
@@ -63,12 +70,17 @@ def check_alone(source: Path) -> None:
 
 
 def read_photographs(
-    source: Path, paths: Sequence[Path], folder: Path, exclude: Sequence[str]
+    source: Path,
+    paths: Sequence[Path],
+    folder: Path,
+    exclude: Sequence[str],
+    places: Sequence[Path] = (),
 ) -> Source:
     """Poses, lenses and points of photographs, of the largest part that hangs together. folder: for
     matches, which a later call continues. exclude: names of photographs to leave out; they do not
-    place others either. With GPS in their EXIF that fits, the world is in metres, +Y north and +Z
-    up. Raises InputError if fewer than FEWEST can be placed."""
+    place others either. places: folders in which `depth_beside` looks. With GPS in their EXIF that
+    fits, the world is in metres, +Y north and +Z up. Raises InputError if fewer than FEWEST can be
+    placed, and as `depth_beside`."""
     import pycolmap
 
     names = [frame_name(path.relative_to(source).as_posix()) for path in paths]
@@ -82,6 +94,7 @@ def read_photographs(
             f"{source}: of its photographs {len(paths)} can be used; take at least {FEWEST}, "
             f"better 20, that overlap{_and_names(dropped)}"
         )
+    depths = depth_beside(pictures_of(source), paths, places)
     matcher = Matcher(paths, folder)
     matcher.match(_pairs(len(paths)))
     if len(paths) > EXHAUSTIVE:
@@ -107,6 +120,7 @@ def read_photographs(
     lines = (f"left out {names}" for names in _by_reason(why))
     left_out = Counter(why.values())
     result = replace(largest, shots=shots, left_out=left_out, notes=tuple(lines))
+    result = with_depth(result, depths, models[0], {path: k for k, (_, path) in files.items()})
     if georeferenced is None:
         return result
     note = f"GPS gives scale and place: the world's 0 is at {georeferenced}"

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from mgs.camera import Camera
-from mgs.data.agreement import Agreement
+from mgs.data.agreement import Agreement, DepthScale
 from mgs.data.clouds import SparseCloud
 from mgs.data.lens import Lens, fitted
 from mgs.data.world import PLUS_Z, Vector, degrees_between, up_of_cameras
@@ -51,6 +51,7 @@ class Shot:
     float_unit: float = 1.0  # metres in one of floating-point numbers
     turned: bool = False  # its files are turned by their EXIF orientation
     mended: bool = False  # its rotation was NEARLY_RIGID
+    depth_factor: float = 1.0  # by which its depth is multiplied, to fit its camera
 
     @property
     def files(self) -> list[Path]:
@@ -74,6 +75,7 @@ class Source:
     fit: Agreement | None = None  # of poses and points
     origin: Vector = (0.0, 0.0, 0.0)  # what was subtracted from all positions
     place: str = ""  # latitude, longitude and altitude of 0, if known; +Y is north
+    depth_scale: DepthScale | None = None  # of photographs without poses, by depth beside them
 
     def in_metres(self, unit: float) -> Source:
         """Scale cameras and points by `unit` metres. Raises InputError unless it is positive."""
@@ -83,7 +85,11 @@ class Source:
         shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
         sparse, (x, y, z) = self.sparse and self.sparse.scaled(unit), self.origin
         origin = x * unit, y * unit, z * unit
-        return replace(self, shots=shots, sparse=sparse, unit="m", origin=origin, place="")
+        depth = self.depth_scale and replace(
+            self.depth_scale, metres=self.depth_scale.metres / unit
+        )
+        scaled = replace(self, shots=shots, sparse=sparse, unit="m", depth_scale=depth)
+        return replace(scaled, origin=origin, place="")
 
     def with_distance(self, text: str) -> Source:
         """Scale to metres by a known distance between two cameras: A,B,METRES, with the names of

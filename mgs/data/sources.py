@@ -16,6 +16,7 @@ from mgs.data.bags import is_bag, read_bag
 from mgs.data.clouds import read_cloud
 from mgs.data.colmap import check_no_part, models_in, read_colmap
 from mgs.data.dataset import finite_number, posed_camera, read_records, timestamp_of, unit_of
+from mgs.data.depth_beside import with_scale_of_depth
 from mgs.data.lens import Lens
 from mgs.data.peers import PEERS, is_peer, read_peer
 from mgs.data.photographs import KIND as PHOTOGRAPHS
@@ -23,6 +24,7 @@ from mgs.data.photographs import (
     UNREAD,
     VIDEO_SUFFIXES,
     check_alone,
+    depth_places,
     photographs_in,
     pictures_of,
     read_photographs,
@@ -79,6 +81,8 @@ def read_source(
     pose: str | None = None,
     exclude: Sequence[str] = (),
     test_split: str | None = None,
+    unit: float | None = None,
+    distance: str | None = None,
 ) -> Source:
     """Recognise the format of a source, and read its cameras and file names.
 
@@ -88,9 +92,11 @@ def read_source(
     transforms.json; of a bag the topic. test_split: the split of NeRF-synthetic data that is set
     apart as test views. keyframes: `Spacing` of a recording. unpack: folder for the images of a
     bag and the matches of photographs, by default SOURCE.unpacked. pose: topic of a bag's poses.
-    exclude: names of images to leave out. Raises InputError if no format is recognised, no image
-    exists, a frame is listed twice, a camera model is not supported, photographs cannot be placed,
-    there is no such test split, or `pose` is given and the source is no bag."""
+    exclude: names of images to leave out. unit, distance: as `Source.in_metres` and
+    `with_distance`; without, GPS gives metres, else depth beside photographs. Raises InputError if
+    no format is recognised, no image exists, a frame is listed twice, a camera model is not
+    supported, photographs cannot be placed, there is no such test split, or `pose` is given and the
+    source is no bag."""
     source = Path(source)
     source.exists()  # an OSError of the source itself is not one of a file that it names
     try:
@@ -108,7 +114,13 @@ def read_source(
         result = replace(result, notes=(f"{ROUNDED}: {count}", *result.notes))
     if result.kind != PHOTOGRAPHS:
         result = result.without(exclude)
-    return turned_by_exif(result.fitted()).near_origin()
+    result = turned_by_exif(result.fitted()).near_origin()
+    given = "GPS" if result.unit == "m" else ""
+    if unit is not None:
+        result, given = result.in_metres(unit), "--unit"
+    if distance is not None:
+        result, given = result.with_distance(distance), "--distance"
+    return with_scale_of_depth(result, given)
 
 
 def _recognised(
@@ -156,7 +168,8 @@ def _recognised(
             why = "the output would lie among its photographs, and its pictures be taken for some"
             raise InputError(f"{root}: {why}; write it to a place outside")
         check_alone(images or source)
-        return read_photographs(images or source, paths, folder / "matches", exclude)
+        places = depth_places(source, images)
+        return read_photographs(images or source, paths, folder / "matches", exclude, places)
     raise InputError(
         f"{source}: holds no photographs (PNG, JPEG, TIFF, WebP), transforms.json, "
         f"{TRAINING} or COLMAP model (cameras, images and points3D, .bin or .txt, in "
