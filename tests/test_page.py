@@ -97,6 +97,10 @@ def test_the_page_of_a_fit_without_masks_speaks_of_photographs(page, runs, tmp_p
     shutil.copytree(runs[0].parent, root)
     change_settings(root / "d-optimal", dataset=str(root / "data"), seeds=6, budget=0)
     synthetic.edit(root / "data", lambda data: [f.pop("mask_path") for f in data["frames"]])
+    synthetic.edit(root / "data", lambda data: data.update(unit="unit"))
+    steps = read_steps(root / "d-optimal")
+    steps = [line | {"warnings": ["few passes"] * (not line["step"])} for line in steps]
+    change_steps(root / "d-optimal", lambda _: steps)
     write_page(tmp_path / "fit.html", [root / "d-optimal"])
     parsed, masked = read_page(tmp_path / "fit.html"), read_page(page)
     assert "Run of mgs fit on" in parsed.text
@@ -104,6 +108,20 @@ def test_the_page_of_a_fit_without_masks_speaks_of_photographs(page, runs, tmp_p
     assert views == sorted(views) != [frame.name for frame in open_run(runs[0]).taken]
     assert "The truth is the photograph." in parsed.text
     assert "object in front of black" not in json.dumps(parsed.data)
+    assert "few passes" in parsed.text
+    for words in (
+        "step 0",
+        "of the step",
+        "Step by step",
+        "coverage (%)",
+        "path (",
+        "(unit",
+        "Time,",
+    ):
+        assert words not in parsed.text
+    shown = json.dumps(parsed.data["runs"])
+    for words in ("seed", "Seed", "Chosen", "Gaussians observed", "(unit", "step (0"):
+        assert words not in shown
     assert "Runs of mgs nbv on" in masked.text
     assert "The truth is the object alone in front of black." in masked.text
 

@@ -178,7 +178,7 @@ def test_table(runs):
     assert row["masked SSIM, held-out views"] == f"{run.metrics['held_out']['ssim_mask']:.4f}"
     assert row["path (m)"] == f"{path:.2f}"
     assert len(row) == 14
-    assert "| path (unit) |" in tables.markdown_table([row | {"unit": "unit"} for row in rows])
+    assert "| path (units) |" in tables.markdown_table([row | {"unit": "units"} for row in rows])
 
 
 def test_a_run_that_was_not_measured_on_the_test_views_is_compared_on_the_others(

@@ -592,6 +592,8 @@ def test_photographs_alone_are_one_command_to_the_next_picture(
     text = said(capsys)[0]
     assert f"1: {view['way']}" in text
     assert "not PSNR" not in text, "the certificate of one view"
+    for words in ("unit ", "unit)", "flight:", "step 0", "coverage"):  # no metres, no steps
+        assert words not in text
     assert "round the object to the" in view["way"]
     assert len(found) == 8
     shutil.copy(frames[8].image_path, root / "a new one.png")

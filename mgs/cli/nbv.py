@@ -179,7 +179,8 @@ def resume_and_print(
             progress.whole(f"{run.folder.name}: images", len(state.taken), total)
             new = state.steps[len(steps) :]
             steps.extend(new)
-            for line in [line for step in new for line in step_lines(step)]:
+            of_fit = run.settings.budget == 0
+            for line in [line for step in new for line in step_lines(step, of_fit)]:
                 progress.print(line)
 
         def on_pass(done: int, most: int, model: Gaussians) -> None:

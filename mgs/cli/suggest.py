@@ -268,25 +268,26 @@ def _print(console: Terminal, result: Suggestion, run: Run, crossed: str, place:
         console.print(f"candidates left out: {count} {reason}")
     rows, unit = result.plan if len(result.plan) > 1 else result.ranking[:SHOWN], run.dataset.unit
     table = Table(box=None)
-    length = f"distance ({unit})"
-    numbers = ("score", "gain", length, "azimuth", "elevation", "unseen", "unknown")
+    known = unit != "unit"  # else lengths say nothing
+    length = [f"distance ({unit})"] if known else []
+    numbers = ("score", "gain", *length, "azimuth", "elevation", "unseen", "unknown")
     for heading in ("", "pose", *numbers):
         table.add_column(heading, justify="left" if heading == "pose" else "right", overflow="fold")
     for number, view in enumerate(rows, 1):
-        table.add_row(str(number), view.name, *_cells(view))
+        table.add_row(str(number), view.name, *_cells(view, known))
     console.print(table)
     north = place.bearing if place else 0.0
     for number, view in enumerate(result.plan, 1):
         bearing, _ = Stop(view.camera.position, "", view.camera).heading_and_pitch(north)
         facing = f"; bearing {bearing:.0f}°" if place else ""
-        moved = f"; moved {view.moved:.2f} {unit}" if result.refined else ""
+        moved = f"; moved {view.moved:.2f} {unit}" if result.refined and known else ""
         console.print(f"{number}: {view.way}{facing}{moved}", soft_wrap=True)
     time = f" and {result.seconds:.0f} s" if unit == "m" else ""  # its speed is in metres
     plan = f"{len(result.plan)} view{'s' if len(result.plan) > 1 else ''}"
-    console.print(
-        f"gain: Eq. 7, {GAIN_UNIT}; unseen, unknown: shares of what the picture shows\n"
-        f"flight: {result.metres:.1f} {unit}{time} from the first image through {plan} and back"
-    )
+    console.print(f"gain: Eq. 7, {GAIN_UNIT}; unseen, unknown: shares of what the picture shows")
+    if known:
+        flight = f"{result.metres:.1f} {unit}{time} from the first image through {plan} and back"
+        console.print(f"flight: {flight}")
     if result.refined:
         console.print("refined: gain of the plan from {:.4f} to {:.4f}".format(*result.refined))
     if result.certificate and len(result.plan) > 1:  # the best of the table needs no proof
@@ -295,11 +296,11 @@ def _print(console: Terminal, result: Suggestion, run: Run, crossed: str, place:
         console.print(f"{crossed}; give flight.no_fly to plan around it")
 
 
-def _cells(view: View) -> tuple[str, ...]:
+def _cells(view: View, distance: bool) -> tuple[str, ...]:
     return (
         f"{view.score:.4g}",
         f"{view.information_gain:.4f}",
-        f"{view.distance:.2f}",
+        *([f"{view.distance:.2f}"] if distance else []),
         f"{view.azimuth:.0f}°",
         f"{view.elevation:.0f}°",
         f"{100 * view.unseen:.1f} %",

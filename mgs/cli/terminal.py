@@ -135,8 +135,10 @@ def print_quality(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> None:
     metrics = [key for key in metrics if is_masked(rows) or "mask" not in key]
     if exposure := any(row.get("exposure") for row in rows):
         metrics = [f"{key}_corrected" if "psnr" in key else key for key in metrics]
-    keys = ["images", *metrics, "coverage"]
-    caption = f"n: images; PSNR in dB{' with fitted gains' if exposure else ''}, coverage in %"
+    covered = any("coverage" in row for row in rows)
+    keys = ["images", *metrics, *(["coverage"] if covered else [])]
+    caption = f"n: images; PSNR in dB{' with fitted gains' if exposure else ''}"
+    caption += ", coverage in %" if covered else ""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=caption)
     table.add_column("policy", overflow="fold")
     for key in keys:
@@ -167,8 +169,8 @@ def print_run(out: Path, state: "Checkpoint", metrics: dict[str, Any], console: 
     from mgs.run.ending import RunEnd, why_ended
 
     last = state.steps[-1]
-    row = metrics_row(metrics["policy"], metrics) | {"coverage": 100 * last["coverage"]}
-    row |= {"exposure": bool(last.get("exposure"))}
+    row = metrics_row(metrics["policy"], metrics) | {"exposure": bool(last.get("exposure"))}
+    row |= {"coverage": 100 * last["coverage"]} if len(state.steps) > 1 else {}
     print_quality(console, [row])
     if (apart := _apart(row)) > FAR_APART:
         cure = "too few photographs show what they show; take more between them"
@@ -180,16 +182,19 @@ def print_run(out: Path, state: "Checkpoint", metrics: dict[str, Any], console: 
     console.print(f"wrote {out}", soft_wrap=True)
 
 
-def step_lines(step: Mapping[str, Any]) -> Iterator[str]:
-    """A line of steps.jsonl in words: a line for the step, its certificate and its warnings."""
+def step_lines(step: Mapping[str, Any], of_fit: bool = False) -> Iterator[str]:
+    """A line of steps.jsonl in words: a line for the step, its certificate and its warnings.
+    of_fit: whether it is the only one."""
     from mgs.policy.certificate import Certificate
 
     names = [step["name"]] if step["name"] else step.get("seed_names", [])
     views = ", ".join(names) if len(names) <= MOST_NAMES else f"{len(names)} views"
-    parts = [f"step {step['step']}: {views}"]
+    prefix = "" if of_fit else f"step {step['step']}: "
+    parts = [prefix + views]
     if step["score"] is not None:
         parts.append(f"score {step['score']:.4g}")
-    parts.append(f"coverage {100 * step['coverage']:.2f} %")
+    if not of_fit:
+        parts.append(f"coverage {100 * step['coverage']:.2f} %")
     if "loss" in step:
         passes = step["iterations"] // step["images"]
         parts.append(f"{passes} passes to a loss of {step['loss']:.3g} ({step['stop_reason']})")
@@ -200,4 +205,4 @@ def step_lines(step: Mapping[str, Any]) -> Iterator[str]:
     yield ", ".join([*parts, f"{sum(step['seconds'].values()):.1f} s"])
     if "certificate" in step:
         yield Certificate(**step["certificate"]).sentence()
-    yield from (f"step {step['step']}: {warning}" for warning in step.get("warnings", []))
+    yield from (prefix + warning for warning in step.get("warnings", []))

@@ -186,7 +186,7 @@ def write_page(path: str | Path, folders: Sequence[str | PathLike[str]]) -> int:
                     "label": label,
                     "views": [_view(label, run, *view) for view in enumerate(taken_in_order(run))],
                     "orbit": orbit_plot(label, run),
-                    "time": timing_plot(label, run.steps),
+                    "time": timing_plot(label, run.steps) if run.settings.budget else None,
                 }
                 for label, run in runs.items()
             ],
@@ -253,8 +253,8 @@ def _view(label: str, run: Run, k: int, frame: Frame) -> dict[str, Any]:
     first = "seed" if run.settings.budget else "image"
     role = f"{first} {k + 1} of {seeds}" if k < seeds else f"step {step['step']}"
     facts = [("view", view), ("taken as", role)]
-    # The numbers are known after the last of the seeds.
-    facts += step_facts(step) if k >= seeds - 1 else [("images", str(k + 1))]
+    if run.settings.budget:  # its numbers are known after the last of the seeds
+        facts += step_facts(step) if k >= seeds - 1 else [("images", str(k + 1))]
     black = ", the object in front of black" if frame.mask_path or frame.rock_path else ""
     own, where, bright = f"{view}/{label}", f"seen from {view}", "bright where little is known"
     pictures = [

@@ -161,7 +161,7 @@ def curve_plot(label: str, certificate: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def orbit_plot(label: str, run: Run) -> dict[str, Any]:
-    """The orbit in 3D: the model as points, all poses, seeds, and the chosen views, numbered and
+    """The cameras in 3D: the model as points, all poses, seeds, and the chosen views, numbered and
     joined in their order. Other candidates have the colours of their prices, if the run has them.
     The last trace, "shown above", marks the view of the page's slider; the page moves it."""
     taken, frames = run.indices, run.dataset.frames
@@ -179,7 +179,7 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
     candidates = [i for i in range(len(eyes)) if i not in taken]
     prices = run.steps[0].get("certificate", {}).get("prices", {})
     circle: dict[str, Any] = {"size": 3, "color": "#9a9a9a", "symbol": "circle-open"}
-    others = "candidates"
+    others, start = ("candidates", "seeds") if run.settings.budget else ("not fitted", "images")
     bar: dict[str, Any] = {"thickness": 12, "len": 0.6}
     if candidates and all(names[i] in prices for i in candidates):
         price = {"title": {"text": "price of a picture"}, **bar, "x": -0.1}
@@ -198,17 +198,19 @@ def orbit_plot(label: str, run: Run) -> dict[str, Any]:
         _model_points(run.gaussians),
         markers(others, candidates, [names[i] for i in candidates], **circle),
         _frusta([cameras[i] for i in taken], length),
-        markers("seeds", seeds, [names[i] for i in seeds], **diamond),
+        markers(start, seeds, [names[i] for i in seeds], **diamond),
         path,
         _points("shown above", eyes[taken[:1]], here) | {"hoverinfo": "skip"},
     ]
-    axes = {f"{a}axis": _axis(f"{a} ({run.dataset.unit})") for a in "xyz"}
+    unit = "" if run.dataset.unit == "unit" else f" ({run.dataset.unit})"
+    axes = {f"{a}axis": _axis(a + unit) for a in "xyz"}
     view = {"eye": {"x": 0.9, "y": 0.9, "z": 0.7}}
     first, later = (", ".join(names[i] for i in some) for some in (seeds, views))
-    alt = f"Camera positions of {label} in 3D around the model. Seeds: {first}. "
-    alt += f"Chosen, in this order: {later or 'none yet'}."
+    alt = f"Camera positions of {label} in 3D around the model. {start.capitalize()}: {first}."
+    if run.settings.budget:
+        alt += f" Chosen, in this order: {later or 'none yet'}."
     layout = {"scene": {"aspectmode": "data", "camera": view, **axes}}
-    return {"title": f"Orbit, {label}", "alt": alt, "data": traces, "layout": layout}
+    return {"title": f"Cameras, {label}", "alt": alt, "data": traces, "layout": layout}
 
 
 def _model_points(model: Gaussians) -> dict[str, Any]:
@@ -267,7 +269,8 @@ def notes(run: Run) -> list[str]:
     if certificate := run.steps[0].get("certificate"):
         lines.append(Certificate(**certificate).sentence())
     for step in run.steps:
-        lines += [f"step {step['step']}: {warning}" for warning in step.get("warnings", [])]
+        prefix = f"step {step['step']}: " if run.settings.budget else ""
+        lines += [prefix + warning for warning in step.get("warnings", [])]
     return lines
 
 
@@ -281,7 +284,7 @@ def summary_rows(runs: Mapping[str, Run]) -> list[tuple[str, list[str]]]:
         (table_heading(key, rows), [table_cell(key, row.get(key)) for row in rows]) for key in keys
     ]
     table.append(("Gaussians", [f"{len(run.gaussians):,}" for run in runs.values()]))
-    return [*table, ("time of all steps (s)", [f"{value:.1f}" for value in seconds])]
+    return [*table, ("time (s)", [f"{value:.1f}" for value in seconds])]
 
 
 def measured(step: Mapping[str, Any]) -> dict[str, float]:

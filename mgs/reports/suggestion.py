@@ -147,7 +147,8 @@ def _from_above(axis: Any, run: Run, suggestion: Suggestion) -> None:
     axis.scatter(*np.concatenate(stops).T, s=110, color=CHOSEN, zorder=3, label="to take next")
     for k, stop in enumerate(stops, 1):
         axis.text(*stop[0], str(k), color="white", fontsize=8, ha="center", va="center", zorder=4)
-    unit = run.dataset.unit
-    axis.set(aspect="equal", xlabel=f"x ({unit})", ylabel=f"y ({unit})")
-    axis.set_title(f"from above: a flight of {suggestion.metres:.1f} {unit}")
+    axis.set(aspect="equal", title="from above")
+    if (unit := run.dataset.unit) != "unit":  # else lengths say nothing
+        title = f"from above: a flight of {suggestion.metres:.1f} {unit}"
+        axis.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})", title=title)
     axis.figure.colorbar(dots, ax=axis, shrink=0.6, aspect=20, label=label)

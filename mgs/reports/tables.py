@@ -119,8 +119,9 @@ def comparison_rows(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
 
     policy: the label; images: number of training images; coverage: per cent. path: length of the
     lines from view to view, in `unit`. test.NAME, all.NAME, held_out.NAME: means in metrics.json,
-    PSNR in dB. exposure: True, if the run estimated it. ended: the reason, only if before the
-    budget was spent. Raises InputError if a run was not evaluated since its last step."""
+    PSNR in dB. Fits, which choose no views, have neither coverage nor path. exposure: True, if the
+    run estimated it. ended: the reason, only if before the budget was spent. Raises InputError if a
+    run was not evaluated since its last step."""
     for run in runs.values():
         check_measured(run)
     return [table_row(label, run) for label, run in runs.items()]
@@ -133,9 +134,10 @@ def table_row(label: str, run: Run) -> dict[str, Any]:
         row["exposure"] = True
     if run.ended and run.ended["reason"] != RunEnd.BUDGET:
         row["ended"] = run.ended["reason"]
-    positions = np.array([frame.camera.position for frame in run.taken])
-    row |= {"coverage": 100 * run.steps[-1]["coverage"], "path": path_length(positions)}
-    return row | {"unit": run.dataset.unit}
+    if run.settings.budget:
+        positions = np.array([frame.camera.position for frame in run.taken])
+        row |= {"coverage": 100 * run.steps[-1]["coverage"], "path": path_length(positions)}
+    return row | {"unit": "units" if run.dataset.unit == "unit" else run.dataset.unit}
 
 
 def metrics_row(label: str, metrics: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ const style = name => getComputedStyle(document.documentElement).getPropertyValu
 // Plots. Drawn when they come into sight; drawn anew when light and dark change.
 const specs = new Map();
 data.plots.forEach((plot, i) => specs.set("plot-" + i, plot));
-data.runs.forEach((run, i) => { specs.set("orbit-" + i, run.orbit); specs.set("time-" + i, run.time); });
+data.runs.forEach((run, i) => { specs.set("orbit-" + i, run.orbit); if (run.time) specs.set("time-" + i, run.time); });
 const drawn = new Set();
 
 function isDark() {
