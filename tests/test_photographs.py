@@ -41,6 +41,7 @@ from mgs.prior.hull import visual_hull
 from mgs.prior.points import _grown, main_cluster, on_surface, reliable, scattered
 from mgs.prior.segmentation import Plane
 from mgs.prior.surface import shell
+from mgs.run.nbv import start_of_fit
 from mgs.splat_files import load_gaussians
 from mgs.synth.orbit import perturb
 
@@ -577,6 +578,16 @@ def test_photographs_without_masks_are_fitted_whole_from_their_points(
     bare(tmp_path / "bare")
     arguments = ["fit", tmp_path / "bare", "--exposure", "--out", tmp_path / "run"]
     assert "has no surface on which to compare" in refused(capsys, arguments, tmp_path / "run")
+
+
+def test_depth_beside_photographs_without_masks_leaves_the_fit_whole(colmap, tmp_path):
+    """The surface of the object in their middle gave 7 dB of a scene with its ground."""
+    data = import_source(read_source(colmap), tmp_path / "d")
+    assert start_of_fit(data, None, None, {}).source == "random"
+    deep = replace(data, frames=tuple(replace(f, depth_path=f.image_path) for f in data.frames))
+    assert start_of_fit(deep, None, None, {}) == start_of_fit(data, None, None, {})
+    (tmp_path / "d/sparse.ply").unlink()
+    assert start_of_fit(deep, None, None, {}).source is None
 
 
 def test_an_object_in_masks_starts_with_few_gaussians_that_are_split(

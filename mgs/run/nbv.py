@@ -265,7 +265,8 @@ def start_of_fit(data: Dataset, prior: Any, gaussians: Any, train: dict[str, Any
         kind = str(numbers.get("from", "")) if isinstance(numbers, dict) else ""
     else:
         kind = existing.kind if existing else choose_source(data.survey())
-    whole = prior is None and kind == "points" and not has_masks(data.frames)
+    points = kind == "points" or (kind == "depth" and (data.root / CLOUD).is_file())
+    whole = prior is None and points and not has_masks(data.frames)
     source = "random" if whole and train.get("means", "free") == "free" else None
     kind = source or kind
     if train.get("density") == "adaptive":
