@@ -26,7 +26,7 @@ STAGES = {
     "fits": ("fits", "--rocks", "8"),
     "certificate": ("certificate", "--rocks", "8"),
     "setups": ("setups", "--rocks", "8"),
-    "setups-8": ("setups", "--rocks", "8", "--images", "8"),
+    "curves": ("curves", "--rocks", "8"),
     "pools": ("pools", "--rocks", "8"),
     "henge": ("pools", "--scene", "henge"),
     "oracle": ("oracle", "--rocks", "1"),
@@ -47,10 +47,10 @@ are run by hand: `studies.rate`, `studies.blender` and `studies.photographs`."""
 QUICK = {
     name: (*arguments[: arguments.index("--rocks") + 1], "1")
     for name, arguments in STAGES.items()
-    if "--rocks" in arguments and name not in ("setups-8", "oracle")
+    if "--rocks" in arguments and name not in ("curves", "oracle")
 }
-"""Each study with --rocks, for the first; setups-8 repeats setups with fewer images, and oracle has
-one rock anyway."""
+"""Each study with --rocks, for the first; curves repeats two set-ups with other numbers of images,
+and oracle has one rock anyway."""
 
 ENOUGH = 0.05
 """Largest difference of a number, in its unit. Processors of another type round differently: with 8
