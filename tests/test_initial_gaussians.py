@@ -171,5 +171,5 @@ def test_the_backing_survives_the_file_and_is_part_of_what_a_run_goes_on_from(
     assert prior_digest(replace(loaded, backed=99)) != prior_digest(loaded)
     numbers = json.loads((tmp_path / "prior/prior.json").read_text())
     (tmp_path / "prior/prior.json").write_text(json.dumps(numbers | {"backed": 1000}))
-    fails("backed must be a number of the points", load_prior, tmp_path / "prior")
+    fails("backed and triangulated must be numbers of the points", load_prior, tmp_path / "prior")
     fails("0 to 1; correct `backing`", PriorSettings, gaussians=300, backing=1.5)

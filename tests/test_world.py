@@ -85,8 +85,8 @@ def test_the_page_draws_it_upright_too_and_names_the_unit(runs, tmp_path):
     eyes = ([view["eye"] for view in run["views"]] for run in (tilted, level))
     np.testing.assert_allclose(*eyes, atol=1e-9)
     titles = [run["orbit"]["layout"]["scene"]["zaxis"]["title"]["text"] for run in data]
-    assert titles == ["z (m)", "z (unit)"]
-    assert "path (unit)" in text
+    assert titles == ["z (m)", "z"]
+    assert "path (units)" in text
     assert "(m)" not in text.split("<script")[0]
 
 
