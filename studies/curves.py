@@ -6,8 +6,9 @@ from itertools import product
 from pathlib import Path
 
 from studies import setups
+from studies.frame.case import ROCKS
 from studies.frame.output import Panel, draw_panels, table, with_interval, write_table
-from studies.frame.program import Work, study_of
+from studies.frame.program import WORKERS, Work, study_of
 from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
 
@@ -19,8 +20,10 @@ DRAWS = 3
 
 SOME = {name: setups.SETUPS[name] for name in ("hemisphere", "mixed distances")}
 
-POLICIES = (setups.LEADER, "cover", setups.BASELINES[2], setups.RANDOM)
-"""The last of BASELINES here is the pose with the largest angle to those taken."""
+ANGLE = setups.BASELINES[2]
+"""The pose with the largest angle to those taken."""
+
+POLICIES = (setups.LEADER, "cover", ANGLE, setups.RANDOM)
 
 
 def cells_of(size: setups.SetupSize) -> list[Cell]:
@@ -79,6 +82,7 @@ STUDY = replace(
     about="Compare policies as `setups` does, for several numbers of images.",
     cells=lambda work: cells_of(work.size),
     write=write,
+    options=ROCKS | WORKERS,
 )
 
 if __name__ == "__main__":

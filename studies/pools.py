@@ -3,7 +3,8 @@
 from dataclasses import replace
 
 from studies import setups
-from studies.frame.program import study_of
+from studies.frame.case import ROCKS
+from studies.frame.program import WORKERS, study_of
 
 DRAWN = {
     f"drawn {name}": replace(setups.SETUPS[name], frames=72, drawn=True)
@@ -20,6 +21,7 @@ STUDY = replace(
     name="pools",
     about="Compare policies as `setups` does, over five random pools with random seeds each.",
     cells=lambda work: setups.cells_of(work.size, POLICIES, DRAWN),
+    options=ROCKS | WORKERS,
     write=lambda work: setups.write(work, "pools", work.cells),
 )
 

@@ -196,7 +196,7 @@ def shown_as(policy: str) -> str:
 
 
 def worded(policy: str) -> str:
-    """Name of a policy in words, as pages write it: those of files have underscores."""
+    """Name of a policy for tables, with spaces in place of underscores."""
     return policy.replace("_", " ")
 
 

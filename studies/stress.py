@@ -24,7 +24,7 @@ from mgs.run.policies import Policy
 from mgs.run.settings import NbvSettings
 from mgs.seeds import generator
 from studies.faults import IMAGE_FAULTS, PRIOR_FAULTS, captured, pose_noise
-from studies.frame.case import FRESH, MESH_SCENE, ROCKS, Case, judge
+from studies.frame.case import FRESH, ROCKS, Case, judge
 from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
 from studies.frame.program import WORKERS, Study, Work, study_of
 from studies.frame.statistics import Row
@@ -58,7 +58,7 @@ POLICIES: dict[str, Policy] = {"d-optimal": mgs.DOptimal(), "directional-i": mgs
 
 NONE, ANOTHER, SHORT, ONE_POSE = "none", "another rock's prior", "few passes", "one bad pose"
 SUN, SUN_MOVES = "moving sun", (5, 15, 45)
-"""Degrees by which the sun has gone round when the later half of the views is taken."""
+"""Degrees of azimuth by which the sun moves before the later half of the views is taken."""
 
 FIT_FAULTS = {SHORT: ((5, 2, 1), "{:g}"), ONE_POSE: ((0.25, 1.0, 4.0), "{:g}° and cm")}
 """Sizes of faults of the fit and of a single view, and their words."""
@@ -91,11 +91,10 @@ def cells_of(size: SetupSize) -> list[Cell]:
 
 
 def under_sun(case: Case, degrees: float) -> Case:
-    """The same views with the sun so many degrees further round."""
+    """Case of the same views, with the sun turned by so many degrees of azimuth."""
     from mgs.synth.scene_file import load_scene_file
 
-    rock = case.rock
-    sky = load_scene_file(MESH_SCENE if rock.mesh else str(rock.file or rock.scene)).sky
+    sky = load_scene_file(case.rock.scene_file).sky
     changes = {**case.changes, "sky": {"sun_azimuth": sky.sun_azimuth + degrees}}
     label, size = f"{case.label}/sun-{degrees:g}", replace(case.size, tests=0)
     return replace(case, changes=changes, label=label, size=size)
@@ -176,7 +175,8 @@ class Lab:
         return [change(f, size, rng) if i in views else f for i, f in frames]
 
     def with_later(self, frames: Sequence[mgs.Frame]) -> list[mgs.Frame]:
-        """All frames, the later half of the views taken from others of the same poses."""
+        """Frames of the rock, with the later half of the views taken replaced. frames: of the same
+        poses."""
         later = sorted(self.taken)[len(self.taken) // 2 :]
         pairs = enumerate(zip(self.data.frames, frames, strict=True))
         return [other if i in later else own for i, (own, other) in pairs]

@@ -434,7 +434,7 @@ def opensfm_pixels(root: Path, points: np.ndarray) -> np.ndarray:
 
 
 def bundler_pixels(root: Path, points: np.ndarray) -> np.ndarray:
-    """By the formulas of Bundler's manual, y up from the middle of the image."""
+    """Follow the formulas of Bundler's manual, y up from the middle of the image."""
     path = root / "bundle/bundle.out"
     lines = path.read_text().splitlines()
     f, k1, k2 = 60.0, -0.1, 0.03

@@ -291,7 +291,7 @@ def deep(placed, monkeypatch):
 
 @pytest.mark.parametrize("given", ["", "GPS", "--distance", "--unit"])
 def test_depth_beside_photographs_gives_the_scale_or_is_made_to_fit(given, frames, deep, tmp_path):
-    """Of one photograph there is none; pictures are as before."""
+    """One photograph has no depth; pictures are as without any."""
     read, folder = deep
     write_depth(frames[:-1], folder, lambda z, k: 1.05 * z if given == "GPS" else z)
     options = {"--distance": {"distance": "view 00,view 06,10"}, "--unit": {"unit": 3}}

@@ -44,6 +44,11 @@ class Rock:
         return self.file if self.file and self.file.suffix != ".toml" else None
 
     @property
+    def scene_file(self) -> str:
+        """Name or path of the scene file, of a mesh that of MESH_SCENE."""
+        return MESH_SCENE if self.mesh else str(self.file or self.scene)
+
+    @property
     def name(self) -> str:
         """Folder name."""
         parts = self.scene, self.digest[:8], "" if self.mesh else str(self.seed)
@@ -200,7 +205,7 @@ class Case:
         if not self.given:
             rock = self.rock
             arguments = {
-                "scene": MESH_SCENE if rock.mesh else str(rock.file or rock.scene),
+                "scene": rock.scene_file,
                 "seed": rock.seed,
                 "changes": self.changes,
                 "size": asdict(self.size),
