@@ -54,8 +54,8 @@ def test_psnr_of_a_constant_error_and_inside_a_mask(images):
 
 
 def test_ssim_is_that_of_wang(images):
-    """Compare with scikit-image, which has the paper's window and constants with these options; also where
-    all around a part is black, and inside a mask."""
+    """Compare with scikit-image, which has the paper's window and constants with these options;
+    also where all around a part is black, and inside a mask."""
     from skimage.metrics import structural_similarity
 
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}

@@ -245,7 +245,7 @@ def test_forward_mode_is_that_of_the_api(ply, space):
 
 @pytest.mark.parametrize("film", [{}, CROP])
 def test_the_sensor_is_differentiated(ply, film):
-    """Move by to_world and x_fov, as `moved` does: Mitsuba's cameras have x to the left and y up."""
+    """Move by to_world and x_fov, as `moved`: Mitsuba's cameras have x to the left and y up."""
     scene = load(ply, sensor_dict(film, **PPO))
     own = camera(scene)
     whole, window = own.film or own, (*own.corner, own.width, own.height)
