@@ -207,15 +207,19 @@ def test_poses_that_see_nothing_gain_nothing(points):
 
 @settings(max_examples=20)
 @given(seeds, degrees, st.booleans(), st.permutations(range(POSES)))
-def test_gains_after_a_view_is_dropped_are_those_without_it(seed, degree, over_dome, order):
+def test_gains_without_a_view_are_those_of_the_others(seed, degree, over_dome, order):
     points, pool, dome = scene(seed)
     around = dome if over_dome else None
     held = PoolGains(points, pool, LAM, degree, 0.3, around)
     held.take(order[:3])
-    held.drop(order[1])
-    asked = [order[0], order[2]], order[3:], degree, 0.3, over_dome
-    expected = anew(points, pool, dome, *asked)
-    assert held.of_poses(order[3:]) == pytest.approx(expected, rel=1e-5, abs=1e-7 * expected.max())
+    before, left = held.of_poses(order), held.without(order[1])
+    for taken in ([order[0], order[2]], [order[0], order[2], order[3]]):
+        expected = anew(points, pool, dome, taken, order[4:], degree, 0.3, over_dome)
+        close = pytest.approx(expected, rel=1e-5, abs=1e-7 * expected.max())
+        assert left.of_poses(order[4:]) == close
+        left.take(order[3:4])
+    assert np.array_equal(held.of_poses(order), before)
+    assert held.taken == order[:3]
 
 
 def circle(count, radius):

@@ -268,8 +268,8 @@ def test_a_plan_finds_what_greedy_choice_misses():
         return np.asarray(metres / 6.5)
 
     worth = np.array([0.0, 1.0, 1.5, 1.5])  # whatever was taken, unlike that of `PoolGains`
-    held = SimpleNamespace(of_poses=lambda poses: worth[list(poses)], copy=lambda: held)
-    held.take = held.drop = lambda views: None
+    held = SimpleNamespace(of_poses=lambda poses: worth[list(poses)], take=lambda views: None)
+    held.without = lambda view: held
     legs = tour.legs(positions, AXIS)
     way = tour.planned_tour(legs, [0, 0], [1, 2, 3], held, share, 0.0)
     assert sorted(way) == [0, 0, 2, 3]

@@ -87,12 +87,15 @@ class PoolGains:
             self._take(view)
 
     @one_at_a_time
-    def drop(self, view: int) -> None:
-        """Undo the update of a view taken: it adds -W y y^T."""
-        self.taken.remove(view)
-        self._take(view, sign=-1.0)
+    def without(self, view: int) -> "PoolGains":
+        """The gains if a view taken had not been: an update by -W y y^T."""
+        other = self.copy()
+        other.taken.remove(view)
+        other._take(view, sign=-1.0)
+        return other
 
     def _take(self, view: int, sign: float = 1.0) -> None:
+        dr.eval(self.S)
         n = len(self.points) // 3
         weights = sign * mi.Float64(padded(self.pool.seen[view], np.float64))
         y = self._harmonics(dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, view, n))
@@ -103,7 +106,8 @@ class PoolGains:
         pairs = zip(self.S, _upper(len(y)), strict=True)
         self.S = [entry - k * u[a] * u[b] for entry, (a, b) in pairs]
         u, w = _interleaved(u), None if w is None else _interleaved(w)
-        dr.eval(self.S, u, w, k, both)
+        # Most gains without a view are only looked at: their S is computed where it is used.
+        dr.eval(self.S if sign > 0 else [], u, w, k, both)
         self._update(u, w, k, both)
 
     def _update(self, u: Any, w: Any, k: Any, both: Any) -> None:

@@ -165,9 +165,9 @@ def planned_tour(
             dropped = tour[first:-1][:width]
             if len(dropped) < width:
                 continue
-            state, loss = gains.copy(), 0.0
+            state, loss = gains, 0.0
             for stop in dropped:
-                state.drop(stop)
+                state = state.without(stop)
                 loss += float(state.of_poses([stop])[0])
             rest = two_opt(legs, [stop for stop in tour[:-1] if stop not in dropped] + tour[-1:])
             others = [stop for stop in free if stop not in rest and stop != dropped[0]]

@@ -162,17 +162,17 @@ def planned_views(gains: PoolGains, candidates: Sequence[int], count: int) -> li
         free = [view for view in candidates if view not in views]
         views.append(free[int(gains.of_poses(free).argmax())])
         gains.take(views[-1:])
-    improved = True
-    while improved:
-        improved = False
-        for k, view in enumerate(views):
-            gains.drop(view)
-            free = [view] + [other for other in candidates if other not in views]
-            values = gains.of_poses(free)
-            best = int(values.argmax())
-            if values[best] > BETTER * values[0]:
-                views[k], improved = free[best], True
+    k, kept = 0, 0  # next view to exchange, and how many in a row were kept
+    while kept < count:
+        left = gains.without(views[k])
+        free = [views[k]] + [view for view in candidates if view not in views]
+        values = left.of_poses(free)
+        best = int(values.argmax())
+        kept += 1
+        if values[best] > BETTER * values[0]:
+            views[k], gains, kept = free[best], left, 1
             gains.take([views[k]])
+        k = (k + 1) % count
     return views
 
 
