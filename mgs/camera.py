@@ -111,6 +111,12 @@ class Camera:
         return self.camera_to_world[:3, 3]
 
     @property
+    def focal(self) -> float:
+        """Geometric mean of both focal lengths, pixels: the area of a pixel at z-depth z is
+        (z / focal)^2."""
+        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+    @property
     def key(self) -> bytes:
         """K, pose and image size as bytes: the key of a view in caches and seeds."""
         size = f"{self.width}x{self.height}".encode()

@@ -44,6 +44,13 @@ def orbit_cameras(
     return [pinhole(1.1 * width, width, height, eye, CENTRE) for eye in eyes]
 
 
+def halved(cameras: list[Camera], across: bool) -> list[Camera]:
+    """The same views with half as many pixels across, or half as many down."""
+    x, y = (0.5, 1) if across else (1, 0.5)
+    K = np.diag([x, y, 1])
+    return [Camera(K @ c.K, x * c.width, y * c.height, c.world_to_camera) for c in cameras]
+
+
 def albedo(points: np.ndarray) -> np.ndarray:
     """Smooth colour of a world point, linear RGB in [0.1, 0.9]."""
     return 0.5 + 0.4 * np.sin(points * [4, 3, 5] + [0, 1, 2])

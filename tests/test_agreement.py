@@ -15,6 +15,7 @@ from mgs.data.agreement import BODY, FLIP, observed
 from mgs.data.dataset import write_transforms
 from mgs.data.structure import Matcher
 from mgs.images import write_exr, write_png
+from mgs.synth.orbit import perturb
 
 pytestmark = pytest.mark.usefixtures("features_once")
 
@@ -150,3 +151,15 @@ def test_poses_of_other_pictures_are_noticed_and_said(frames, tmp_path, capsys):
     command("import", root, "--out", tmp_path / "out")
     assert "the poses do not belong to these pictures" in said(capsys)[1]
     assert agreement(frames[:1], tmp_path / "one") is None
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_errors_are_in_pixels_of_either_side(tmp_path, depth):
+    cameras, errors = synthetic.orbit_cameras(8, 160, 120), []
+    for across in (True, False):
+        root, several = tmp_path / f"{across}", synthetic.halved(cameras, across)
+        frames = synthetic.write_dataset(root, several, depth=depth).frames
+        moved = perturb(several, 0.02, 0.3, np.random.default_rng(0))
+        moved = [replace(f, camera=c) for f, c in zip(frames, moved, strict=True)]
+        errors.append(agreement(moved, root / "matches").error)
+    assert errors[0] == pytest.approx(errors[1], rel=0.2)

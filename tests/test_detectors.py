@@ -159,6 +159,10 @@ def test_the_margin_is_a_pixel_and_the_size_of_a_gaussian():
     assert margin(0.3) == 1 + int(np.ceil(0.3 * camera.K[0, 0] / depth)) > 2
     behind = camera.position - 5 * camera.camera_to_world[:3, 2] + 0 * model.means
     assert margin(0.3, behind) == 1
+    square = margin(0.3)
+    for across in (True, False):
+        (camera,) = synthetic.halved(tiny.orbit()[:1], across)
+        assert margin(0.3) == square  # of the side with more pixels
 
 
 def test_a_perfect_render_explains_all_and_a_single_colour_nothing():

@@ -115,7 +115,8 @@ def lattice(count: int, radius: float = 3.0) -> list[Camera]:
 def floating(root: Path, cameras: list[Camera]) -> Dataset:
     dataset = synthetic.write_dataset(root, cameras, depth=False)
     for frame in dataset.frames:
-        directions = frame.camera.unproject(np.ones((72, 96))) - frame.camera.position
+        size = frame.camera.height, frame.camera.width
+        directions = frame.camera.unproject(np.ones(size)) - frame.camera.position
         o = (frame.camera.position - synthetic.CENTRE) / synthetic.AXES
         d = directions / synthetic.AXES
         write_png(frame.mask_path, (d @ o) ** 2 > (d * d).sum(-1) * (o @ o - 1))
@@ -146,6 +147,19 @@ def test_the_hull_of_a_convex_body_seen_from_all_sides_is_that_body(tmp_path, mo
     monkeypatch.setattr(hull, "COARSE", 24)
     monkeypatch.setattr(hull, "IMAGE_BYTES", 30 * 96 * 72)  # of all 30 masks together, 4 a pixel
     assert np.array_equal(visual_hull(dataset.frames).mesh.vertices, blocks)
+
+
+def test_sizes_in_masks_of_uneven_pixels_are_metres(tmp_path):
+    """The object's radius about its centre, the edge of the grid, and a random start's ball."""
+    sizes = []
+    for across in (True, False):
+        data = floating(tmp_path / f"{across}", synthetic.halved(lattice(8), across))
+        radii = [hull._view(f, hull.MOST_PIXELS)(synthetic.CENTRE[None])[0] for f in data.frames]
+        start = scattered(data, PriorSettings(gaussians=500))[0]
+        sizes.append([*radii, hull._bounds(data.frames)[1], np.ptp(start.vertices)])
+    pixel = 2 * 3.0 / 90
+    assert sizes[0] == pytest.approx(sizes[1], abs=pixel)
+    assert sizes[0][:8] == pytest.approx(np.full(8, 0.5), abs=0.1)
 
 
 def test_the_hull_keeps_each_piece_inside_the_masks(tmp_path, monkeypatch):

@@ -187,8 +187,12 @@ def test_distances_to_mesh_are_exact():
         assert np.allclose(distances, np.array([2, np.sqrt(2), 0.6])[some])
 
 
-def test_visible_is_the_near_side():
-    camera = synthetic.orbit_cameras(1, 160, 120)[0]
+@pytest.mark.parametrize("across", [None, True, False])
+def test_visible_is_the_near_side(across):
+    cameras = synthetic.orbit_cameras(1, 320, 240)
+    for _ in range(0 if across is None else 2):
+        cameras = synthetic.halved(cameras, across)
+    (camera,) = cameras
     depth, _, _ = synthetic.cast(camera, [(synthetic.CENTRE, synthetic.AXES)])
     mesh = synthetic.rock_mesh()
     points, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)

@@ -16,6 +16,7 @@ from mgs.images import write_png
 from mgs.survey import depth_sensor
 from mgs.survey.depth_sensor import AXIAL_GROWTH, QUANTUM, depth_noise, filter_depth, noisy_depth
 from mgs.survey.flight import SurveySettings, fly, survey_numbers, trajectory_error, write_survey
+from mgs.survey.fusion import fuse_frames
 from mgs.survey.registration import Edge, chain, drifting_odometry, loop_candidates, optimise
 
 CENTRES = [[0.1, -0.05, 0.2], [0.7, 0.5, 0.05], [-0.6, 0.6, 0], [-0.4, -0.8, 0.05], [1, -0.6, 0]]
@@ -244,3 +245,11 @@ def test_duplicate_frames_are_no_trouble(tmp_path):
     survey = fly(Dataset(tmp_path, twice), SurveySettings(sensor=0.0))
     assert np.isfinite(survey.optimised).all()
     assert np.linalg.norm(survey.optimised[1, :3, 3] - survey.optimised[2, :3, 3]) < 0.02
+
+
+def test_a_cloud_of_uneven_pixels_is_as_fine_as_their_area(tmp_path):
+    cameras, voxels = synthetic.orbit_cameras(6, 48, 36), []
+    for across in (True, False):
+        frames = synthetic.write_dataset(tmp_path / f"{across}", synthetic.halved(cameras, across))
+        voxels.append(fuse_frames(frames.frames).voxel)
+    assert voxels[0] == pytest.approx(voxels[1], rel=0.05)

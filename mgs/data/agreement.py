@@ -154,7 +154,6 @@ def _tangent_error(
     poses = [convention(camera.world_to_camera) for camera in (one, other)]
     eyes = [-pose[:3, :3].T @ pose[:3, 3] for pose in poses]
     base = (eyes[1] - eyes[0]) / max(float(np.linalg.norm(eyes[1] - eyes[0])), 1e-30)
-    focal = zoom * one.K[0, 0]
     rays = []
     for camera, pose, corners in zip((one, other), poses, (a, b), strict=True):
         level = (corners - camera.K[:2, 2]) / (zoom * camera.K[[0, 1], [0, 1]])
@@ -167,7 +166,7 @@ def _tangent_error(
     for end in (np.argmin, np.argmax):
         i, j = (int(end(angle)) for angle in angles)
         slope = np.linalg.norm(np.cross(rays[0][i], base))
-        errors.append(focal * slope * abs(angles[0][i] - angles[1][j]))
+        errors.append(zoom * one.focal * slope * abs(angles[0][i] - angles[1][j]))
     return float(max(errors))
 
 
@@ -296,7 +295,7 @@ def _depth_error(
     usable = (depth > 0) & (z < HIDDEN * depth)
     if usable.sum() < max(LEAST_SEEN * len(points), 1):
         return np.inf
-    pixels = zoom * other.camera.K[0, 0] * np.abs(1 - depth[usable] / z[usable])
+    pixels = zoom * other.camera.focal * np.abs(1 - depth[usable] / z[usable])
     return float(np.median(pixels))
 
 

@@ -191,7 +191,7 @@ def visible(
 
     points [N,3] world, metres; normals [N,3] unit; depth [H,W] z-depth, metres, 0 = no return;
     tolerance: largest depth difference, metres; two_sided: include points that face away. The
-    tolerance grows by the size of a pixel times the slope, since depth varies within a pixel."""
+    tolerance grows by the longer side of a pixel times the slope, as depth varies within it."""
     pixels, z = camera.project(points)
     view = camera.position - points
     cosine = np.einsum("nk,nk->n", normals, view) / np.maximum(np.linalg.norm(view, axis=1), 1e-30)
@@ -202,7 +202,8 @@ def visible(
     column, row = np.floor(pixels[inside]).astype(int).T
     surface[inside] = depth[row, column]
     steep = np.maximum(np.abs(cosine), GRAZING)
-    slack = tolerance + z / camera.K[0, 0] * np.sqrt(np.maximum(1 - steep**2, 0)) / steep
+    longer = z / min(camera.K[0, 0], camera.K[1, 1])
+    slack = tolerance + longer * np.sqrt(np.maximum(1 - steep**2, 0)) / steep
     return inside & (surface > 0) & (np.abs(z - surface) < slack)
 
 

@@ -153,7 +153,7 @@ def prior_and_cloud(
     mesh = _seen_by(mesh, dataset.frames, tolerance)
     cameras = [frame.camera for frame in dataset.frames]
     middle = mesh.vertices.mean(0)
-    pixels = [np.linalg.norm(camera.position - middle) / camera.K[0, 0] for camera in cameras]
+    pixels = [np.linalg.norm(camera.position - middle) / camera.focal for camera in cameras]
     pixel = cell if kind == "depth" else float(np.median(pixels))
     closest = PIXELS_PER_SAMPLE if kind == "depth" else PIXELS_OF_PHOTOGRAPHS
     samples, normals, spacing, sampled = _samples(mesh, settings, cameras, pixel, closest)

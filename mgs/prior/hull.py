@@ -4,6 +4,7 @@ point's projections inside the masks' outlines, times the size of a pixel there,
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -105,7 +106,8 @@ def _carved(frames: Sequence[Frame]) -> Surface:
 
 @dataclass(frozen=True)
 class _View:
-    """A frame to carve with. distance: [H,W] pixels from the mask's outline, positive inside."""
+    """A frame to carve with. distance: [H,W] from the mask's outline, in shorter sides of a pixel,
+    positive inside."""
 
     camera: Camera
     distance: np.ndarray
@@ -126,7 +128,8 @@ class _View:
             remap(self.distance, part, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             for part in np.array_split(at, -(-len(at) // ROW))
         ]
-        value = np.concatenate(parts).ravel()[: len(points)] * (z / self.camera.K[0, 0])
+        side = z / max(self.camera.K[0, 0], self.camera.K[1, 1])
+        value = np.concatenate(parts).ravel()[: len(points)] * side
         return np.where(inside, value, np.inf)
 
 
@@ -135,8 +138,10 @@ def _view(frame: Frame, most: int) -> _View:
     camera, smaller = shrunk_to(frame.camera, most)
     mask = smaller(frame.mask().astype(np.uint8) * 255, True) >= 128
     far = np.full(mask.shape, float(max(mask.shape)))
-    inside = far if mask.all() else distance_transform_edt(mask) - 0.5
-    outside = distance_transform_edt(~mask) - 0.5 if mask.any() else far
+    focal = camera.K[[1, 0], [1, 0]]
+    distance = partial(distance_transform_edt, sampling=focal.max() / focal)  # down, across
+    inside = far if mask.all() else distance(mask) - 0.5
+    outside = distance(~mask) - 0.5 if mask.any() else far
     return _View(camera, np.where(mask, inside, -outside).astype(np.float32))
 
 
@@ -154,7 +159,7 @@ def _bounds(frames: Sequence[Frame]) -> tuple[np.ndarray, float]:
         middle, K = (pixels.min(0) + pixels.max(0)) / 2, frame.camera.K
         ray = frame.camera.world_to_camera[:3, :3].T @ np.linalg.solve(K, [*middle, 1])
         rays.append(ray / np.linalg.norm(ray))
-        tangent = np.linalg.norm(pixels - middle, axis=1).max() / K[0, 0]
+        tangent = np.linalg.norm((pixels - middle) / K[[0, 1], [0, 1]], axis=1).max()
         cones.append((frame.camera.position, tangent))
     if not cones:
         cure = "give masks that are white on the object only"

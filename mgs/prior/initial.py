@@ -151,7 +151,7 @@ def pixel_on(prior: Prior, cameras: Sequence[Camera]) -> float:
     for camera in cameras:
         z = camera.project(prior.points)[1]
         if (z > 0).any():
-            sizes.append(np.median(z[z > 0]) / np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
+            sizes.append(np.median(z[z > 0]) / camera.focal)
     return float(np.percentile(sizes, CLOSEST)) if sizes else 0.0
 
 

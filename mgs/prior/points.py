@@ -221,12 +221,10 @@ def scattered(
     if len(cloud) and not isinstance(gaussians, int):
         count = min(count, max(round((1 + MOST_RANDOM) * len(cloud)), GAUSSIANS))
     middle = focus(dataset.frames).point
-    reach = [
-        np.linalg.norm(frame.camera.position - middle)
-        * np.sin(np.arctan(min(frame.camera.width, frame.camera.height) / 2 / frame.camera.K[0, 0]))
-        for frame in dataset.frames
-    ]
-    radius = float(np.median(reach))
+    cameras = [frame.camera for frame in dataset.frames]
+    tangents = [min(one.width / one.K[0, 0], one.height / one.K[1, 1]) / 2 for one in cameras]
+    away = np.linalg.norm([one.position - middle for one in cameras], axis=1)
+    radius = float(np.median(away * np.sin(np.arctan(tangents))))
     parts, tries = [cloud], 0
     while sum(map(len, parts)) < count and tries < DRAWS * count:
         directions = rng.normal(size=(count, 3))

@@ -317,7 +317,7 @@ def resolution(
         at, z = camera.project(middles)
         inside = in_image(camera, at, z)
         facing = np.einsum("fk,fk->f", crosses, camera.position - middles) > 0
-        size = z / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
+        size = z / camera.focal
         pixel = np.where(inside & facing & (size < pixel), size, pixel)
     in_view = np.isfinite(pixel) & (areas > 0)
     if not in_view.any():

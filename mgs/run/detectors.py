@@ -80,7 +80,7 @@ def outline_margin(start: Gaussians, camera: Camera) -> int:
     if not len(in_front):
         return 1
     size = float(np.median(np.exp(start.log_scales.max(axis=1))))
-    return 1 + math.ceil(size * camera.K[0, 0] / float(np.median(in_front)))
+    return 1 + math.ceil(size * max(camera.K[0, 0], camera.K[1, 1]) / float(np.median(in_front)))
 
 
 def view_indicators(

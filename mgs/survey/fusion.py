@@ -69,8 +69,8 @@ def fuse_frames(frames: Sequence[Frame]) -> Cloud:
         raise InputError(f"cloud: no depth image has a return; {cure}")
     stride = max(1, int(np.ceil(np.sqrt(total / MAX_FUSED_PIXELS))))
     # The lower quartile of depths is about that of the rock; most of a frame is ground behind it.
-    focal = [frame.camera.K[0, 0] for frame in frames]
-    pixels = [np.quantile(z, 0.25) / f for f, z in zip(focal, returns, strict=True) if len(z)]
+    of_frames = zip(frames, returns, strict=True)
+    pixels = [np.quantile(z, 0.25) / frame.camera.focal for frame, z in of_frames if len(z)]
     near = [p for p in pixels if p <= ALIKE * np.quantile(pixels, 0.25)]
     noise = float(np.median([depth_noise(depth) for depth in depths]))
     voxel = max(float(np.median(near)), FILTERED_SHARE * noise)
