@@ -85,7 +85,10 @@ def prune(gaussians: Gaussians, cameras: Sequence[Camera], noise: float) -> Prun
 
 def fewest(gaussians: Gaussians, cameras: Sequence[Camera], count: int) -> np.ndarray:
     """Indices [count] of the Gaussians that are left when those that change the images least are
-    removed, in rounds of at most SHARE of the rest (`prune`)."""
+    removed, in rounds of at most SHARE of the rest (`prune`). Raises InputError as `render`, and if
+    `count` is negative."""
+    if count < 0:
+        raise InputError(f"fewest: count {count} must be at least 0; correct `count`")
     indices = np.arange(len(gaussians))
     while len(indices) > count:
         rest = gaussians[indices]

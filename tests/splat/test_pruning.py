@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import fails
 
-from mgs.fit.pruning import NEIGHBOURS, prune, removal_cost
+from mgs.fit.pruning import NEIGHBOURS, fewest, prune, removal_cost
 from mgs.splat import reference, render
 
 from .scenes import calm, make_camera, make_gaussians
@@ -93,5 +93,6 @@ def test_gaussians_that_no_camera_sees_go_first_and_reruns_are_equal():
     assert prune(g[:0], [camera], 0.01).kept.shape == (0,)
 
 
-def test_a_noise_that_is_not_positive_is_one_line():
+def test_a_noise_that_is_not_positive_and_a_negative_count_are_one_line():
     fails("noise", prune, wall(), [make_camera()], float("nan"))
+    fails("count -1 must be at least 0", fewest, wall(), [make_camera()], -1)
