@@ -280,9 +280,17 @@ def brighten(run):
     write_ply(run / "gaussians.ply", read_checkpoint(run).gaussians)
 
 
+def set_noise(run):
+    """Correct the noise of pixels by hand, which decides how many parameters are informed."""
+    config = read_json(run / "config.json")
+    config["settings"]["pixel_noise"] *= 100
+    write_json(run / "config.json", config)
+
+
 WHITE = np.ones((tiny.HEIGHT, tiny.WIDTH, 3))
 CHANGES = {
     "model": lambda run, data: brighten(run),
+    "settings": lambda run, data: set_noise(run),
     "image": lambda run, data: write_png(data / "images/kf_0003.png", WHITE),
     "test view": lambda run, data: write_png(data / "test/images/kf_0002.png", WHITE),
     "mask": lambda run, data: write_png(data / "masks/kf_0003.png", WHITE[..., 0] > 0),
@@ -311,8 +319,9 @@ def test_what_has_changed_is_measured_again(dataset, prior, tmp_path, work):
         work()
         after = evaluate_run(run, pictures=False)
         assert work() == (VIEWS, 0), what
-        assert (after["all"] == before["all"]) == (what in ("damaged", "test view"))
+        assert (after["all"] == before["all"]) == (what in ("settings", "damaged", "test view"))
         assert (after["test"] == before["test"]) == (what not in ("model", "test view"))
+        assert (after["informed"] == before["informed"]) == (what != "settings")
         assert after["pictures"] is False  # those that are there may be of another model
         before = after
     evaluate_run(run)

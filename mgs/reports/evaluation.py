@@ -46,7 +46,7 @@ def evaluate_run(
         trained, tests = [frame.name for frame in run.taken], run.dataset.test_views()
         frames = run.dataset.with_images(trained)
         test_frames = () if tests is None else tests.frames
-        subject = _subject(run.gaussians, [*frames, *test_frames], trained)
+        subject = _subject(run, [*frames, *test_frames], trained)
         files = [folder / f"{frame.name}.png" for frame in frames]
         files += [folder / TEST_FOLDER / f"{frame.name}.png" for frame in test_frames]
         metrics = _measured_before(run, subject)
@@ -90,14 +90,16 @@ def _informed(run: Run) -> dict[str, dict[str, int]]:
     return {kind: {"of": part.size, "informed": int(part.sum())} for kind, part in parts.items()}
 
 
-def _subject(gaussians: Gaussians, frames: Sequence[Frame], trained: list[str]) -> str:
+def _subject(run: Run, frames: Sequence[Frame], trained: list[str]) -> str:
     """Hash of all that the metrics of a run depend on."""
     kinds = ("image", "mask", "rock", "depth")
     views = [[f.name, camera_digest(f.camera), frame_digests(f, kinds)] for f in frames]
     software = {name: version for name, version in versions().items() if name != "commit"}
+    gaussians, settings = run.gaussians, run.settings
     marks = gaussians.antialiased, gaussians.linear
+    lam = settings.lam, settings.pixel_noise, settings.prior_std, settings.estimator
     model = array_digest(getattr(gaussians, name) for name in ARRAYS), *marks
-    text = json.dumps([*model, views, trained, software])
+    text = json.dumps([*model, *lam, views, trained, software])
     return array_digest([np.frombuffer(text.encode(), np.uint8)])
 
 
