@@ -1,5 +1,6 @@
 """Versions, which files of results record."""
 
+import hashlib
 import platform
 import subprocess
 from functools import cache
@@ -19,6 +20,15 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             numbers[package] = "unknown"
     return numbers
+
+
+@cache
+def source_digest() -> str:
+    """Hash of the source files of mgs, which also differ within one commit and version."""
+    digest, folder = hashlib.sha256(), Path(__file__).parent
+    for file in sorted(folder.rglob("*.py")):
+        digest.update(f"{file.relative_to(folder)}\n".encode() + file.read_bytes())
+    return digest.hexdigest()
 
 
 @cache

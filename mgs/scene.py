@@ -27,7 +27,7 @@ from mgs.prior.build import Prior
 from mgs.prior.exposure import exposure_of, without_gain
 from mgs.prior.initial import colours_of, initial_gaussians, pixel_on
 from mgs.progress import Stage, report
-from mgs.provenance import versions
+from mgs.provenance import source_digest, versions
 from mgs.seeds import generator
 from mgs.splat import ListCache, fisher, groups, render
 from mgs.splat.information import fisher_of_colours
@@ -44,8 +44,10 @@ def _key_of_fit(
     train: TrainSettings,
     lam: Mapping[str, Any],
 ) -> str:
-    """Hash of all that decides a fit, with the content of files and the versions of libraries."""
-    settings = json.dumps([versions(), train.model_dump(mode="json")], sort_keys=True)
+    """Hash of all that decides a fit, with the content of files and of mgs, and the versions of
+    libraries."""
+    about = [versions(), source_digest(), train.model_dump(mode="json")]
+    settings = json.dumps(about, sort_keys=True)
     digest = hashlib.sha256(settings.encode())
     models = [(name, getattr(one, name)) for name in ARRAYS for one in (model, start)]
     for name, values in (("gains", gains), *models, *sorted(lam.items())):

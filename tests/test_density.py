@@ -14,6 +14,7 @@ from mgs.errors import Notice
 from mgs.fit import density, fitting, unfinished
 from mgs.fit.density import Slopes, adapt, split
 from mgs.fit.settings import RATES, TrainSettings
+from mgs.provenance import source_digest
 from mgs.rotation import rotmat_from_quat
 from mgs.scene import _key_of_fit
 from mgs.splat import reference, render
@@ -252,4 +253,10 @@ def test_any_other_number_picture_or_version_is_another_fit(scene, tmp_path, mon
     keys.append(_key_of_fit(*given, {"colour": lam}))
     monkeypatch.setattr("mgs.provenance.__version__", "99")
     keys += [_key_of_fit(*given, {kind: lam}) for kind in ("colour", "scale")]
+    for edited in ("a = 1", "a = 2"):  # a source file of mgs, in one commit
+        (tmp_path / "fitting.py").write_text(edited)
+        monkeypatch.setattr("mgs.provenance.__file__", str(tmp_path / "provenance.py"))
+        source_digest.cache_clear()
+        keys.append(_key_of_fit(*given, {"colour": lam}))
+    source_digest.cache_clear()
     assert len(set(keys)) == len(keys)
