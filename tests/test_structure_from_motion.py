@@ -543,7 +543,7 @@ def test_an_import_that_fills_the_disk_keeps_its_features(frames, tmp_path, caps
     room = iter((1 << 40, 1 << 40, 1 << 20))
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=next(room)))
     assert exit_code("import", frames[0].image_path.parent, "--out", tmp_path / "d") == 2
-    assert "repeat the command, which continues" in said(capsys)[1]
+    assert "repeat the command, or choose another place" in said(capsys)[1]
     with closing(pycolmap.Database.open(tmp_path / "d.unpacked/matches/database.db")) as database:
         assert database.num_keypoints() > 1000
 

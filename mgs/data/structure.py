@@ -132,7 +132,7 @@ class Matcher:
         need = ROOM + pictures * FEATURES * FEATURE_BYTES
         if need > free:
             room = f"may take {need / 2**20:,.0f} MiB on disk, {free / 2**20:,.0f} are free"
-            cure = "make room and repeat the command, which continues, or choose another place"
+            cure = "make room and repeat the command, or choose another place"
             raise NoRoom(f"{self.folder}: features and matches {room}; {cure}")
 
     def _extract(self, places: Sequence[int]) -> None:
