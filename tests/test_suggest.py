@@ -389,6 +389,12 @@ def test_a_suggestion_that_cannot_be_made_is_one_line(run, tmp_path, capsys, giv
     assert words in refused(capsys, ["suggest", run, *given, "--out", tmp_path / "out"], tmp_path)
 
 
+@pytest.mark.parametrize("given", ["--dome 5 --poses a.csv", "--dome 6000", "--poses a.csv"])
+def test_candidates_are_refused_before_a_model_is_fitted(run, capsys, monkeypatch, given):
+    monkeypatch.setattr("mgs.cli.suggest._run", None)
+    refused(capsys, ["suggest", open_run(run).dataset.root, *given.split()])
+
+
 def test_headings_straight_down_and_up_and_in_a_world_that_stands_otherwise():
     """Straight down the top of the image is ahead, straight up its bottom."""
     camera = Camera(np.diag([9.0, 9, 1]), 8, 8, look_at([0, 0, 5], [0, 0, 0], [1, 0, 0]))

@@ -114,6 +114,7 @@ def suggest(
         check_new_file(path, force)
     values = parse_settings(settings, suggest)
     asked = validated(Candidates, values)
+    shape = _shape(poses, dome, asked)
     own = ("flight", "enough", "certificate")
     changes = {key: values[key] for key in own if key in values} | not_none(policy=policy)
     count = parse_gaussians(views, "views") or 1
@@ -136,7 +137,7 @@ def suggest(
         run = _run(source, Path(scratch) / "run", fit)
         if plan and run.dataset.unit != "m":
             raise InputError(f"{source}: a flight plan needs metres; import the data with `unit`")
-        candidates, safe, band = _candidates(run, poses, dome, asked)
+        candidates, safe, band = _candidates(run, poses, shape, asked)
         from mgs.run.suggest import suggest as suggested
 
         changes |= {"safe_distance": safe, "elevations": band, "refine": asked.refine}
@@ -197,26 +198,37 @@ def _run(source: Path, scratch: Path, settings: dict[str, Any]) -> Run:
     return resume_nbv(run)
 
 
-def _candidates(
-    run: Run, poses: Path | None, dome: int | None, asked: Candidates
-) -> tuple[Sequence[Named], float, tuple[float, float] | None]:
-    """Candidates, their least distance from the mesh, and their elevations."""
-    from mgs.data.meshes import distances_to_mesh
-    from mgs.run.candidates import MOST_POSES, Site, place_poses, read_poses
+def _shape(poses: Path | None, dome: int | None, asked: Candidates) -> tuple[str, int] | None:
+    """Kind and number of the candidates that are asked for, if they are. Raises InputError where
+    there are two kinds, too many, or no file of them: placing and fitting pictures takes long."""
+    from mgs.run.candidates import MOST_POSES
 
     shapes = not_none(dome=dome, ring=asked.ring, grid=asked.grid)
     if len(shapes) + (poses is not None) > 1:
         raise InputError("suggest: `poses`, `dome`, `ring`, `grid`: give one of them")
+    if poses is not None and not poses.exists():
+        raise InputError(f"{poses}: no such file; give a transforms.json or a CSV of poses")
+    for kind, count in shapes.items():
+        if count > MOST_POSES:
+            raise InputError(f"suggest: {kind} {count:,}: give at most {MOST_POSES:,} poses")
+    return next(iter(shapes.items()), None)
+
+
+def _candidates(
+    run: Run, poses: Path | None, shape: tuple[str, int] | None, asked: Candidates
+) -> tuple[Sequence[Named], float, tuple[float, float] | None]:
+    """Candidates, their least distance from the mesh, and their elevations."""
+    from mgs.data.meshes import distances_to_mesh
+    from mgs.run.candidates import Site, place_poses, read_poses
+
     site = Site(run.prior, run.taken[-1].camera, run.dataset.world)
     left = [frame for frame in run.dataset.frames if frame not in run.taken]
     safe, band = asked.safe_distance, asked.elevations
     if poses is not None:
         return read_poses(poses, site), safe or 0.0, band
-    if not shapes and left:
+    if shape is None and left:
         return [(frame.name, frame.camera) for frame in left], safe or 0.0, band
-    ((kind, count),) = shapes.items() or {"dome": DOME}.items()
-    if count > MOST_POSES:
-        raise InputError(f"suggest: {kind} {count:,}: give at most {MOST_POSES:,} poses")
+    kind, count = shape or ("dome", DOME)
     eyes = np.stack([frame.camera.position for frame in run.taken])
     band = band or (10.0, 80.0)
     if safe is None:
