@@ -326,6 +326,11 @@ def test_a_topic_of_poses_is_refused_where_there_is_no_bag(dataset, tmp_path, ca
         assert "is no ROS bag, so it has no topic /slam; leave out --pose" in line
 
 
+def test_keyframes_are_refused_where_there_is_no_recording(dataset, tmp_path, capsys):
+    line = refused(capsys, ["import", dataset.root, "--out", tmp_path / "out", "--keyframes", "2s"])
+    assert "is no recording or video, and all images are taken; leave out --keyframes" in line
+
+
 def test_images_are_excluded_by_name(dataset, tmp_path, capsys):
     names = [frame.name for frame in dataset.frames]
     given = ["import", dataset.root, "--exclude", f"images/{names[2]}.png"]

@@ -69,6 +69,7 @@ RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
 }
 
 
+KEYFRAMES = "0.5s"  # default spacing of a recording
 TRAINING = "transforms_train.json"  # the training split of NeRF-synthetic data
 
 
@@ -76,7 +77,7 @@ def read_source(
     source: str | Path,
     images: Path | None = None,
     *,
-    keyframes: str = "0.5s",
+    keyframes: str = KEYFRAMES,
     unpack: Path | None = None,
     pose: str | None = None,
     exclude: Sequence[str] = (),
@@ -148,9 +149,13 @@ def _recognised(
     if recording is not None:
         reader = RECORDINGS[recording][1]
         return reader(source, images, spacing, folder, pose)
+    video = source.suffix.lower() in VIDEO_SUFFIXES and source.is_file()
+    if keyframes != KEYFRAMES and not video:
+        cure = "leave out --keyframes"
+        raise InputError(f"{source}: is no recording or video, and all images are taken; {cure}")
     if images is not None and not images.is_dir():
         raise InputError(f"{images}: no such folder; give the folder of the images")
-    if source.suffix.lower() in VIDEO_SUFFIXES and source.is_file():
+    if video:
         frames = folder / "frames"
         paths = sharpest_frames(source, frames, spacing)
         return read_photographs(frames, paths, folder / "matches", exclude)
