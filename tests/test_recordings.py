@@ -100,8 +100,8 @@ class Bag:
     def compressed_depth(self, topic: str, time: float, encoding: str, metres: np.ndarray) -> None:
         """An image of compressed_depth_image_transport; of 32FC1 with a = 60000 and b = -10."""
         steps = np.where(metres > 0, 60000 / np.maximum(metres, 1e-3) - 10, 0)
-        steps = 1000 * metres if encoding == "16UC1" else steps
-        png = cv2.imencode(".png", np.round(steps).astype(np.uint16))[1]
+        steps = in_millimetres(metres) if encoding == "16UC1" else np.round(steps)
+        png = cv2.imencode(".png", steps.astype(np.uint16))[1]
         data = np.frombuffer(struct.pack("<iff", 0, 60000, -10) + png.tobytes(), np.uint8)
         head, form = self.header(time, OPTICAL), f"{encoding}; compressedDepth png"
         self.write(topic, "sensor_msgs/msg/CompressedImage", time, head, form, data)
@@ -141,6 +141,11 @@ class Bag:
     def motion_capture(self, time: float, pose: np.ndarray) -> None:
         values = self.header(time, "room"), "base_link", self.pose("Transform", "Vector3", pose)
         self.write("/mocap/robot", "geometry_msgs/msg/TransformStamped", time, *values)
+
+
+def in_millimetres(metres: np.ndarray) -> np.ndarray:
+    """Numbers of a depth camera that gives 65535 where it sees nothing."""
+    return np.where(metres > 0, np.round(1000 * metres), 65535).astype(np.uint16)
 
 
 def slipped(pose: np.ndarray, k: int) -> np.ndarray:
@@ -190,7 +195,7 @@ def write_bag(
                 topic = f"{topic}/compressedDepth"
                 bag.compressed_depth(topic, time + 0.01, compressed, frame.depth())
             else:
-                millimetres = np.round(1000 * frame.depth()).astype(np.uint16)
+                millimetres = in_millimetres(frame.depth())
                 bag.image(topic, time + 0.01, "16UC1", millimetres)
     return path
 

@@ -15,7 +15,7 @@ from mgs.data.lens import Lens
 from mgs.data.shots import Shot, Source, Spacing, Track, posed, rigid
 from mgs.errors import InputError
 from mgs.files import atomic_path, parsing, read_bytes, reading
-from mgs.images import read_values, write_exr, write_png
+from mgs.images import UNKNOWN_DEPTH, read_values, write_exr, write_png
 
 STORAGE = (".mcap", ".db3")  # endings of the files of a ROS 2 bag
 KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -293,20 +293,26 @@ def _metres(message: Any, scratch: Path) -> np.ndarray | None:
     if not hasattr(message, "format"):
         if message.encoding not in DEPTHS:
             return None
-        kind, unit = DEPTHS[message.encoding]
-        return _rows(message, kind)[..., 0].astype(np.float32) * np.float32(unit)
+        encoding = message.encoding
+        return _scaled(_rows(message, DEPTHS[encoding][0])[..., 0], encoding)
     encoding, _, how = message.format.replace(" ", "").partition(";")
     if encoding not in DEPTHS or how not in ("compressedDepth", "compressedDepthpng"):
         return None
     data = bytes(message.data)
     scratch.write_bytes(data[DEPTH_HEADER:])
-    steps = read_values(scratch).astype(np.float32)
+    steps = read_values(scratch)
     scratch.unlink()
     if DEPTHS[encoding][0] == "u2":
-        return steps * np.float32(DEPTHS[encoding][1])
+        return _scaled(steps, encoding)
     a, b = np.frombuffer(data[4:DEPTH_HEADER], "<f4")
     with np.errstate(divide="ignore"):
-        return np.where(steps > 0, a / (steps - b), np.float32(0))
+        return np.where(steps > 0, a / (steps.astype(np.float32) - b), np.float32(0))
+
+
+def _scaled(values: np.ndarray, encoding: str) -> np.ndarray:
+    """Metres, float32 [H,W], of the numbers of an encoding; 0 for UNKNOWN_DEPTH."""
+    metres = values.astype(np.float32) * np.float32(DEPTHS[encoding][1])
+    return np.where(values == UNKNOWN_DEPTH, np.float32(0), metres)
 
 
 def _unpack_depth(reader: Any, unpack: Path, frame: str, shots: dict[float, Shot]) -> list[str]:
