@@ -24,6 +24,8 @@ mgs: fly; dataset check {long}; eval {out}; dataset check {out};
 mgs view: {out}.ply; {root}; {ply} --follow; {run} --host 192.0.2.1
 mgs simplify {run}: --noise 1e300
 mgs export {run} --out {out}.mgs: --psnr nan
+mgs export {run} --out {out}.glb: --views all; --psnr 9 --sh 2
+mgs export {run} --out {out} --to colmap: --sh 2; --colour-space linear; --prior {prior}
 mgs report {run}: --figures eps; --html {out}.html --figures pdf
 mgs diagnose {run}: --views kf_9999; --views ''
 mgs simplify {run} --method refit: --learn some; --learn all --sh 0; --loss nan; --noise 0.1

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from mgs import runtime
-from mgs.cli.options import not_none
+from mgs.cli.options import not_none, refuse_unused
 from mgs.cli.terminal import Terminal, echo, print_quality, progress_bar
 from mgs.errors import InputError
 from mgs.files import below, check_new_file, folder_locked, working_in
@@ -127,8 +127,7 @@ def simplify(
     from mgs.run.folder import open_run
 
     of_prune, of_refit = not_none(noise=noise), not_none(learn=learn, sh=sh, loss=loss)
-    if other := of_refit if method == "prune" else of_prune:
-        raise InputError(f"--{next(iter(other))}: is not used by the method {method}; leave it out")
+    refuse_unused(f"by the method {method}", **(of_refit if method == "prune" else of_prune))
     name = PRUNED if method == "prune" else REFITTED
     for run in runs:
         check_new_file(open_run(run).folder / name, force)

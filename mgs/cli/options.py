@@ -150,6 +150,12 @@ def not_none(**options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
+def refuse_unused(where: str, **options: Any) -> None:
+    """Raise InputError for the first of these options that is given. where: words after "is not used"."""
+    for name in not_none(**options):
+        raise InputError(f"--{name.replace('_', '-')}: is not used {where}; leave it out")
+
+
 def parse_up(text: str) -> tuple[float, float, float] | None:
     """Unit vector of an option like 0,0,1; None for auto. Raises InputError for anything else."""
     from mgs.data.world import unit_up

@@ -11,7 +11,7 @@ import numpy as np
 import typer
 
 from mgs import runtime
-from mgs.cli.options import Count
+from mgs.cli.options import Count, refuse_unused
 from mgs.cli.terminal import echo, progress_bar
 from mgs.errors import InputError
 from mgs.files import (
@@ -160,13 +160,19 @@ def export(
 
     limited = most is not None or psnr is not None
     to = to or ("mgs" if limited else "glb")
+    linear = True if colour_space == "linear" else None
+    if to in ("nerfstudio", "colmap"):
+        refuse_unused(f"with --to {to}", sh=sh, colour_space=linear, prior=prior)
+    else:
+        refuse_unused(f"with --to {to}", views="all" if views == "all" else None)
     if shared_prior and to != "mgs":
         raise InputError("--shared-prior: is for --to mgs; leave it out")
     if to == "mgs" or limited:
         if (most is None) == (psnr is None):
             raise InputError(f"--to {to}: needs one of --bytes and --psnr")
-        if to in ("nerfstudio", "colmap") or sh is not None or colour_space == "linear":
-            raise InputError("--bytes, --psnr: are for models as they are; leave out other options")
+        if to in ("nerfstudio", "colmap"):
+            raise InputError("--bytes, --psnr: are for models, not for views; leave them out")
+        refuse_unused("with --bytes or --psnr", sh=sh, colour_space=linear, prior=prior)
         _export_compact(models, to, out, most, psnr, shared_prior, force)
         return
     if to in ("nerfstudio", "colmap"):
@@ -179,9 +185,9 @@ def export(
     ]
     for model, path in _targets(models, defaults, out, force):
         gaussians, up = read_model(model, prior)
-        if not gaussians.linear and colour_space == "linear":
+        if not gaussians.linear and linear:
             raise InputError(f"{model}: its colours are sRGB; leave out --colour-space linear")
-        srgb = gaussians.linear and colour_space == "srgb"
+        srgb = gaussians.linear and not linear
         splats = _in_srgb(model, gaussians) if srgb else gaussians
         splats = replace(splats, origin=gaussians.origin)
         splats = splats.with_degree(max(sh or 0, splats.sh_degree))
@@ -303,11 +309,8 @@ def video(
     from mgs.reports.video import check_film, path_frames, story_frames, write_film
     from mgs.run.folder import open_run
 
-    unused: dict[str, object] = (
-        {"--beside": beside, "--width": width, "--fps": fps} if story else {}
-    )
-    if names := [name for name, value in unused.items() if value is not None]:
-        raise InputError(f"{names[0]}: is not used with --story; leave out one of them")
+    if story:
+        refuse_unused("with --story", beside=beside, width=width, fps=fps)
     fps = fps or 25
     targets = _targets(runs, [run / "video.mp4" for run in runs], out, force)
     check_film(targets[0][1])
