@@ -151,7 +151,7 @@ def not_none(**options: Any) -> dict[str, Any]:
 
 
 def refuse_unused(where: str, **options: Any) -> None:
-    """Raise InputError for the first of these options that is given. where: words after "is not used"."""
+    """Raise InputError for the first of these options that is given. where: ends the sentence."""
     for name in not_none(**options):
         raise InputError(f"--{name.replace('_', '-')}: is not used {where}; leave it out")
 
