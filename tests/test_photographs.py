@@ -643,12 +643,14 @@ def test_a_fit_with_adaptive_density_is_a_run_as_3dgs(tmp_path, capsys, monkeypa
     command("eval", tmp_path / "run")
 
 
-def test_test_views_get_masks_too(tmp_path):
+def test_test_views_get_masks_too_and_the_place_of_the_origin_stays(tmp_path):
     bare(tmp_path / "d")
+    synthetic.edit(tmp_path / "d", lambda data: data.update(place="47,8,430"))
     bare(tmp_path / "d/test")
     ball = trimesh.creation.icosphere(2, 0.4)
     mesh = Mesh(ball.vertices, ball.faces, np.ones(len(ball.faces), bool))
     made = make_masks(load_dataset(tmp_path / "d"), mesh)
+    assert read_json(tmp_path / "d/transforms.json")["place"] == "47,8,430"
     tests = load_dataset(tmp_path / "d/test")
     assert all(0 < frame.mask().mean() < 0.9 for frame in tests.frames)
     assert not any("no masks" in line for line in check_dataset(made).problems)

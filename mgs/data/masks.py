@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from mgs.colour import srgb_from_linear
-from mgs.data.dataset import Dataset, write_transforms
+from mgs.data.dataset import Dataset, read_records, write_transforms
 from mgs.data.frames import has_masks
 from mgs.data.meshes import Mesh
 from mgs.errors import InputError
@@ -45,7 +45,9 @@ def make_masks(dataset: Dataset, mesh: Mesh) -> Dataset:
         cure = "make masks with one that fits the poses"
         raise InputError(f"{dataset.root}: the mesh is in no image; {cure}")
     write_sheet(dataset.root / SHEET, thumbnails, ACROSS)
-    write_transforms(dataset.root, frames, dataset.world)
+    about, _ = read_records(dataset.root / "transforms.json")
+    place = {"place": about["place"]} if isinstance(about.get("place"), str) else {}
+    write_transforms(dataset.root, frames, dataset.world, place)
     return replace(dataset, frames=tuple(frames))
 
 
