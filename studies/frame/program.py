@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from mgs import InputError, runtime
-from mgs.errors import Notice, missing, printable_lines, row_named
+from mgs.errors import Notice, from_interrupt, missing, printable_lines, row_named
 from mgs.files import check_new_folder, check_writable, folder_locked, read_json, write_json
 
 if TYPE_CHECKING:
@@ -127,9 +127,8 @@ class Study:
             if not line:
                 raise
         except (Exception, KeyboardInterrupt) as error:
-            causes = error, error.__cause__, error.__context__
-            if not any(isinstance(cause, KeyboardInterrupt) for cause in causes):
-                raise  # Dr.Jit raises an exception of its own when a call is interrupted
+            if not from_interrupt(error):
+                raise
             line, code = "interrupted; run the same command again to continue", INTERRUPTED
         if line:
             print(f"{self.name}: {line}", file=sys.stderr)
