@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 import mgs
-from mgs.fit.settings import PASSES, WARM_PASSES
+from mgs.fit.settings import PASSES, WARM_PASSES, WARM_RATE
 from studies.chart_points import draw, points_over_rocks, tables
 from studies.frame.case import ROCKS, Case, Rock, Size, judge, rocks_of, test_views_of
 from studies.frame.output import write_table
@@ -119,6 +119,7 @@ class Point:
     density: float = DENSITY
     passes: int = PASSES
     warm_passes: int = WARM_PASSES
+    warm_rate: float = WARM_RATE
     policy: str = ""
     estimator: str = "exact"
 
@@ -131,7 +132,8 @@ class Point:
     def name(self) -> str:
         """Name of its cell."""
         parts = [f"d{1 / self.density:g}", f"i{self.images}", f"p{self.passes}"]
-        parts += [str(self.warm_passes), self.policy, self.estimator] if self.policy else []
+        later = f"{self.warm_passes}x{self.warm_rate:g}"
+        parts += [later, self.policy, self.estimator] if self.policy else []
         return f"{self.kind}/{'-'.join(parts)}"
 
     def settings(self, seeds: int) -> dict[str, Any]:
@@ -141,6 +143,7 @@ class Point:
             "policy": self.policy or "uniform",
             "estimator": self.estimator,
             "warm_passes": self.warm_passes,
+            "warm_rate": self.warm_rate,
             "seeds": seeds,
             "budget": self.images - seeds,
             "train": {"passes": self.passes},
@@ -166,6 +169,7 @@ def points_of(size: ChartSize, kind: str) -> list[Point]:
     else:
         base = Point(size.count, policy=BASE)
         points = [replace(base, policy=name) for name in size.policies]
+        points += [replace(base, warm_rate=1.0)]
         points += [replace(base, estimator=name) for name in size.estimators]
         points += [
             replace(base, density=d, passes=p, warm_passes=LATER_PASSES[p])

@@ -21,7 +21,9 @@ from studies.frame.statistics import Row, interval, pareto_front
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SETTINGS = ("kind", "images", "density", "passes", "warm_passes", "policy", "estimator")
+SETTINGS = (
+    "kind", "images", "density", "passes", "warm_passes", "warm_rate", "policy", "estimator",
+)  # fmt: skip
 """Columns that name a point."""
 
 
@@ -63,6 +65,7 @@ def base_of(points: Sequence[Row]) -> Row:
 WORDS = {
     "density": "{:g} samples a pixel",
     "passes": "{} passes",
+    "warm_rate": "later fits at {:g} of the rates of the first",
     "images": "{} images",
     "policy": "policy {}",
     "estimator": "estimator {}",
@@ -138,6 +141,7 @@ def _label(point: Row) -> str:
     if not point["policy"]:
         return f"{point['passes']} passes"
     passes = f"{point['passes']}, then {point['warm_passes']} passes"
+    passes += " at full rates" if point["warm_rate"] == 1 else ""
     return f"{point['policy']}, {passes if point['estimator'] == 'exact' else point['estimator']}"
 
 

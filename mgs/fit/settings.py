@@ -18,6 +18,7 @@ MEAN_RATE = 0.02
 # Most passes of the first fit of a run, and of the later ones, which start from a model that was
 # fitted to all images but the new. More passes overfit. Chosen constants (docs/speed-accuracy.md).
 PASSES, WARM_PASSES = 10, 5
+WARM_RATE = 0.7  # they start near their end: full rates lead away from it (the same page)
 # Default of `TrainSettings.alpha_weight` in a run whose frames all have a mask or alpha. A chosen
 # constant (docs/fit.md, An opaque surface).
 ALPHA_WEIGHT = 0.1
@@ -113,7 +114,7 @@ class ModelSettings(Frozen):
     """Prior standard deviation by kind of parameter; `mean`, in metres, only if means move."""
     warm_passes: Annotated[int, Field(ge=1, le=MOST_PASSES)] = WARM_PASSES
     """Most passes of each fit after the first; never more than `passes`."""
-    warm_rate: Positive = 1.0
+    warm_rate: Positive = WARM_RATE
     """Factor on the learning rates of the fits after the first."""
     exposure: bool = False
     """Estimate a gain per image and channel, for images of unequal exposure or white balance."""
