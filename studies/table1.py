@@ -9,11 +9,17 @@ fits of less than 30,000 steps it changes during the first half of the steps.
 Runs are timed one by one: let nothing else run meanwhile.
 """
 
+import os
 import shutil
+import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
+from multiprocessing import get_context, parent_process
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -32,7 +38,7 @@ from studies.frame.case import Case, Rock, Size, test_views_of
 from studies.frame.output import table, write_table
 from studies.frame.program import Study, Work, at_least, study_of
 from studies.frame.statistics import Row
-from studies.frame.sweep import Cell, cell_folder, worker_pool
+from studies.frame.sweep import Cell, cell_folder
 from studies.frame.timing import peak_megabytes
 from studies.setups import RANDOM, RING
 
@@ -216,8 +222,27 @@ def in_new_process(
 
     Raises InputError if that process is killed, and what the function raises.
     """
-    with worker_pool(1, f"{out}: its process") as pool:
-        return pool.submit(task, *arguments).result()
+    with ProcessPoolExecutor(1, get_context("spawn"), initializer=_begin) as pool:
+        try:
+            return pool.submit(task, *arguments).result()
+        except BrokenProcessPool:
+            raise mgs.InputError(
+                f"{out}: its process was killed (is there too little memory?); "
+                "give the command again"
+            ) from None
+
+
+def _begin() -> None:
+    """Begin a process that ends silently at Ctrl-C, and with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    parent = parent_process()
+    assert parent
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=wait, daemon=True).start()
 
 
 def time_3dgs(

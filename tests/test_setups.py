@@ -3,6 +3,8 @@
 import json
 import os
 import re
+import subprocess
+import sys
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
@@ -338,9 +340,30 @@ def test_a_run_and_3dgs_are_timed_alone_and_measured_on_all_views(tmp_path, monk
     assert free["all"]["psnr"] > 15
 
 
-def test_a_process_that_is_killed_is_one_clear_line():
-    line = fails("^cell: its process was", table1.in_new_process, os._exit, Path("cell"), 9)
-    assert "workers" not in line
+LINGERING = """
+import time
+from pathlib import Path
+
+def linger():
+    print("begun", flush=True)
+    time.sleep(100)
+
+if __name__ == "__main__":
+    from studies.table1 import in_new_process
+
+    in_new_process(linger, Path("cell"))
+"""
+"""A study with a task that takes long."""
+
+
+def test_a_study_that_is_killed_leaves_no_process_behind(tmp_path):
+    (tmp_path / "study.py").write_text(LINGERING)
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    options = {"env": env, "stdout": subprocess.PIPE, "text": True}
+    process = subprocess.Popen([sys.executable, tmp_path / "study.py"], **options)
+    assert process.stdout.readline() == "begun\n"
+    process.kill()
+    process.communicate(timeout=60)  # returns when the last process that has the pipe has ended
 
 
 def test_table_1_has_equal_counts_and_the_papers_rows(tmp_path, capsys, monkeypatch):
@@ -423,7 +446,7 @@ def test_leads_are_over_scenes_and_corrected_for_all_tests():
 
 
 BAD = {
-    "--rocks": "--rocks 13; --rocks x", "--workers": "--workers 0",
+    "--rocks": "--rocks 13; --rocks x", "--scheduler": "--workers 2 --scheduler tcp://x:1",
     "--policy uniform": "--policy uniform", "angle": f"--policy {OWN} --policy {OWN}",
     "none.glb": "--mesh none.glb", "--scale": "--scale huge", "--images": "--images 4",
 }  # fmt: skip

@@ -1,27 +1,31 @@
 """A sweep of cells: each is done once, in the order of needs, and what was interrupted goes on."""
 
 import json
+import logging
 import os
+import signal
+import subprocess
 import sys
+import threading
 import time
 from importlib import import_module
 from pathlib import Path
 
+import dask
 import pytest
-from program import python
+from distributed import LocalCluster
 from refusals import fails
 
-from studies.frame import program
+from studies.frame import program, sweep
 from studies.frame.program import names_of
 from studies.frame.sweep import Cell, cell_folder, result_of, run_cells
 
 CALLS = []
 
 
-def add(root, out, x, to=None, seconds=0):
+def add(root, out, x, to=None):
     """A task: x plus what another cell found."""
     CALLS.append(out.name)
-    time.sleep(seconds)
     if x < 0:
         raise ValueError(x)
     (out / "file").write_text(str(x))
@@ -90,78 +94,129 @@ def test_names_come_in_the_order_of_those_known():
         fails(r"^--only", names_of, only, [*"abc"])
 
 
-def describe(root, out):
-    """A task that finds its process, and whether another cell has begun and not ended."""
-    import drjit as dr
+def add_slowly(root, out, x):
+    """A task that takes part of a second."""
+    time.sleep(0.2)
+    return {"square": x * x}
 
+
+def write_process(root, out, **arguments):
+    """A task that finds its process, and whether another cell has begun and not ended."""
     others = [folder for folder in out.parent.iterdir() if folder != out]
     beside = [folder.name for folder in others if not (folder / "result.json").exists()]
-    process = {"pid": os.getpid(), "threads": dr.thread_count()}
-    return process | {"beside": beside, "waits": os.environ.get("OMP_WAIT_POLICY")}
+    return {"pid": os.getpid(), "beside": beside}
 
 
-def test_workers_find_silently_what_a_serial_run_finds(tmp_path, capfd):
-    slow, told = cell("slow", x=1, seconds=0.5), []
-    cells = [cell("last", ("slow",), x=2, to="slow"), slow, cell("other", x=3)]
+def die(root, out):
+    """A task that its process does not survive."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def die_once(root, out):
+    """A task that its process does not survive at first."""
+    if not (out / "begun").exists():
+        (out / "begun").touch()
+        die(root, out)
+    return {"preloaded": "pymeshlab" in sys.modules}
+
+
+def test_two_workers_of_which_one_is_killed_find_silently_what_a_serial_run_finds(tmp_path, capfd):
+    cells, told = [Cell(str(x), "test_sweep:add_slowly", {"x": x}) for x in range(3)], []
+    killed = [Cell("killed", "test_sweep:die_once"), cell("last", (*"012", "killed"), x=1)]
     report = lambda name, *_: told.append(name)  # noqa: E731
-    found = run_cells(tmp_path / "a", cells, report, workers=2)
+    found = run_cells(tmp_path / "a", cells + killed, report, workers=2)
     assert capfd.readouterr() == ("", "")
-    assert sorted(told) == ["last", "other", "slow"]
-    assert found == run_cells(tmp_path / "b", cells, silent)
+    assert sorted(told) == ["0", "1", "2", "killed", "last"]
+    assert told[-1] == "last"
+    more = {"killed": {"preloaded": True}, "last": {"sum": 1}}
+    assert found == run_cells(tmp_path / "b", cells, silent) | more
 
 
-def test_a_cell_that_must_be_alone_runs_here_and_others_share_the_cores(tmp_path, monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(6))
-    task, slow = "test_sweep:describe", cell("slow", x=1, seconds=0.5)
-    cells = [Cell("alone", task, alone=True), Cell("other", task), slow]
-    results = run_cells(tmp_path, cells, silent, workers=2)
-    assert (results["alone"]["pid"], results["alone"]["beside"]) == (os.getpid(), [])
-    assert results["other"]["pid"] != os.getpid()
-    assert (results["other"]["threads"], results["other"]["waits"]) == (3, "passive")
+@pytest.fixture(scope="module")
+def scheduler():
+    """Address of a Dask scheduler with two worker processes."""
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, host="127.0.0.1", memory_limit=0,
+            dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL + 1,
+        ) as cluster,
+    ):  # fmt: skip
+        yield cluster.scheduler_address
 
 
-def test_what_a_cell_raises_ends_all_workers_and_what_is_done_is_kept(tmp_path):
-    cells = [cell("a", x=1), cell("b", ("a",), x=-1), cell("long", x=1, seconds=60)]
-    began = time.monotonic()
+def test_a_cell_that_must_be_alone_runs_here_and_beside_nothing(tmp_path, scheduler):
+    alone = Cell("alone", "test_sweep:write_process", alone=True)
+    cells = [alone, Cell("a", "test_sweep:add_slowly", {"x": 1})]
+    cells.append(Cell("b", "test_sweep:write_process"))
+    results = run_cells(tmp_path, cells, silent, scheduler=scheduler)
+    assert results["alone"] == {"pid": os.getpid(), "beside": []}
+    assert results["b"]["pid"] != os.getpid()
+
+
+def test_what_a_cell_raises_in_a_worker_is_raised_and_what_is_done_is_kept(tmp_path, scheduler):
+    cells = [cell("a", x=1), cell("b", ("a",), x=-1)]
     with pytest.raises(ValueError, match="-1"):
-        run_cells(tmp_path, cells, silent, workers=2)
-    assert time.monotonic() - began < 40
-    assert [result_of(tmp_path, one) for one in cells] == [{"sum": 1}, None, None]
+        run_cells(tmp_path, cells, silent, scheduler=scheduler)
+    assert result_of(tmp_path, cells[0]) == {"sum": 1}
+    assert result_of(tmp_path, cells[1]) is None
 
 
-def strike(root, out, who, end):
-    """A task that sends a signal to its study, its worker, or all processes, as Ctrl-C does. Then
-    another worker is there and idle, because cell c is done."""
-    while not (cell_folder(root, "c") / "result.json").exists():
-        time.sleep(0.05)
-    os.kill({"all": 0, "study": os.getppid(), "worker": os.getpid()}[who], end)
-    time.sleep(60)
+def test_a_cell_that_kills_its_worker_again_and_again_is_one_clear_line(tmp_path, scheduler):
+    cells = [Cell("deadly", "test_sweep:die")]
+    fails("deadly: its worker", run_cells, tmp_path, cells, silent, scheduler=scheduler)
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x"])
+def test_a_scheduler_that_does_not_answer_is_one_clear_line(tmp_path, address, monkeypatch):
+    monkeypatch.setattr(sweep, "CONNECT_SECONDS", 0.5)
+    cells, named = [cell("a", x=1)], f"^--scheduler {address}: no Dask"
+    fails(named, run_cells, tmp_path, cells, silent, scheduler=address)
+
+
+@pytest.mark.parametrize(("workers", "fault"), [(0, "has no worker"), (1, "several threads")])
+def test_a_scheduler_whose_workers_will_not_do_is_one_clear_line(
+    tmp_path, workers, fault, monkeypatch
+):
+    monkeypatch.setattr(sweep, "CONNECT_SECONDS", 1)
+    options = {"processes": False, "dashboard_address": "127.0.0.1:0", "threads_per_worker": 2}
+    options |= {"host": "127.0.0.1", "protocol": "tcp://"}
+    with LocalCluster(n_workers=workers, **options) as cluster:
+        place = {"scheduler": cluster.scheduler_address}
+        fails(fault, run_cells, tmp_path, [cell("a", x=1)], silent, **place)
+
+
+def sleep(root, out):
+    """A task that outlives its scheduler."""
+    time.sleep(3)
     return {}
 
 
-STRUCK = """
-import sys
-from test_sweep import Cell, cell, program
-out, who, end = sys.argv[1:]
-struck = Cell("b", "test_sweep:strike", {"who": who, "end": int(end)}, ("a",))
-cells = lambda work: [cell("a", x=1), struck, cell("c", ("a",), x=1)]
-program.Study("made", "", None, {"quick": 0}, cells, program.WORKERS)([out, "--workers", "2"])
+HOST = """
+from distributed import LocalCluster
+options = {"processes": False, "host": "127.0.0.1", "protocol": "tcp://"}
+with LocalCluster(1, threads_per_worker=1, dashboard_address="127.0.0.1:0", **options) as cluster:
+    print(cluster.scheduler_address, flush=True)
+    input()
 """
 
 
-@pytest.mark.parametrize(
-    ("who", "end", "code", "line"),
-    [
-        ("all", 2, 130, "made: interrupted; run the same command again to continue\n"),
-        ("study", 9, -9, ""),
-        ("worker", 9, 2, "made: a worker was killed (is there too little memory?); "
-                         "run the same command again with fewer workers\n"),
-    ],
-)  # fmt: skip
-def test_a_signal_ends_all_processes_and_what_is_done_is_kept(tmp_path, who, end, code, line):
-    # Python tells of a killed process what is no fault of ours, that its semaphores are left.
-    env = {"PYTHONPATH": os.pathsep.join(sys.path), "PYTHONWARNINGS": "ignore:resource_tracker"}
-    options = {"env": env, "start_new_session": True, "timeout": 50}
-    ended = python(STRUCK, tmp_path / "out", who, end, **options)  # until no worker can print
-    assert (ended.returncode, ended.stderr) == (code, line)
-    assert result_of(tmp_path / "out", cell("a", x=1)) == {"sum": 1}
+def test_a_lost_scheduler_is_one_line(tmp_path, caplog):
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen([sys.executable, "-c", HOST], text=True, env=env, **pipes)
+
+    def lose():
+        while not (tmp_path / "cells/sleep").exists():
+            time.sleep(0.05)
+        process.kill()
+
+    threading.Thread(target=lose, daemon=True).start()
+    place = {"scheduler": process.stdout.readline().strip()}
+    cells = [Cell("sleep", "test_sweep:sleep")]
+    try:
+        fails("the connection to the Dask .* is lost", run_cells, tmp_path, cells, silent, **place)
+    finally:
+        process.kill()
+        process.communicate()
+    assert [one.name for one in caplog.records if one.name == "distributed.client"] == []

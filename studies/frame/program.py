@@ -47,6 +47,10 @@ WORKERS: Options = {
         "default": 1,
         "help": "Worker processes, which share the cores.",
     },
+    "--scheduler": {
+        "metavar": "ADDRESS",
+        "help": "Use the workers of this Dask scheduler instead, as tcp://HOST:8786.",
+    },
 }
 
 
@@ -141,6 +145,8 @@ class Study:
         if not self.sizes:
             self.tell(self.write(work))
             return
+        if getattr(options, "scheduler", None) and options.workers != 1:
+            raise InputError("--scheduler: has workers of its own; leave out --workers")
         size = self.sized(row_named(self.sizes, options.scale, "--scale"), options)
         work = replace(work, size=size)
         work = replace(work, cells=self.cells(work))
@@ -157,7 +163,8 @@ class Study:
                 self.write(replace(work, results=results))
             print(printable_lines(f"{done}/{total} {name}"), flush=True)
 
-        return run_cells(work.out, work.cells, report, workers=getattr(work.options, "workers", 1))
+        how = {key: getattr(work.options, key, None) for key in ("workers", "scheduler")}
+        return run_cells(work.out, work.cells, report, **how)
 
     def tell(self, paths: Sequence[Path]) -> None:
         """Print the Markdown files, and the names of all."""

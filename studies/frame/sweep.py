@@ -2,27 +2,34 @@
 
 A cell is a function and its JSON arguments. Its result is kept in OUT/cells/NAME/result.json,
 beside the files it writes, and is reused as long as function and arguments stay the same. Cells run
-one after another in this process, or several at a time in workers; the results are the same.
+one after another in this process, or several at a time in Dask workers; the results are the same.
 """
 
+import gc
+import logging
 import os
-import signal
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from concurrent.futures import CancelledError
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from graphlib import TopologicalSorter
 from importlib import import_module
-from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
-from threading import Thread
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mgs import InputError, runtime
+from mgs import InputError
 from mgs.files import read_json, write_json
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 CELLS = "cells"
+CONNECT_SECONDS = 10
+"""Longest wait for a scheduler to answer, and for its first worker."""
+
+PRELOAD = "pymeshlab"
+"""Module that workers import in their main thread. A process in which another thread imports it and
+makes a Poisson surface aborts when it ends."""
 
 Report = Callable[[str, int, int], None]
 """Called as report(name, done, total) for each cell that is not done yet."""
@@ -92,15 +99,24 @@ def do(root: Path, cell: Cell) -> dict[str, Any]:
     return result
 
 
-def run_cells(root: Path, cells: Iterable[Cell], report: Report, *, workers: int = 1) -> Results:
+def run_cells(
+    root: Path,
+    cells: Iterable[Cell],
+    report: Report,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> Results:
     """Do all cells in the order of their needs, and return their results.
 
-    workers: number of processes, which share the cores; one: this process. A cell is reported
-    before it begins, and in a worker once it is done.
+    workers: number of processes, which share the cores; one: this process. scheduler: address of a
+    Dask scheduler whose workers are used instead; they must see `root` under the same path and have
+    one thread each. A cell is reported before it begins, and in a worker once it is done.
 
-    Raises what a cell raises; InputError if a worker is killed. Finished cells are kept.
+    Raises what a cell raises; InputError if the scheduler does not answer or is lost, its workers
+    do not fit, or a cell's worker is killed repeatedly. Finished cells are kept.
     """
-    root = root.resolve()  # tasks run programs in other folders
+    root = root.resolve()  # workers may have another current folder
     by_name = {cell.name: cell for cell in cells}
     order = TopologicalSorter({name: cell.needs for name, cell in by_name.items()}).static_order()
     ordered = [by_name[name] for name in order]
@@ -110,9 +126,10 @@ def run_cells(root: Path, cells: Iterable[Cell], report: Report, *, workers: int
         report(cell.name, len(results), len(ordered))
 
     side_by_side = [cell for cell in ordered if cell.name not in results and not cell.alone]
-    if side_by_side and workers > 1:
-        with worker_pool(workers, "a worker") as pool:
-            for cell, result in _done_in_workers(root, side_by_side, pool):
+    if side_by_side and (scheduler or (workers or 1) > 1):
+        threads = None if scheduler else max(1, len(os.sched_getaffinity(0)) // (workers or 1))
+        with _client(workers or 1, scheduler) as client:
+            for cell, result in _done_in_workers(root, side_by_side, client, threads):
                 tell(cell)
                 results[cell.name] = result
     for cell in ordered:
@@ -122,61 +139,103 @@ def run_cells(root: Path, cells: Iterable[Cell], report: Report, *, workers: int
     return {cell.name: results[cell.name] for cell in ordered}
 
 
-def _done_in_workers(
-    root: Path, cells: list[Cell], pool: ProcessPoolExecutor
-) -> Iterator[tuple[Cell, dict[str, Any]]]:
-    """Do each cell once its needs are done; yield them with their results as they end."""
-    by_name = {cell.name: cell for cell in cells}
-    order = TopologicalSorter(
-        {cell.name: [name for name in cell.needs if name in by_name] for cell in cells}
-    )
-    order.prepare()
-    running: dict[Future[dict[str, Any]], Cell] = {}
-    while order.is_active():
-        for name in order.get_ready():
-            running[pool.submit(do, root, by_name[name])] = by_name[name]
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
-            cell = running.pop(future)
-            yield cell, future.result()
-            order.done(cell.name)
-
-
 @contextmanager
-def worker_pool(workers: int, name: str) -> Iterator[ProcessPoolExecutor]:
-    """Pool of worker processes, which share the cores and end with the block.
+def _client(workers: int, scheduler: str | None) -> "Iterator[Client]":
+    """Connection to a scheduler: the one at the address, or a cluster of this machine that ends
+    with the block."""
+    import dask
+    from distributed import Client, LocalCluster
 
-    Raises InputError if one is killed. name: of a worker, for that message.
-    """
-    threads = max(1, len(os.sched_getaffinity(0)) // workers)
-    with ProcessPoolExecutor(workers, get_context("spawn"), _begin, (threads,)) as pool:
+    settings = {
+        "distributed.worker.profile.enabled": False,
+        "distributed.comm.timeouts.connect": CONNECT_SECONDS,
+        # Poisson surfaces start a thread for each core, which would keep all workers waiting.
+        "distributed.nanny.pre-spawn-environ.OMP_WAIT_POLICY": "passive",
+    }
+    silent = logging.CRITICAL + 1  # killed workers are retried, and errors of cells are raised
+    names = ("distributed", "distributed.client", "tornado.application")
+    loggers = [logging.getLogger(name) for name in names]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(silent)
+    options: dict[str, Any] = {
+        "host": "127.0.0.1",
+        "dashboard_address": "127.0.0.1:0",
+        "preload": PRELOAD,
+    }
+    options |= {"threads_per_worker": 1, "memory_limit": 0, "silence_logs": silent}
+    try:
+        with dask.config.set(settings):
+            if scheduler is not None:
+                with _connected(scheduler) as client:
+                    yield client
+                return
+            with LocalCluster(n_workers=workers, **options) as cluster, Client(cluster) as client:
+                yield client
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+def _connected(scheduler: str) -> "Client":
+    from distributed import Client
+
+    client = None
+    with suppress(OSError, ValueError, TimeoutError):
+        client = Client(scheduler, timeout=CONNECT_SECONDS)
+    if client is None:
+        gc.collect()  # the client that failed: collected while another starts, it blocks for ever
+        raise InputError(
+            f"--scheduler {scheduler}: no Dask scheduler answers; "
+            "give its address, as tcp://HOST:8786"
+        )
+    with suppress(TimeoutError):
+        client.wait_for_workers(1, timeout=CONNECT_SECONDS)
+    threads = client.nthreads().values()
+    if not threads or max(threads) > 1:
+        client.close()
+        fault = "has a worker with several threads" if threads else "has no worker"
+        raise InputError(
+            f"--scheduler {scheduler}: {fault}; "
+            f"start workers with `dask worker {scheduler} --nthreads 1`"
+        )
+    return client
+
+
+def _done_in_workers(
+    root: Path, cells: list[Cell], client: "Client", threads: int | None
+) -> Iterator[tuple[Cell, dict[str, Any]]]:
+    """Do cells in workers, one at a time in each; yield them with their results as they end."""
+    from distributed import Future, KilledWorker, as_completed
+
+    futures: dict[str, Future] = {}
+    for cell in cells:
+        needs = [futures[name] for name in cell.needs if name in futures]
+        futures[cell.name] = client.submit(_do_in_worker, root, cell, threads, needs, pure=False)
+    by_future = {futures[cell.name]: cell for cell in cells}
+    for future in as_completed(by_future):
         try:
-            yield pool
-        except BrokenProcessPool:
-            fewer = " with fewer workers" if workers > 1 else ""
+            yield by_future[future], future.result()
+        except CancelledError:
             raise InputError(
-                f"{name} was killed (is there too little memory?); "
-                f"run the same command again{fewer}"
+                "the connection to the Dask scheduler is lost; finished cells are kept: run the "
+                "same command again when the scheduler is there"
             ) from None
-        finally:
-            for process in active_children():
-                process.terminate()
+        except KilledWorker:
+            raise InputError(
+                f"{by_future[future].name}: its worker was killed again and again (is there too "
+                "little memory?); run the same command again with fewer workers"
+            ) from None
 
 
-def _begin(threads: int) -> None:
-    """Begin a worker process with this many threads of Dr.Jit. It ends silently at Ctrl-C, and with
-    its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    parent = parent_process()
-    assert parent
+def _do_in_worker(root: Path, cell: Cell, threads: int | None, needs: list[Any]) -> dict[str, Any]:
+    """`do` in a worker process with this many threads of Dr.Jit, None: its default; after the cells
+    whose results are `needs`."""
+    if threads is not None:
+        import drjit as dr
 
-    def end_with_parent() -> None:
-        parent.join()
-        os._exit(1)
+        from mgs import runtime
 
-    Thread(target=end_with_parent, daemon=True).start()
-    # OpenMP threads of a Poisson surface, one for each core, would keep all workers waiting.
-    os.environ["OMP_WAIT_POLICY"] = "passive"
-    runtime.start()
-    import drjit as dr
-
-    dr.set_thread_count(threads)
+        runtime.start()
+        dr.set_thread_count(threads)
+    return do(root, cell)
