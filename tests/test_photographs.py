@@ -33,7 +33,7 @@ from mgs.data.world import World, degrees_between, levelled, unit_up, up_of_came
 from mgs.errors import InputError, Notice
 from mgs.files import read_json, write_json
 from mgs.fit import density
-from mgs.images import write_png
+from mgs.images import write_exr, write_png
 from mgs.prior import hull
 from mgs.prior.build import build_prior, load_prior, prior_and_cloud
 from mgs.prior.figure import UP, _oblique
@@ -602,6 +602,44 @@ def test_depth_beside_photographs_without_masks_leaves_the_fit_whole(colmap, tmp
     assert start_of_fit(deep, None, None, {}) == start_of_fit(data, None, None, {})
     (tmp_path / "d/sparse.ply").unlink()
     assert start_of_fit(deep, None, None, {}).source is None
+
+
+WALL = 3.0
+"""Radius of the round room, metres, about the origin."""
+
+
+def write_room(root):
+    """RGB-D images without masks from near the middle of a room, outwards."""
+    frames = []
+    for i, towards in enumerate(synthetic.sphere(14)):
+        camera = synthetic.pinhole(30, 48, 36, 0.3 * towards, towards)
+        rays = camera.unproject(np.ones((36, 48))) - camera.position
+        along = rays @ camera.position
+        beyond = WALL**2 - camera.position @ camera.position
+        square = (rays**2).sum(-1)
+        z = (np.sqrt(along**2 + square * beyond) - along) / square
+        paths = root / f"images/kf_{i:04d}.png", root / f"depth/kf_{i:04d}.exr"
+        write_png(paths[0], synthetic.albedo(camera.unproject(z)))
+        write_exr(paths[1], {"Z": z})
+        frames.append(Frame(f"kf_{i:04d}", camera, 0.5 * i, paths[0], depth_path=paths[1]))
+    write_transforms(root, frames)
+    return load_dataset(root)
+
+
+def test_a_room_with_depth_starts_whole_from_its_walls(tmp_path, capsys):
+    """It was refused: what all cameras look at lies behind them, where there is no depth."""
+    data = write_room(tmp_path / "room")
+    start = start_of_fit(data, None, None, {})
+    assert start.source == "random"
+    assert start.train["density"] == "split"
+    line = refused(capsys, ["prior", data.root], tmp_path / "none")
+    assert "a whole scene is fitted without a prior (`mgs fit`)" in line
+    _, points, normals, _, numbers = scattered(data, PriorSettings(gaussians=400))
+    on_wall = np.abs(np.linalg.norm(points, axis=1) - WALL) < 0.02 * WALL
+    assert numbers["triangulated"] == on_wall[:364].sum() == 364  # 1 / 1.1 of all
+    assert (normals[:364] * points[:364]).sum(1).max() < 0
+    command("fit", data.root, "--passes", 6, "--out", tmp_path / "run")
+    assert load_prior(tmp_path / "run/prior").kind == "random"
 
 
 def test_an_object_in_masks_starts_with_few_gaussians_that_are_split(

@@ -18,14 +18,13 @@ from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame, in_mask, visible
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh, distances_to_mesh, mesh_of, read_mesh
-from mgs.data.structure import CLOUD
 from mgs.data.world import UPRIGHT, World, unit_up
 from mgs.errors import InputError
 from mgs.files import atomic_path, check_new_folder, parsing, read_json, reading, write_json
 from mgs.notebook import cloud, html
 from mgs.prior.hull import MOST_PIXELS
 from mgs.prior.photographs import check_masks, check_photographs, choose_source, surface_of
-from mgs.prior.points import scattered
+from mgs.prior.points import has_points, scattered
 from mgs.prior.segmentation import SegmentedCloud, segment_dataset
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import (
@@ -189,7 +188,7 @@ def _place(dataset: Dataset) -> dict[str, Any]:
 
 def _random_prior(dataset: Dataset, settings: PriorSettings, shown: Sequence[Frame]) -> Prior:
     """The prior of the source "random". shown: frames whose masks are read."""
-    check_photographs(dataset.frames, of_object=not (dataset.root / CLOUD).is_file())
+    check_photographs(dataset.frames, of_object=not has_points(dataset))
     check_masks(shown)
     mesh, points, normals, spacing, numbers = scattered(dataset, settings, shown)
     about = {"from": "random", "frames": len(dataset.frames), **_place(dataset)}

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import Dataset
-from mgs.data.frames import Frame, has_masks, in_image
+from mgs.data.frames import Frame, has_masks
 from mgs.data.meshes import Mesh
 from mgs.data.structure import CLOUD
 from mgs.errors import InputError, Notice
@@ -19,11 +19,10 @@ from mgs.prior.segmentation import NoSurface, Plane, SegmentedCloud
 from mgs.prior.settings import PriorSettings
 from mgs.prior.surface import Surface, closed_poisson, intersection, poisson_mesh, shell
 from mgs.progress import report
-from mgs.survey.fusion import focus, voxel_means
+from mgs.survey.fusion import LEAST_OVERLAP, looking_at_one, voxel_means
 
 SOURCES = ("depth", "mesh", "points", "hull", "random")  # sources of a prior
 LEAST_PHOTOGRAPHS = 8  # fewest photographs without depth for a surface
-LEAST_OVERLAP = 0.5  # least share of cameras that have in their image the point that all look at
 GAP = 4.0  # distance from every point, in spacings, beyond which the hull replaces the points
 # Cells of 0.75 spacings: larger ones lose detail, smaller ones gain nothing (measured).
 CELL_OF_SPACING = 0.5  # cloud spacing passed to the Poisson reconstruction, over the real one
@@ -79,8 +78,7 @@ def check_photographs(frames: Sequence[Frame], of_object: bool) -> None:
     check_enough(len(frames))
     if not of_object:
         return
-    point = focus(frames).point[None]
-    inside = [bool(in_image(frame.camera, *frame.camera.project(point))[0]) for frame in frames]
+    inside = looking_at_one(frames)
     if np.mean(inside) < LEAST_OVERLAP:
         raise InputError(
             f"prior: the photographs are not of one object: of {len(frames)} cameras only "

@@ -24,7 +24,7 @@ from mgs.prior.surface import MOST_GAUSSIANS
 from mgs.progress import report
 from mgs.seeds import derive_seed, generator
 from mgs.survey.depth_sensor import SIGMA_FROM_MAD
-from mgs.survey.fusion import REACH, Cloud, focus
+from mgs.survey.fusion import REACH, Cloud, focus, fuse_frames, of_one_object
 
 LEAST_TRACK = 3  # fewest images that saw a point: two can agree by chance
 ERROR_LIMIT = 2.5  # largest reprojection error, robust standard deviations above the median
@@ -191,8 +191,17 @@ PIXELS = 100  # of all images, in the masks, per Gaussian where no number is giv
 # many: they hide what is behind them, and a fit splits Gaussians where more are needed. A chosen
 # constant.
 MOST_RANDOM = 0.1
+MOST_FUSED = 100  # about the most depth images that points of a whole scene come from; chosen
 FAR = 10.0  # radius of the random background, over that of the ball that the cameras look at
 DRAWS = 64  # draws per Gaussian after which too few lie inside the masks
+
+
+def has_points(dataset: Dataset) -> bool:
+    """Whether a whole scene has points to start from: those that came with the cameras, or depth
+    images of cameras that do not look at one thing."""
+    frames = dataset.frames
+    with_depth = all(frame.depth_path for frame in frames)
+    return (dataset.root / CLOUD).is_file() or (with_depth and not of_one_object(frames))
 
 
 def scattered(
@@ -259,12 +268,16 @@ def scattered(
 def _triangulated(
     dataset: Dataset, shown: Sequence[Frame], most: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Reliable points [N,3] of the dataset's cloud, at most `most`, that lie in some of the frames
-    shown and in all their masks, and unit directions to their cameras [N,3]; none without a cloud.
-    """
-    if not (dataset.root / CLOUD).is_file():
+    """Reliable points [N,3] of the dataset's cloud, else of its depth, at most `most`, that lie in
+    some of the frames shown and in all their masks, and unit directions to their cameras [N,3];
+    none unless `has_points`."""
+    if not has_points(dataset):
         return np.zeros((0, 3)), np.zeros((0, 3))
-    cloud = read_cloud(dataset.root / CLOUD).upright(dataset.world)
+    if (dataset.root / CLOUD).is_file():
+        cloud = read_cloud(dataset.root / CLOUD).upright(dataset.world)
+    else:
+        fused = fuse_frames(dataset.frames[:: -(-len(dataset) // MOST_FUSED)], np.inf)
+        cloud = SparseCloud(fused.points, fused.views)
     share, count = mask_share(cloud.points, shown)
     indices = np.flatnonzero(reliable(cloud) & (count > 0) & (share >= MASK_SHARE))
     indices = np.sort(rng.permutation(indices)[:most])

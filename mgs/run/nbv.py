@@ -12,7 +12,7 @@ from mgs import runtime
 from mgs.camera import extent_of
 from mgs.data.dataset import Dataset, load_dataset
 from mgs.data.frames import Frame, has_masks
-from mgs.data.structure import CLOUD, write_refined
+from mgs.data.structure import write_refined
 from mgs.errors import InputError
 from mgs.files import THERE, Ours, atomic_folder, read_leftover, read_text
 from mgs.fit.density import GROWTH, split_times
@@ -23,6 +23,7 @@ from mgs.memory import VIEW_BYTES, check_room
 from mgs.policy.poses import seed_views
 from mgs.prior.build import Prior, build_prior, load_prior, save_prior
 from mgs.prior.photographs import choose_source
+from mgs.prior.points import has_points
 from mgs.prior.settings import PriorSettings
 from mgs.progress import Progress, listening
 from mgs.run import recording
@@ -254,8 +255,8 @@ def start_of_fit(data: Dataset, prior: Any, gaussians: Any, train: dict[str, Any
     By default means are free where the prior comes from photographs (`LOOSE`), with FREE_TRAIN,
     colours of degree FREE_SH and a looser prior, else frozen. With adaptive density, settings and
     degree are by default those of 3DGS (`as_3dgs`). Photographs without masks are fitted whole,
-    from the points that came with the cameras and random ones, unless a prior is given: a surface
-    of the object cannot explain what is around it. Gaussians of a prior from photographs that is
+    from `has_points` and random ones, unless a prior is given: a surface of the object cannot
+    explain what is around it. Gaussians of a prior from photographs that is
     built in the run are split where images need more: those of a whole scene unless their number is
     given, those of an object into that number."""
     existing, sh, parts = _place_of(data.root, prior, gaussians), 0, 1.0
@@ -265,7 +266,7 @@ def start_of_fit(data: Dataset, prior: Any, gaussians: Any, train: dict[str, Any
         kind = str(numbers.get("from", "")) if isinstance(numbers, dict) else ""
     else:
         kind = existing.kind if existing else choose_source(data.survey())
-    points = kind == "points" or (kind == "depth" and (data.root / CLOUD).is_file())
+    points = kind in ("points", "depth") and has_points(data)
     whole = prior is None and points and not has_masks(data.frames)
     source = "random" if whole and train.get("means", "free") == "free" else None
     kind = source or kind
@@ -277,7 +278,7 @@ def start_of_fit(data: Dataset, prior: Any, gaussians: Any, train: dict[str, Any
     if train["means"] != "free" or kind not in LOOSE:
         return FitStart(source, train, sh)
     train, of_object = passes | FREE_TRAIN | train, kind != "random" and existing is None
-    few = kind == "random" and (data.root / CLOUD).is_file() and not isinstance(gaussians, int)
+    few = kind == "random" and has_points(data) and not isinstance(gaussians, int)
     if of_object or few:
         train.setdefault("density", "split")
     if of_object and train["density"] == "split":

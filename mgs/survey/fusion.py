@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from mgs.data.frames import Frame, nearest_point
+from mgs.data.frames import Frame, in_image, nearest_point
 from mgs.errors import InputError
 from mgs.survey.depth_sensor import depth_noise, filter_depth
 
@@ -14,6 +14,7 @@ from mgs.survey.depth_sensor import depth_noise, filter_depth
 MAX_FUSED_PIXELS = 6_000_000  # about the most pixels that are fused
 # Beyond it lie silhouettes, where a depth may mix two surfaces, and grazing views.
 EDGE_JUMP = 0.05  # largest depth difference around a pixel, over its depth
+LEAST_OVERLAP = 0.5  # least share of cameras that have in their image the point that all look at
 REACH = 1.0  # radius of the cloud around the focus, over the cameras' distance from it
 ALIKE = 1.25  # largest pixel of the nearest frames, over the lower quartile of all
 FILTERED_SHARE = 0.5  # noise after the bilateral filter, over before; measured 0.27, with a margin
@@ -47,6 +48,17 @@ def focus(frames: Sequence[Frame]) -> Focus:
     return Focus(point, float(np.median([np.linalg.norm(eye - point) for eye in positions])))
 
 
+def looking_at_one(frames: Sequence[Frame]) -> list[bool]:
+    """Whether each camera has in its image the point that all look at."""
+    point = focus(frames).point[None]
+    return [bool(in_image(frame.camera, *frame.camera.project(point))[0]) for frame in frames]
+
+
+def of_one_object(frames: Sequence[Frame]) -> bool:
+    """Whether cameras look at one thing, and not around them, as in a room or from the air."""
+    return bool(np.mean(looking_at_one(frames)) >= LEAST_OVERLAP)
+
+
 def usable_depth(depth: np.ndarray, size: int = 3) -> np.ndarray:
     """Depth image [H,W], metres, with pixels on silhouettes and at grazing angles set to 0
     (EDGE_JUMP). size: of the neighbourhood, pixels. Pixels beside a lost return are set to 0 too:
@@ -56,8 +68,9 @@ def usable_depth(depth: np.ndarray, size: int = 3) -> np.ndarray:
     return np.where(jump <= EDGE_JUMP * depth, depth, 0.0)
 
 
-def fuse_frames(frames: Sequence[Frame]) -> Cloud:
-    """Fuse the depth images of frames into one cloud, averaged on a grid. A cell is as large as a
+def fuse_frames(frames: Sequence[Frame], reach: float = REACH) -> Cloud:
+    """Fuse the depth images of frames into one cloud, averaged on a grid, within `reach` of what
+    all look at, over the cameras' distance from it. A cell is as large as a
     pixel of the nearest frames on the rock, or larger if the depths are noisy. With `depth_noise`
     over a quarter of a cell, the images are smoothed first by `filter_depth`. Raises InputError if
     a frame has no depth image or cannot be read, or no depth can be used."""
@@ -81,14 +94,16 @@ def fuse_frames(frames: Sequence[Frame]) -> Cloud:
         keep = np.zeros(z.shape, bool)
         keep[::stride, ::stride] = True
         world = frame.camera.unproject(z)
-        keep &= (z > 0) & (np.linalg.norm(world - target.point, axis=-1) < REACH * target.distance)
+        keep &= (z > 0) & (np.linalg.norm(world - target.point, axis=-1) < reach * target.distance)
         p = world[keep]
         view = frame.camera.position - p
         points.append(p)
         views.append(view / np.linalg.norm(view, axis=1, keepdims=True))
     p, index = voxel_means(np.concatenate(points), voxel)
     if len(p) == 0:
-        cure = "check the depth files and poses"
+        cure = (
+            "check the depth files and poses; a whole scene is fitted without a prior (`mgs fit`)"
+        )
         raise InputError(f"cloud: no usable depth near what the cameras look at; {cure}")
     view = _group_means(np.concatenate(views), index, len(p))
     norm = np.linalg.norm(view, axis=1, keepdims=True)
