@@ -21,6 +21,7 @@ OPTIONS = """
 mgs: fly; dataset check {long}; eval {out}; dataset check {out};
     render {ply} --cameras {data} --out {out} --width 100000000;
     render {ply} --cameras {data} --out {out} --background 255 255 255; video {run} --out {out}.avi
+mgs eval {run}: --dataset {data}; --prior {prior}
 mgs view: {out}.ply; {root}; {ply} --follow; {run} --host 192.0.2.1
 mgs simplify {run}: --noise 1e300
 mgs export {run} --out {out}.mgs: --psnr nan

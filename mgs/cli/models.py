@@ -53,8 +53,8 @@ def evaluate(
         for subject in subjects:
             files = [subject]
             if subject.is_dir():
-                if dataset is not None:
-                    raise InputError(f"--dataset: is for a file, not for {subject}; leave it out")
+                for name in not_none(dataset=dataset, prior=prior):
+                    raise InputError(f"--{name}: is for a file, not for {subject}; leave it out")
                 run = open_run(subject)
                 evaluate_run(run, pictures=pictures, say=lines.append)
                 folder = f" ({subject.resolve().name})" if len(subjects) > 1 else ""
@@ -62,10 +62,8 @@ def evaluate(
                 smaller = [subject / name for name in (REFITTED, PRUNED)]
                 files = [path for path in smaller if path.is_file()]
             for path in files:
-                name, of = path.name, prior
-                if path != subject:
-                    name, of = f"  {path.stem.partition('_')[2]}", None
-                metrics = measured(path, dataset, prior=of)
+                metrics = measured(path, dataset, prior=prior)
+                name = path.name if path == subject else f"  {path.stem.partition('_')[2]}"
                 rows.append(metrics_row(name, metrics))
                 lines.append(f"wrote {path.with_suffix('.metrics.json')}")
     print_quality(Terminal(), rows)
