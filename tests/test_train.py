@@ -8,7 +8,7 @@ import pytest
 from refusals import fails
 from splat.scenes import cameras_around
 
-from mgs import Camera, InputError, ListCache, TrainSettings, fisher, render
+from mgs import Camera, InputError, ListCache, ModelSettings, TrainSettings, fisher, render
 from mgs.fit.fitting import COLOUR_MIN, fit_gaussians
 from mgs.fit.optimisers import ADAM_EPSILON
 from mgs.fit.stopping import LOSS_FLOOR, StopReason, stop_reason
@@ -145,6 +145,15 @@ def faster(factor: float, **values) -> TrainSettings:
     """Settings with multiplied learning rates."""
     rates = {kind: factor * rate for kind, rate in TrainSettings().rates.items()}
     return TrainSettings(rates=rates, **values)
+
+
+@pytest.mark.parametrize(("first", "later"), [(10, 3), (2, 2)])
+def test_fits_after_the_first_take_fewer_passes_at_lower_rates(first, later):
+    rates = rates_of(0.02) | {"mean": 0.01}
+    settings = ModelSettings(warm_passes=3, warm_rate=0.5, train={"passes": first, "rates": rates})
+    assert settings.train_at(0) == settings.train
+    assert settings.train_at(1).passes == settings.train_at(9).passes == later
+    assert settings.train_at(1).rates == {kind: rate / 2 for kind, rate in rates.items()}
 
 
 def test_a_fit_whose_loss_rises_has_diverged(truth, cameras, targets):
