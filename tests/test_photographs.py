@@ -640,6 +640,9 @@ def test_a_room_with_depth_starts_whole_from_its_walls(tmp_path, capsys):
     assert (normals[:364] * points[:364]).sum(1).max() < 0
     command("fit", data.root, "--passes", 6, "--out", tmp_path / "run")
     assert load_prior(tmp_path / "run/prior").kind == "random"
+    synthetic.edit(data.root, lambda d: [f.pop("depth_file_path") for f in d["frames"]])
+    line = refused(capsys, ["fit", data.root, "--out", tmp_path / "bare"], tmp_path / "bare")
+    assert "a whole scene needs points, which `mgs import` triangulates" in line
 
 
 def test_an_object_in_masks_starts_with_few_gaussians_that_are_split(

@@ -140,8 +140,8 @@ def test_a_survey_that_looks_at_no_one_place_starts_from_its_points(tmp_path):
     frames = views(tmp_path / "s", [Camera(K, WIDTH, HEIGHT, pose) for pose in poses])
     write_transforms(tmp_path / "s", frames)
     command("import", tmp_path / "s", "--out", tmp_path / "d", "--up", "0,0,1")
-    with pytest.raises(InputError, match="not of one object"):
-        check_photographs(load_dataset(tmp_path / "d").frames, of_object=True)
+    with pytest.raises(InputError, match=r"not of one object.*a whole scene is fitted"):
+        check_photographs(load_dataset(tmp_path / "d").frames, "is fitted")
     prior = build_prior(tmp_path / "d", source="random")
     assert prior.numbers["triangulated"] > 200
     assert np.median(distances(prior.points[: prior.numbers["triangulated"]])) < 0.01

@@ -135,7 +135,7 @@ def prior_and_cloud(
     if kind == "random":
         return _random_prior(dataset, settings, dataset.frames), None
     if kind != "depth":
-        check_photographs(dataset.frames, of_object=True)
+        check_photographs(dataset.frames, "is fitted without a prior (`mgs fit`)")
         check_masks(dataset.frames)
     if kind == "depth":
         surface = _depth_surface(dataset, settings)
@@ -188,7 +188,8 @@ def _place(dataset: Dataset) -> dict[str, Any]:
 
 def _random_prior(dataset: Dataset, settings: PriorSettings, shown: Sequence[Frame]) -> Prior:
     """The prior of the source "random". shown: frames whose masks are read."""
-    check_photographs(dataset.frames, of_object=not has_points(dataset))
+    needs = "needs points, which `mgs import` triangulates at the given poses, or depth"
+    check_photographs(dataset.frames, None if has_points(dataset) else needs)
     check_masks(shown)
     mesh, points, normals, spacing, numbers = scattered(dataset, settings, shown)
     about = {"from": "random", "frames": len(dataset.frames), **_place(dataset)}

@@ -72,18 +72,19 @@ def check_enough(photographs: int, where: str = "prior") -> None:
         raise InputError(f"{where}: too few photographs without depth, {photographs}; {cure}")
 
 
-def check_photographs(frames: Sequence[Frame], of_object: bool) -> None:
-    """Raise InputError as `check_enough`. of_object: also for cameras that do not look at one
-    thing. Whole scenes, such as rooms and surveys from the air, have none."""
+def check_photographs(frames: Sequence[Frame], whole: str | None) -> None:
+    """Raise InputError as `check_enough`. whole: what to do with a whole scene, such as a room or a
+    survey from the air, whose cameras do not look at one thing: for InputError; None: it may be
+    one."""
     check_enough(len(frames))
-    if not of_object:
+    if whole is None:
         return
     inside = looking_at_one(frames)
     if np.mean(inside) < LEAST_OVERLAP:
         raise InputError(
             f"prior: the photographs are not of one object: of {len(frames)} cameras only "
             f"{sum(inside)} have in their image what all look at; walk around the object, or check "
-            "the poses; a whole scene is fitted without a prior (`mgs fit`)"
+            f"the poses; a whole scene {whole}"
         )
 
 
