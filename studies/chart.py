@@ -169,7 +169,7 @@ def points_of(size: ChartSize, kind: str) -> list[Point]:
     else:
         base = Point(size.count, policy=BASE)
         points = [replace(base, policy=name) for name in size.policies]
-        points += [replace(base, warm_rate=1.0)]
+        points += [replace(run, warm_rate=1.0) for run in (base, *preset_points(size).values())]
         points += [replace(base, estimator=name) for name in size.estimators]
         points += [
             replace(base, density=d, passes=p, warm_passes=LATER_PASSES[p])
