@@ -29,12 +29,11 @@ SETTINGS = (
 
 def points_over_rocks(rows: Sequence[Row]) -> list[Row]:
     """A row for each point, with those of its rocks "of" it, and means of "seconds" and
-    "psnr_more". "front": whether no point of its kind and number of images has a higher PSNR in
-    less time.
+    "psnr_more". "front": whether it has the rates of the base, and no such point of its kind and
+    number of images has a higher PSNR in less time.
 
-    The rows "of" it get "times" the seconds, and "psnr_more", "psnr_mask_more" (dB) and
-    "peak_megabytes_more" against the base of the kind on the same rock. One process does all
-    points, so its memory is more than that of a run alone; the differences are not.
+    The rows "of" it get "times" the seconds, and "psnr_more" and "psnr_mask_more" (dB) against the
+    base of the kind on the same rock.
     """
     empty_columns = dict.fromkeys((*SETTINGS, "preset"))
     full_rows = [empty_columns | row | {"policy": row.get("policy") or ""} for row in rows]
@@ -45,12 +44,13 @@ def points_over_rocks(rows: Sequence[Row]) -> list[Row]:
             for row in point["of"]:
                 base = base_rows[row["rock"]]
                 row["times"] = row["seconds"] / base["seconds"]
-                for key in ("psnr", "psnr_mask", "peak_megabytes"):
+                for key in ("psnr", "psnr_mask"):
                     row[f"{key}_more"] = row[key] - base[key]
-            point["preset"] = point["of"][0]["preset"]
+            point["preset"], point["front"] = point["of"][0]["preset"], False
             for key in ("seconds", "psnr_more"):
                 point[key] = float(np.mean([row[key] for row in point["of"]]))
-    for alike in grouped(points, "kind", "images"):
+    usual = [p for p in points if p["warm_rate"] == base_of(points)["warm_rate"]]
+    for alike in grouped(usual, "kind", "images"):
         seconds, gains = ([point[key] for point in alike["of"]] for key in ("seconds", "psnr_more"))
         for point, on in zip(alike["of"], pareto_front(seconds, gains), strict=True):
             point["front"] = bool(on)
@@ -65,7 +65,7 @@ def base_of(points: Sequence[Row]) -> Row:
 WORDS = {
     "density": "{:g} samples a pixel",
     "passes": "{} passes",
-    "warm_rate": "later fits at {:g} of the rates of the first",
+    "warm_rate": "later fits at {:g} times the first rates",
     "images": "{} images",
     "policy": "policy {}",
     "estimator": "estimator {}",
@@ -105,7 +105,6 @@ def tables(rows: Sequence[Row]) -> str:
     texts = [table(columns, changes(points))]
     means = {
         "seconds": ("seconds", ".2g"),
-        "MB over the base": ("peak_megabytes_more", "+.0f"),
         "PSNR (dB)": ("psnr", ".2f"),
         "SSIM": ("ssim", ".4f"),
         "rock (dB)": ("psnr_mask", ".2f"),
@@ -141,14 +140,14 @@ def _label(point: Row) -> str:
     if not point["policy"]:
         return f"{point['passes']} passes"
     passes = f"{point['passes']}, then {point['warm_passes']} passes"
-    passes += " at full rates" if point["warm_rate"] == 1 else ""
     return f"{point['policy']}, {passes if point['estimator'] == 'exact' else point['estimator']}"
 
 
 def _draw_kind(axes: "Axes", points: Sequence[Row]) -> None:
     """Draw one panel."""
-    most = base_of(points)["images"]
-    points = [point | {"label": _label(point)} for point in points if point["images"] == most]
+    most, rate = (base_of(points)[key] for key in ("images", "warm_rate"))
+    points = [p for p in points if (p["images"], p["warm_rate"]) == (most, rate)]
+    points = [point | {"label": _label(point)} for point in points]
     front = sorted((point["seconds"], point["psnr_more"]) for point in points if point["front"])
     ahead = {"color": "black", "linewidth": 1, "zorder": 1, "label": "best of its time"}
     axes.step(*zip(*front, strict=True), where="post", **ahead)
