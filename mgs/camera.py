@@ -113,8 +113,8 @@ class Camera:
     @property
     def focal(self) -> float:
         """Geometric mean of both focal lengths, pixels: the area of a pixel at z-depth z is
-        (z / focal)^2."""
-        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+        (z / focal)^2. A NumPy float64, so that float32 depths over it are float64."""
+        return np.float64(np.sqrt(self.K[0, 0] * self.K[1, 1]))
 
     @property
     def key(self) -> bytes:

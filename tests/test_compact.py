@@ -390,7 +390,7 @@ def test_the_command_writes_what_fits_and_programs_read_it(
         (["--bytes", "9", "--psnr", "3"], "one of"),
         (["--to", "mgs"], "one of"),
         (["--to", "spz", "--bytes", "20"], "ask for more bytes"),
-        (["--to", "colmap", "--bytes", "2k"], "leave out other"),
+        (["--to", "colmap", "--bytes", "2k"], "not for views; leave them out"),
         (["--bytes", "200"], "ask for more bytes"),
         (["--psnr", "90"], "ask for less"),
         (["--shared-prior", "--to", "spz"], "leave it out"),

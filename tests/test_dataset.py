@@ -138,6 +138,15 @@ def test_a_camera_has_no_skew_and_whole_pixels():
             fails("must be whole pixels", Camera, K, *size, np.eye(4))
 
 
+def test_a_focal_length_keeps_the_precision_of_what_it_divides():
+    """Sizes of pixels were float32 once, so every prior from depth was another."""
+    K = np.array([[3.1, 0, 2], [0, 3.1, 1], [0, 0, 1]])
+    camera = Camera(K, 4, 2, np.eye(4))
+    assert camera.focal == K[0, 0]
+    assert (np.ones(2, np.float32) / camera.focal).dtype == np.float64
+    assert (np.float32(1) / camera.focal).dtype == np.float64
+
+
 def test_cameras_that_differ_in_the_sign_of_zero_are_equal():
     signed_K, signed_pose = (np.where(matrix == 0, -0.0, matrix) for matrix in (K, np.eye(4)))
     plain, signed = Camera(K, W, H, np.eye(4)), Camera(signed_K, W, H, signed_pose)

@@ -140,7 +140,7 @@ def test_gains_of_refined_poses_are_measured_anew(varied):
 
 Runs = dict[str, tuple[Checkpoint, Path]]
 
-RUN = {"policy": "uniform", "seeds": 4, "budget": 3, "train": {"passes": 10}}
+RUN = {"policy": "uniform", "seeds": 4, "budget": 5, "train": {"passes": 10}}
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def runs(rock: Path, varied: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     made = {}
     kinds = {"constant": (rock, False), "without": (varied, False), "with": (varied, True)}
     for name, (root, exposure) in kinds.items():
-        state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=3, **RUN).state
+        state = run_nbv(root, folder / name, exposure=exposure, evaluate_every=5, **RUN).state
         evaluate_run(folder / name, pictures=False)
         made[name] = state, folder / name
     return made
