@@ -69,8 +69,8 @@ def usable_depth(depth: np.ndarray, size: int = 3) -> np.ndarray:
 
 
 def fuse_frames(frames: Sequence[Frame], reach: float = REACH) -> Cloud:
-    """Fuse the depth images of frames into one cloud, averaged on a grid, within `reach` of what
-    all look at, over the cameras' distance from it. A cell is as large as a
+    """Fuse the depth images of frames into one cloud, averaged on a grid. What is farther from the
+    point that all look at than `reach` times the cameras is left out. A cell is as large as a
     pixel of the nearest frames on the rock, or larger if the depths are noisy. With `depth_noise`
     over a quarter of a cell, the images are smoothed first by `filter_depth`. Raises InputError if
     a frame has no depth image or cannot be read, or no depth can be used."""
