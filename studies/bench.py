@@ -5,7 +5,6 @@ memory is allocated before anything is timed: let nothing else run meanwhile. Ti
 Ratios of times are about the same on other machines; times are not.
 """
 
-import resource
 import time
 from collections.abc import Callable
 from functools import cache
@@ -25,6 +24,7 @@ from mgs.reports.tables import markdown
 from mgs.rotation import quat_from_normals
 from mgs.seeds import derive_seed, generator
 from studies.frame.program import Study, Work, at_least, study_of
+from studies.frame.timing import peak_megabytes
 
 WARM_UP = 2
 """Untimed calls before the timed ones: they compile kernels and allocate memory."""
@@ -185,7 +185,7 @@ def bench_splat(n: int, width: int, height: int, repeats: int) -> dict[str, Any]
     gaussians = surface_gaussians(n)
     camera = surface_camera(gaussians, width, height)
     own = time_core(gaussians, camera, repeats)
-    memory = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) / 1e3
+    memory = peak_megabytes()
     peer = time_volprim(gaussians, camera, max(repeats // 3, 3))
     ratios = {
         "forward_warm_speedup": peer["volprim_forward"] / own["forward_warm"],

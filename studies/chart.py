@@ -27,7 +27,7 @@ from studies.frame.output import write_table
 from studies.frame.program import Study, Work, at_least, names_of, study_of
 from studies.frame.statistics import Row
 from studies.frame.sweep import Cell, Results
-from studies.frame.timing import REFERENCE, forget_peak, peak_megabytes, timed
+from studies.frame.timing import REFERENCE, timed
 
 KINDS = ("fit", "run")
 
@@ -230,21 +230,18 @@ def measure(
     repeats: int,
     reference: Sequence[int] = REFERENCE,
 ) -> dict[str, Any]:
-    """Task: time a run, files included, and judge its model. Returns times (`timed`), the peak of
-    memory, qualities and passes of all fits together."""
+    """Task: time a run, files included, and judge its model. Returns times (`timed`), qualities,
+    and passes of all fits together."""
 
     def run() -> mgs.Checkpoint:
         shutil.rmtree(out / "run", ignore_errors=True)
-        forget_peak()
         return mgs.run_nbv(root / dataset, out / "run", prior=root / prior, **settings).state
 
     state, times = timed(run, repeats, tuple(reference))
-    peak = peak_megabytes()
     shutil.rmtree(out / "run")
     metrics = judge(state.gaussians, mgs.load_dataset(root / dataset))
     return {
         **times,
-        "peak_megabytes": peak,
         **{name: metrics[name] for name in QUALITIES},
         "total_passes": sum(step["iterations"] // step["images"] for step in state.steps),
     }

@@ -13,6 +13,7 @@ from program import command, said
 from refusals import fails, refused
 from test_recordings import write_bag, write_metashape, write_open3d, write_rtabmap
 
+from mgs.camera import Camera
 from mgs.data.clouds import read_cloud
 from mgs.data.dataset import load_dataset, write_transforms
 from mgs.data.lens import Lens
@@ -73,6 +74,25 @@ def test_the_lens_of_a_bag(tmp_path, data, kind, model):
     lens = read_source(bag, unpack=tmp_path / "x").shots[0].lens
     assert lens.model == model
     assert list(lens.parameters[4 : 4 + len(D)]) == D
+
+
+@pytest.mark.parametrize(
+    ("binning", "window"),
+    [(1, (0, 0, 0, 0)), (2, (0, 0, 0, 0)), (1, (12, 6, 24, 32)), (2, (12, 6, 48, 64))],
+)
+def test_images_of_a_bag_are_binned_or_a_window_of_the_sensor(tmp_path, data, binning, window):
+    """Its camera_info is of all pixels of the sensor; a window of half its sides is not binned."""
+    left, top = window[:2]
+
+    def whole(camera):
+        size = np.array([camera.width, camera.height]) * binning * (2 if any(window) else 1)
+        K = camera.K * [[binning], [binning], [1]] + [[0, 0, left], [0, 0, top], [0, 0, 0]]
+        return Camera(K, *size.tolist(), camera.world_to_camera)
+
+    bag = write_bag(tmp_path / "bag", data, depth=False, whole=whole, window=window)
+    for shot in read_source(bag, unpack=tmp_path / "x").shots:
+        assert (shot.camera.width, shot.camera.height) == (32, 24)
+        np.testing.assert_allclose(shot.camera.K, data.frames[0].camera.K, atol=1e-9)
 
 
 def test_a_frame_that_is_no_optical_one_is_named(tmp_path, data, monkeypatch):

@@ -42,7 +42,7 @@ mgs nbv {data} --prior {prior} --seeds 3 --budget 1 --out {out}: --set estimator
     --set flight.length=30 --set travel=2
 mgs synth-orbit {out}: --scene moon; --scene nowhere/x.toml; --preset huge; --orbit figure-eight;
     --distances 1,far; --distances 1e-300; --size 320; --size 99999999x99999999; --size 3²x24;
-    --mesh nowhere.glb; --mesh-up y; --spp 100000000000; --pose-noise 1e300
+    --size 100000x1; --mesh nowhere.glb; --mesh-up y; --spp 100000000000; --pose-noise 1e300
 mgs survey {rock} --out {out}: --drift nan
 mgs prior {rock} --out {out}: --gaussians 0; --gaussians many; --gaussians 50 --spacing 0.1;
     --spacing 9; --spacing nan; --poisson-depth 0; --up skyward; --up 0,0,0; --source dreams;

@@ -106,10 +106,10 @@ class Bag:
         head, form = self.header(time, OPTICAL), f"{encoding}; compressedDepth png"
         self.write(topic, "sensor_msgs/msg/CompressedImage", time, head, form, data)
 
-    def lens(self, topic: str, time: float, camera, model: str, distortion) -> None:
+    def lens(self, topic: str, time: float, camera, model: str, distortion, window) -> None:
         D, K = np.array(distortion), opencv_K(camera).ravel()
         numbers = D, K, np.eye(3).ravel(), np.eye(3, 4).ravel()
-        roi = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+        roi = self.make("sensor_msgs/msg/RegionOfInterest", *window, False)
         size = camera.height, camera.width, model
         head = self.header(time, OPTICAL)
         self.write(topic, "sensor_msgs/msg/CameraInfo", time, head, *size, *numbers, 0, 0, roi)
@@ -169,11 +169,13 @@ POSES = {
 
 def write_bag(
     path, dataset, version=2, leave_out="", poses=("mount", "tf"), storage="SQLITE3", compressed="",
-    depth=True, distortion=("plumb_bob", np.zeros(5)),
+    depth=True, distortion=("plumb_bob", np.zeros(5)), whole=lambda camera: camera,
+    window=(0, 0, 0, 0),
 ):  # fmt: skip
     """Write a bag without the topics whose names contain `leave_out`. compressed: encoding of
     compressed depth. depth: with depth, and images that are no keyframes. distortion: model of
-    the lens, and its numbers."""
+    the lens, and its numbers. whole: camera of all pixels of the sensor. window: x, y, height and
+    width of the part of them that is recorded."""
     bag = Bag(path, version, storage)
     with bag.writer:
         for k, frame in enumerate(dataset.frames):
@@ -187,7 +189,8 @@ def write_bag(
                 bag.image("/camera/color/image_raw", time, "bgr8", rgb[..., ::-1])
                 bag.image("/camera/color/image_raw", time + 0.2, "bgr8", 0 * rgb)  # no keyframe
             if leave_out != "camera_info":
-                bag.lens("/camera/color/camera_info", time, camera, *distortion)
+                lens = whole(camera), *distortion, window
+                bag.lens("/camera/color/camera_info", time, *lens)
             topic = "/camera/aligned_depth/image_raw"
             if not depth:
                 continue

@@ -257,6 +257,8 @@ def test_a_distance_gives_the_scale(placed):
     assert np.linalg.norm(eyes["view 00"] - eyes["view 06"]) == pytest.approx(10)
     for wrong in ("view 00.jpg,10", "view 00.jpg,other,10", "view 00.jpg,view 01.jpg,0"):
         fails("distance", placed[1].with_distance, wrong)
+    for far in ("1e300", "1e-300"):
+        fails("expected METRES from", placed[1].with_distance, f"view 00,view 06,{far}")
 
 
 def write_depth(frames, folder, change=lambda z, k: z):

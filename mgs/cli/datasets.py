@@ -15,6 +15,8 @@ from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, below, clear_folder, working_in
 from mgs.synth.scene_file import OrbitKind, load_scene_file
 
+LEAST_SIDE = 3  # of an image, pixels: the rock is wholly in it, a pixel from each border
+
 RENDERED = ["config.json", "transforms.json", "images", "depth", "masks", "rock", "rock.glb"]
 RENDERED += ["test", "survey", "timings.json", "true_poses.json", "contact_sheet.png"]
 """Names in a folder of `mgs synth-orbit`."""
@@ -64,14 +66,15 @@ def synth_orbit(
       renders each frame that it chooses.
     - pose_noise: Error of camera positions in transforms.json: standard deviation per axis, metres.
     - rotation_noise: The same of camera rotations, degrees."""
+    sides = _parse_size(size)
+    if mesh_up is not None and mesh is None:
+        raise InputError("--mesh-up: says how a mesh stands, but there is none; give --mesh too")
     runtime.start()
     from mgs.synth.orbit import PoseNoise
     from mgs.synth.rendering import synth_orbit as rendered
 
     factors = {"kind": orbit, "distances": distances and distances.split(",")}
     settings = load_scene_file(scene, **{key: value for key, value in factors.items() if value})
-    if mesh_up is not None and mesh is None:
-        raise InputError("--mesh-up: says how a mesh stands, but there is none; give --mesh too")
     noise = PoseNoise(pose_noise, rotation_noise) if pose_noise or rotation_noise else None
     console = Terminal()
     if force:
@@ -89,7 +92,7 @@ def synth_orbit(
             test_views=test_views,
             on_demand=on_demand,
             frames=frames,
-            size=_parse_size(size),
+            size=sides,
             spp=spp,
         )
     camera, none = dataset.frames[0].camera, ", none rendered" if on_demand else ""
@@ -106,8 +109,8 @@ def _parse_size(size: str | None) -> tuple[int, int] | None:
         return None
     sides = re.fullmatch(r"(\d{1,9})x(\d{1,9})", size.lower(), re.ASCII)
     width, height = (int(side) for side in sides.groups()) if sides else (0, 0)
-    if not 0 < width * height <= MAX_PIXELS:
-        form = f"WIDTHxHEIGHT, at most {MAX_PIXELS:,} pixels in all, as in 320x240"
+    if min(width, height) < LEAST_SIDE or width * height > MAX_PIXELS:
+        form = f"WIDTHxHEIGHT, each {LEAST_SIDE} or more, {MAX_PIXELS:,} pixels at most"
         raise InputError(f"--size {size!r}: expected {form}")
     return width, height
 

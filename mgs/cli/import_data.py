@@ -8,23 +8,30 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
 from mgs.cli.options import parse_up
 from mgs.cli.terminal import Terminal, progress_bar
+from mgs.data.agreement import MATCHED, Agreement, agreement
+from mgs.data.bags import is_bag
+from mgs.data.clouds import SparseCloud, write_cloud
+from mgs.data.colmap import models_in
+from mgs.data.dataset import Dataset
+from mgs.data.depth_beside import depth_files
+from mgs.data.importers import RECORD, import_source, least_factor
+from mgs.data.meshes import GLTF
+from mgs.data.photographs import KIND as PHOTOGRAPHS
+from mgs.data.photographs import PLACED, depth_places, photographs_in
+from mgs.data.shots import Shot, Source
+from mgs.data.sources import KEYFRAMES, read_source
+from mgs.data.structure import CLOUD, WIDEST, Matcher, lacks_points, refined
 from mgs.errors import InputError
 from mgs.files import Ours, read_json, scratch_folder, write_json
+from mgs.images import exif_exposure, exif_orientation
 from mgs.progress import report
-
-if TYPE_CHECKING:
-    from mgs.data.agreement import Agreement
-    from mgs.data.clouds import SparseCloud
-    from mgs.data.dataset import Dataset
-    from mgs.data.shots import Shot, Source
-    from mgs.data.structure import Matcher
 
 EXPOSURE_DIFFERS = 0.1  # stops by EXIF beyond which --exposure is recommended
 WHITE_RIM = 0.9  # share of white along the border of masks that may be inverted
@@ -38,7 +45,7 @@ def import_data(
     source: Path,
     out: Annotated[Path, typer.Option()],
     images: Path | None = None,
-    keyframes: str = "0.5s",
+    keyframes: str = KEYFRAMES,
     masks: Path | None = None,
     mesh: Path | None = None,
     downscale: Annotated[int | None, typer.Option(min=1)] = None,
@@ -83,15 +90,6 @@ def import_data(
     - test_split: Split of NeRF-synthetic data that becomes the test views; publications take test.
     """
     options = {key: value for key, value in locals().items() if key not in ("out", "force")}
-    from mgs.data.bags import is_bag
-    from mgs.data.colmap import models_in
-    from mgs.data.depth_beside import depth_files
-    from mgs.data.importers import RECORD, import_source, least_factor
-    from mgs.data.meshes import GLTF
-    from mgs.data.photographs import KIND as PHOTOGRAPHS
-    from mgs.data.photographs import PLACED, depth_places, photographs_in
-    from mgs.data.sources import read_source
-
     console, notes = Terminal(), Terminal(stderr=True)
     for one, other, what in (
         (masks, mesh, "--masks and --mesh both give masks"),
@@ -133,6 +131,7 @@ def import_data(
             test_split=test_split,
             unit=unit,
             distance=distance,
+            refine_poses=refine_poses,
         )
         upward, reason = shots.up_or_estimate() if axis is None else (axis, "as --up says")
         read = [path for shot in shots.shots for path in shot.files]
@@ -180,9 +179,6 @@ def _checked(
     comparison, and the points. larger: source pictures of `_triangulated`. masked: as in
     `agreement`. refining: where to print how far poses moved; None: they are not refined."""
     from mgs.cli.nbv import moves_in_words
-    from mgs.data.agreement import agreement
-    from mgs.data.clouds import write_cloud
-    from mgs.data.structure import CLOUD, Matcher, lacks_points, refined
 
     matcher, fit, cloud = Matcher.of_frames(result.frames, scratch / "matches"), source.fit, None
     compared = agreement(result.frames, matcher, masked=masked)
@@ -203,9 +199,6 @@ def _checked(
 def _is_loose(fit: Agreement | None, result: Dataset) -> bool:
     """Whether points matched in pictures of a dataset are farther from its poses than those of
     right poses, which are found to a pixel of WIDEST."""
-    from mgs.data.agreement import MATCHED
-    from mgs.data.structure import WIDEST
-
     right = max(1.0, result.frames[0].camera.width / WIDEST)
     return bool(fit and fit.error and fit.evidence.endswith(MATCHED) and fit.error > right)
 
@@ -245,8 +238,6 @@ def _stamp(files: Sequence[Path]) -> dict[str, Any]:
 def _finished(out: Path) -> dict[str, Any]:
     """Record of the finished import in a folder. Empty where there is none. Records of earlier
     versions lack options, files or their digest."""
-    from mgs.data.importers import RECORD
-
     if not all((out / name).is_file() for name in (RECORD, "transforms.json")):
         return {}
     record: Any = read_json(out / RECORD)
@@ -276,8 +267,6 @@ def _check_unchanged(out: Path, record: dict[str, Any], files: dict[str, Any]) -
 
 def _again(record: dict[str, Any]) -> str:
     """What --force does to a finished import of this record, in words."""
-    from mgs.data.photographs import KIND as PHOTOGRAPHS
-
     placed = ", and places all photographs again" if record.get("kind") == PHOTOGRAPHS else ""
     return f"--force makes it again{placed}"
 
@@ -288,9 +277,6 @@ def _triangulated(
     """Triangulate points at the dataset's poses: in the source pictures `larger`, else in its own.
     The former give several times as many. matcher: of its own pictures. folder: for matches of
     `larger`."""
-    from mgs.data.structure import Matcher
-    from mgs.images import exif_orientation
-
     cameras = [result.world.leave(frame.camera) for frame in result.frames]
     upright = {s.name: s for s in larger if s.turned or exif_orientation(s.image) == 1}
     cloud = None
@@ -310,8 +296,6 @@ def _points(cloud: SparseCloud) -> str:
 
 
 def _advice(source: Source, result: Dataset) -> Iterator[str]:
-    from mgs.images import exif_exposure
-
     if source.no_cloud:
         yield f"the points that the source names, {source.no_cloud}, do not exist"
     if any(source.origin):
@@ -338,8 +322,6 @@ def _advice(source: Source, result: Dataset) -> Iterator[str]:
 def _print_summary(
     console: Terminal, source: Source, tests: Source | None, result: Dataset, more: Sequence[str]
 ) -> None:
-    from mgs.data.photographs import KIND as PHOTOGRAPHS
-
     frames, apart = result.frames, len(tests.shots) if tests else 0
     total, alone = len(source.shots) + source.left_out.total(), source.kind == PHOTOGRAPHS
     placed = f"{len(source.shots)} of {total} photographs placed"

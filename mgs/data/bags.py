@@ -248,7 +248,11 @@ def _lens(path: Path, reader: Any, topic: str) -> tuple[Any, Lens | None, str]:
         why = f"the lens of {topic} is {info.distortion_model}, which is not supported"
         raise InputError(f"{path}: {why}; give the topic of its rectified images as `images`")
     K[:2, 2] += 0.5  # from pixel centres at whole numbers to ours
-    size, model = (int(info.width), int(info.height)), "FULL_OPENCV"
+    size, model, window = (int(info.width), int(info.height)), "FULL_OPENCV", info.roi
+    cut = size != (getattr(image, "width", 0), getattr(image, "height", 0))
+    if cut and window.width and window.height:  # binning shows by the size of the images
+        K[:2, 2] -= window.x_offset, window.y_offset
+        size = int(window.width), int(window.height)
     if len(names) == 4:
         model = "OPENCV_FISHEYE"
     else:

@@ -27,6 +27,7 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 # Of a name without a suffix, as in NeRF-synthetic data: PNG first, which has alpha and is a mask.
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".tif", ".tiff", ".webp")
 PHOTOGRAPH = ("", ".jpg", ".jpeg", ".JPG", ".JPEG", *SUFFIXES)  # a cut-out as PNG may lie beside it
+SCALES = 1e-9, 1e9  # least and most metres per unit of length
 FAR = 1000.0  # distance from the origin over the cameras' extent, beyond which the origin is moved
 HELD = {  # EXIF orientation -> axes of the camera of the turned picture, in those of the stored one
     3: [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
@@ -78,10 +79,10 @@ class Source:
     depth_scale: DepthScale | None = None  # of photographs without poses, by depth beside them
 
     def in_metres(self, unit: float) -> Source:
-        """Scale cameras and points by `unit` metres. Raises InputError unless it is positive."""
-        if not 1e-9 <= unit <= 1e9:
-            cure = "correct it"
-            raise InputError(f"import: unit {unit} must be a number of metres, 1e-9 to 1e9; {cure}")
+        """Scale cameras and points by `unit` metres. Raises InputError unless it is in SCALES."""
+        if not SCALES[0] <= unit <= SCALES[1]:
+            form = "a number of metres, {:g} to {:g}; correct it".format(*SCALES)
+            raise InputError(f"import: unit {unit} must be {form}")
         shots = [replace(shot, camera=shot.camera.scaled(unit)) for shot in self.shots]
         sparse, (x, y, z) = self.sparse and self.sparse.scaled(unit), self.origin
         origin = x * unit, y * unit, z * unit
@@ -93,7 +94,8 @@ class Source:
 
     def with_distance(self, text: str) -> Source:
         """Scale to metres by a known distance between two cameras: A,B,METRES, with the names of
-        their images. Raises InputError for another text, unknown names and cameras in one place."""
+        their images. Raises InputError for another text, unknown names, cameras in one place, and
+        a distance that is none of theirs in SCALES."""
         words = [word.strip() for word in text.split(",")]
         eyes = {shot.name: shot.camera.position for shot in self.shots}
         names = [self._name(word) for word in words[:2]]
@@ -108,6 +110,10 @@ class Source:
         apart = float(np.linalg.norm(eyes[names[0]] - eyes[names[1]]))
         if apart == 0:
             raise InputError(f"import: distance {text!r}: its cameras are in one place; correct it")
+        low, high = (apart * scale for scale in SCALES)
+        if not low <= metres <= high:
+            form = f"METRES from {low:.3g} to {high:.3g} between these cameras"
+            raise InputError(f"import: distance {text!r}: expected {form}; correct it")
         return self.in_metres(metres / apart)
 
     def _name(self, image: str) -> str:

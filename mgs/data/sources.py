@@ -84,6 +84,7 @@ def read_source(
     test_split: str | None = None,
     unit: float | None = None,
     distance: str | None = None,
+    refine_poses: bool = False,
 ) -> Source:
     """Recognise the format of a source, and read its cameras and file names.
 
@@ -94,14 +95,15 @@ def read_source(
     apart as test views. keyframes: `Spacing` of a recording. unpack: folder for the images of a
     bag and the matches of photographs, by default SOURCE.unpacked. pose: topic of a bag's poses.
     exclude: names of images to leave out. unit, distance: as `Source.in_metres` and
-    `with_distance`; without, GPS gives metres, else depth beside photographs. Raises InputError if
-    no format is recognised, no image exists, a frame is listed twice, a camera model is not
-    supported, photographs cannot be placed, there is no such test split, or `pose` is given and the
-    source is no bag."""
+    `with_distance`; without, GPS gives metres, else depth beside photographs. refine_poses: refuse
+    pictures without poses. Raises InputError if no format is recognised, no image exists, a frame
+    is listed twice, a camera model is not supported, photographs cannot be placed, there is no such
+    test split, or `pose` is given and the source is no bag."""
     source = Path(source)
     source.exists()  # an OSError of the source itself is not one of a file that it names
     try:
-        result = checked(source, _recognised(source, images, keyframes, unpack, pose, exclude))
+        how = keyframes, unpack, pose, exclude, refine_poses
+        result = checked(source, _recognised(source, images, *how))
         if test_split is not None:
             tests = checked(source, _split_apart(source, images, test_split))
             result = result.with_tests(tests)
@@ -131,6 +133,7 @@ def _recognised(
     unpack: Path | None,
     pose: str | None,
     exclude: Sequence[str],
+    refine_poses: bool,
 ) -> Source:
     """`read_source` without checks of the shots. Raises OSError for names that are too long."""
     if not source.exists():
@@ -156,6 +159,7 @@ def _recognised(
     if images is not None and not images.is_dir():
         raise InputError(f"{images}: no such folder; give the folder of the images")
     if video:
+        _check_given(source, refine_poses)
         frames = folder / "frames"
         paths = sharpest_frames(source, frames, spacing)
         return read_photographs(frames, paths, folder / "matches", exclude)
@@ -168,6 +172,7 @@ def _recognised(
         return read_colmap(source, models, images if images is not None else source / "images")
     check_no_part(source)
     if paths := photographs_in(images or source):
+        _check_given(source, refine_poses)
         root = pictures_of(images or source)
         if folder.resolve().is_relative_to(root.resolve()):
             why = "the output would lie among its photographs, and its pictures be taken for some"
@@ -180,6 +185,13 @@ def _recognised(
         f"{TRAINING} or COLMAP model (cameras, images and points3D, .bin or .txt, in "
         f"sparse/0, sparse or the folder itself), and is no {', '.join(RECORDINGS)}"
     )
+
+
+def _check_given(source: Path, refine_poses: bool) -> None:
+    """Raise InputError where poses are to be refined of a source that has none."""
+    if refine_poses:
+        why = "its pictures come without poses; the ones found fit their points already"
+        raise InputError(f"{source}: {why}; leave out --refine-poses")
 
 
 def _split_apart(source: Path, images: Path | None, test_split: str) -> Source:

@@ -5,7 +5,6 @@ Charts show seconds: the median ratio times the reference's median seconds over 
 """
 
 import functools
-import gc
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -89,16 +88,6 @@ def timed(
 
 
 def peak_megabytes() -> float:
-    """Most memory that this process has held, megabytes, since its start or `forget_peak`.
-    `getrusage` would include the parent's."""
+    """Most memory that this process has held, megabytes. `getrusage` would include the parent's."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) * 1.024e-3
-
-
-def forget_peak() -> None:
-    """Give back memory that Dr.Jit keeps for later, and let `peak_megabytes` count from now on."""
-    import drjit as dr
-
-    gc.collect()
-    dr.flush_malloc_cache()
-    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # proc(5): resets VmHWM
