@@ -2,6 +2,7 @@
 
 import copy
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import synthetic
 import tiny
 from PIL import Image
 from refusals import fails
+from scipy.ndimage import gaussian_filter
 
 from mgs import as_drjit
 from mgs.camera import Camera, look_at, opencv_from_opengl
@@ -189,6 +191,21 @@ def test_check_lists_every_problem(folder):
     for expected in ("not a readable image", "mask is empty", "same pose as kf_0003"):
         assert expected in problems
     assert "most of the mask has no depth" in problems
+
+
+def test_check_names_blurred_frames_or_says_that_all_are(folder):
+    frames = load_dataset(folder).frames
+
+    def soften(frame):
+        write_png(frame.image_path, gaussian_filter(frame.rgb(), (1.5, 1.5, 0)))
+
+    soften(frames[2])
+    (problem,) = check_dataset(load_dataset(folder)).problems
+    assert re.match(r"frame kf_0002: is blurred, by 1\.\d pixels \(median 0\.\d\)", problem)
+    for frame in (*frames[:2], *frames[3:]):
+        soften(frame)
+    (problem,) = check_dataset(load_dataset(folder)).problems
+    assert re.match(r"the images are blurred, by 1\.\d pixels in the median", problem)
 
 
 def test_check_compares_rock_images_with_masks(folder):

@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 import synthetic
 import tiny
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from mgs import as_drjit, run_nbv
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import load_dataset, target_of, write_transforms
+from mgs.data.frames import RIM
 from mgs.evaluation import evaluate_model, render_view
 from mgs.images import write_png
+from mgs.metrics import MOST_BLUR, blur
 from mgs.run import detectors
 from mgs.run.checks import predicted_psnr
 from mgs.run.detectors import DETECTORS, ViewIndicators, alarms, step_indicators, view_indicators
@@ -43,6 +45,7 @@ def one_bad(**changes) -> tuple[ViewIndicators, ...]:
 BAD = {
     "unconverged": ({"losses": (1.0, 0.8, 0.6, 0.4, 0.3)}, "still fell by 29.3 % a pass"),
     "worse": ({"losses": (1.0, 1.3, 1.2, 1.2, 1.2)}, "at least 20 % above"),
+    "blur": ({"views": (replace(GOOD, blur=1.6),) * 4}, "blurred by 1.6 pixels"),
     "prior": ({"views": one_bad(outline=0.6)[3:] * 4}, "60.0 % of the covered pixels"),
     "residual": ({"views": (replace(GOOD, unexplained=0.9),) * 4}, "90 % of the images' variance"),
     "exposure": ({"views": (GOOD, GOOD, GOOD, DIM)}, "by 50 % of"),
@@ -52,6 +55,49 @@ BAD = {
     "coverage": ({"coverage": 0.2}, "only 20 %"),
     "saturated": ({"gains": (0.5, 0.3, 0.01)}, "gained 2 %"),
 }
+
+
+TEXTURE = np.random.default_rng(0).random((96, 128, 3))
+
+
+@pytest.mark.parametrize("sigma", [1.5, 2.5, 4.0])
+def test_the_blur_of_steps_is_that_of_the_gaussian(sigma):
+    steps = gaussian_filter(np.repeat(TEXTURE[:, :8], 16, axis=1), (0, sigma, 0))
+    assert blur(steps, np.ones(steps.shape[:2], bool)) == pytest.approx(sigma, rel=0.08)
+
+
+def test_the_blur_is_that_of_the_worst_direction_and_of_what_counts():
+    sharp = TEXTURE[:12, :16].repeat(8, axis=0).repeat(8, axis=1)
+    moved = np.mean([np.roll(sharp, (k, k), axis=(0, 1)) for k in range(6)], axis=0)
+    whole = np.ones(sharp.shape[:2], bool)
+    assert blur(sharp, whole) < 0.5 < MOST_BLUR < blur(moved, whole)
+    assert blur(moved[:, ::-1], whole) == pytest.approx(blur(moved, whole))
+    left = np.arange(128) < 64
+    both = np.where(left[:, None], sharp, moved)
+    assert blur(both, whole & left) == blur(sharp[:, :64], whole[:, :64])
+
+
+def test_the_blur_does_not_depend_on_strips(monkeypatch):
+    smooth, counted = gaussian_filter(TEXTURE, (1, 2, 0)), TEXTURE[..., 0] < 0.9
+    whole = blur(smooth, counted)
+    monkeypatch.setattr("mgs.metrics.STRIP", 7)
+    assert blur(smooth, counted) == pytest.approx(whole, rel=1e-12)
+
+
+def test_the_blur_is_finite_where_there_is_little_to_see():
+    whole = np.ones(TEXTURE.shape[:2], bool)
+    assert blur(0 * TEXTURE, whole) == blur(TEXTURE, ~whole) == 0
+    assert blur(TEXTURE[:2, :2], whole[:2, :2]) == 0 < blur(TEXTURE[:2], whole[:2])
+    ramp = np.broadcast_to(np.linspace(0, 1, 128)[:, None], TEXTURE.shape)
+    assert 100 < blur(ramp, whole) < np.inf
+
+
+def test_a_plain_ball_in_front_of_something_is_not_blurred():
+    v, u = np.mgrid[-48:48, -64:64] + 0.5
+    lit = np.sqrt(np.maximum(1 - (u**2 + v**2) / 30**2, 0))[..., None]
+    mask = u**2 + v**2 < 30**2
+    image = np.where(mask[..., None], 0.2 + 0.6 * lit, 0.1 + 0.1 * TEXTURE)
+    assert blur(image, mask) > MOST_BLUR > blur(image, binary_dilation(mask, iterations=RIM))
 
 
 @pytest.mark.parametrize("name", DETECTORS)

@@ -78,8 +78,8 @@ def test_a_run_holds_few_images_at_once_and_finds_the_same(rock, tmp_path, monke
         return live.watch(rgba), weight
 
     def watched_colours(frame):
-        bits, truth = compared(frame)
-        return bits, colours.watch(truth)
+        bits, truth, blurred = compared(frame)
+        return bits, colours.watch(truth), blurred
 
     monkeypatch.setattr(Frame, "target", watched)
     monkeypatch.setattr(checks, "_compared", watched_colours)

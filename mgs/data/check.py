@@ -1,14 +1,15 @@
 """Consistency checks of a dataset."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import binary_erosion, minimum_filter
 
 from mgs.data.dataset import Dataset
-from mgs.data.frames import Frame, has_masks, in_image
+from mgs.data.frames import Frame, frame_blur, has_masks, in_image
 from mgs.errors import InputError
+from mgs.metrics import MOST_BLUR
 from mgs.progress import report
 
 TOLERANCE = 0.02  # relative excess of depth beyond which a frame sees through a point of the rock
@@ -40,13 +41,14 @@ def check_dataset(dataset: Dataset) -> Check:
     problems: list[str] = []
     shares, ranges, through = [], [], []
     poses: dict[bytes, str] = {}
+    blurs: dict[str, float] = {}
     before: tuple[Frame, np.ndarray, np.ndarray] | None = None
     frames = taken_frames(dataset)
     for index, frame in enumerate(frames):
         try:
-            if not frame.on_demand or frame.image_path.exists():  # a survey has no images
-                frame.rgb()
             mask = frame.mask()
+            if not frame.on_demand or frame.image_path.exists():  # a survey has no images
+                blurs[frame.name] = frame_blur(frame, mask)
             shares.append(mask.mean())
             problems.extend(_mask_problems(frame, mask))
             pose = frame.camera.world_to_camera.round(9).tobytes()
@@ -83,10 +85,28 @@ def check_dataset(dataset: Dataset) -> Check:
             "poses, intrinsics or depth follow another convention; "
             "poses must be OpenGL camera-to-world, depth z-depth in metres"
         )
+    problems.extend(_blur_problems(blurs))
     problems.extend(_test_problems(dataset))
     low, high = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else (0.0, 0.0)
     share = float(np.mean(shares)) if shares else 0.0
     return Check(problems, share, (float(low), float(high)), median)
+
+
+def _blur_problems(blurs: Mapping[str, float]) -> Iterator[str]:
+    """Problems of images that are blurred by these pixels: one of all of them, or of each."""
+    soft = {name: value for name, value in blurs.items() if value > MOST_BLUR}
+    median = float(np.median(list(blurs.values()))) if blurs else 0.0
+    if median > MOST_BLUR:
+        yield (
+            f"the images are blurred, by {median:.1f} pixels in the median; take them again, "
+            "sharp, or import them smaller (`--downscale`), by which they lose nothing"
+        )
+        return
+    for name, value in soft.items():
+        yield (
+            f"frame {name}: is blurred, by {value:.1f} pixels (median {median:.1f}); take it "
+            f"again, or leave it out (`mgs import --exclude {name}`)"
+        )
 
 
 def _test_problems(dataset: Dataset) -> Iterator[str]:

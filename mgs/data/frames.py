@@ -15,6 +15,7 @@ from mgs.data.world import UPRIGHT, World
 from mgs.errors import InputError
 from mgs.files import read_json
 from mgs.images import image_size, read_depth, read_mask, read_png, read_rgba, write_png
+from mgs.metrics import blur
 
 
 def write_rock_image(path: str | Path, rgba: np.ndarray) -> None:
@@ -169,7 +170,15 @@ def moves(given: Sequence[Frame], frames: Sequence[Frame]) -> dict[str, dict[str
     return by_name
 
 
+RIM = 4  # pixels around a mask whose blur counts
 GRAZING = 0.2  # least cosine of the angle between normal and view that widens the tolerance
+
+
+def frame_blur(frame: Frame, mask: np.ndarray) -> float:
+    """Blur of a frame's image (`mgs.metrics.blur`) in its mask [H,W] and RIM pixels around, pixels.
+    The outline counts, because it is an edge of a plain object, too. Raises InputError as
+    `Frame.rgb`."""
+    return blur(srgb_from_linear(frame.rgb()), binary_dilation(mask, iterations=RIM))
 
 
 def in_image(camera: Camera, pixels: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from mgs.data.frames import Frame
+from mgs.data.frames import Frame, frame_blur
 from mgs.gaussians import Gaussians
 from mgs.memory import IMAGE_BYTES, kept_within
 from mgs.prior.exposure import without_gain
@@ -65,13 +65,14 @@ class Checks:
             frame = state.frames[view]
             key = "before fit", state.taken[: state.seeds], frame
             before = self.scene.once(key, partial(self._before_fit, state, frame))
-            packed, truth = self.compared(frame)
+            packed, truth, blurred = self.compared(frame)
             rendered = self.scene.render(model, frame.camera)[0]
             bits = np.unpackbits(packed, count=rendered[..., 0].size)
             counted = bits.astype(bool).reshape(rendered.shape[:2])
             if state.exposure is not None:
                 truth = without_gain(truth, state.exposure[k])
-            views.append(detectors.view_indicators(truth, counted, rendered, before))
+            seen = detectors.view_indicators(truth, counted, rendered, before)
+            views.append(replace(seen, blur=blurred))
         return views
 
     def prediction(
@@ -132,17 +133,17 @@ class Checks:
         return detectors.before_fit(frame.mask(), alpha, margin)
 
     @cached_property
-    def compared(self) -> Callable[[Frame], tuple[np.ndarray, np.ndarray]]:
+    def compared(self) -> Callable[[Frame], tuple[np.ndarray, np.ndarray, float]]:
         """compared(frame) -> `_compared`, kept within IMAGE_BYTES."""
-        return kept_within(IMAGE_BYTES, _compared, lambda parts: sum(p.nbytes for p in parts))
+        return kept_within(IMAGE_BYTES, _compared, lambda parts: sum(p.nbytes for p in parts[:2]))
 
 
-def _compared(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of a frame taken that are compared, one bit each, and their colours [M,3], linear
-    RGB."""
-    rgba, weight = frame.target()
-    counted = frame.mask() & (weight > 0)
-    return np.packbits(counted), rgba[..., :3][counted]
+def _compared(frame: Frame) -> tuple[np.ndarray, np.ndarray, float]:
+    """Pixels of a frame taken that are compared, one bit each, their colours [M,3], linear RGB, and
+    `frame_blur`."""
+    (rgba, weight), mask = frame.target(), frame.mask()
+    counted = mask & (weight > 0)
+    return np.packbits(counted), rgba[..., :3][counted], frame_blur(frame, mask)
 
 
 def predicted_psnr(entries: Sequence[Mapping[str, float]]) -> float | None:

@@ -11,6 +11,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
 from mgs.gaussians import Gaussians
+from mgs.metrics import MOST_BLUR
 
 DARK = 1e-3  # linear RGB, added to brightnesses before their ratio is taken
 RATIO_QUANTILES = (0.25, 0.5, 0.75)  # quantiles of a view's log ratios
@@ -40,7 +41,8 @@ class ViewIndicators:
 
     unexplained: mean squared error in the mask over the variance of the image there, 0 to 1. error:
     its root, linear RGB. srgb_error: mean squared error of sRGB there. ratios: quantiles
-    (RATIO_QUANTILES) of the log ratio of image to render. pixels: number compared, or 1."""
+    (RATIO_QUANTILES) of the log ratio of image to render. pixels: number compared, or 1. blur: of
+    the image alone, pixels."""
 
     before: Before
     unexplained: float
@@ -48,6 +50,7 @@ class ViewIndicators:
     srgb_error: float = 0.0
     ratios: tuple[float, ...] = (0.0, 0.0, 0.0)
     pixels: int = 1
+    blur: float = 0.0
 
 
 def before_fit(mask: np.ndarray, alpha: np.ndarray, margin: int) -> Before:
@@ -158,6 +161,7 @@ def step_indicators(
         indicators["unconverged"] = float(1 - (lowest[-1] / lowest[-1 - window]) ** (1 / window))
         indicators["worse"] = min(losses[1:]) / losses[0] - 1
     if views:
+        indicators["blur"] = float(np.median([view.blur for view in views]))
         pixels = np.array([view.pixels for view in views])
         if last or len(views) >= MANY_VIEWS:
             unexplained = np.array([view.unexplained for view in views])
@@ -210,6 +214,12 @@ DETECTORS: dict[str, Detector] = {
         0.18,  # good runs of many views: up to 0.134, because a step raises other images' losses
         "every pass of the fit had a loss at least {share:.0f} % above its start; lower the "
         "learning rates (`train.rates`)",
+    ),
+    "blur": Detector(
+        MOST_BLUR,
+        "the images are blurred by {value:.1f} pixels, that of the median view (limit "
+        "{limit:.2f}); take them again, sharp; if that is impossible, import them smaller "
+        "(`mgs import --downscale`), by which they lose nothing",
     ),
     "prior": Detector(
         0.006,
