@@ -326,6 +326,8 @@ ROBOTS = (
     ("TUM RGB-D", "tum/calibration.txt"),
     ("Open3D", "open3d/trajectory.log"),
     ("Open3D", "open3d/camera_intrinsic.json"),
+    ("7-Scenes", "seq-01/frame-000001.pose.txt"),
+    ("7-Scenes", "camera-intrinsics.txt"),
     ("RTAB-Map", "rtabmap/rtabmap_camera_poses.txt"),
     ("RTAB-Map", "rtabmap/rtabmap_calib/1.yaml"),
     ("Metashape", "metashape/cameras.xml"),

@@ -1,4 +1,4 @@
-"""Imports of recordings: ROS bags, TUM RGB-D, Open3D, RTAB-Map, Metashape."""
+"""Imports of recordings: ROS bags, TUM RGB-D, Open3D, 7-Scenes, RTAB-Map, Metashape."""
 
 import json
 import shutil
@@ -233,6 +233,19 @@ def write_open3d(root: Path, dataset) -> Path:
     return root
 
 
+def write_seven_scenes(root: Path, dataset) -> Path:
+    """Folder of NAME.color.png, NAME.depth.png and NAME.pose.txt, one of which is lost."""
+    copy_images(dataset, root / "color", root / "depth")
+    for k, frame in enumerate(dataset.frames):
+        for kind in ("color", "depth"):
+            (root / kind / f"{k}.png").rename(root / f"frame-{k:06d}.{kind}.png")
+        np.savetxt(root / f"frame-{k:06d}.pose.txt", frame.camera.camera_to_world)
+    shutil.copy(root / "frame-000000.color.png", root / "frame-000099.color.png")
+    (root / "frame-000099.pose.txt").write_text("-1.#INF 0 0 0\n" * 4)
+    np.savetxt(root.parent / "camera-intrinsics.txt", opencv_K(dataset.frames[0].camera))
+    return root
+
+
 def write_rtabmap(root: Path, dataset) -> Path:
     """Folder of `rtabmap-export`, with calibrations as OpenCV writes them."""
     copy_images(dataset, root / "rtabmap_rgb", root / "rtabmap_depth")
@@ -354,6 +367,7 @@ WRITERS = {
     "ROS bag 1": lambda root, data: write_bag(root / "one.bag", data, 1, compressed="32FC1"),
     "TUM RGB-D": lambda root, data: write_tum(root / "tum", data),
     "Open3D": lambda root, data: write_open3d(root / "open3d", data),
+    "7-Scenes": lambda root, data: write_seven_scenes(root / "seq-01", data),
     "RTAB-Map": lambda root, data: write_rtabmap(root / "rtabmap", data),
     "Metashape": lambda root, data: write_metashape(root / "metashape", data),
     "OpenSfM": lambda root, data: write_opensfm(root / "opensfm", data),
@@ -583,6 +597,8 @@ def pickled(path: Path) -> None:
         ("TUM RGB-D", "groundtruth.txt", nonsense, "fewer than 8"),
         ("Metashape", "cameras.xml", halved, "not valid XML"),
         ("Metashape", "cameras.xml", b2, "b2 or k4"),
+        ("7-Scenes", "frame-000001.pose.txt", halved, "has 8 numbers; give a 4x4 matrix"),
+        ("7-Scenes", "camera-intrinsics.txt", Path.unlink, "no calibration; write fx fy cx cy"),
         ("RTAB-Map", "3.yaml", halved, "camera_matrix"),
         ("OpenSfM", "reconstruction.json", halved, "not valid JSON"),
         ("Bundler", "bundle.out", halved, "9 cameras and 1 points of 9 listed images"),

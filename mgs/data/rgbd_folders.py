@@ -1,5 +1,5 @@
-"""Folders of robots and scanners with a pose for each image: TUM RGB-D, Open3D, RTAB-Map exports;
-each reader returns keyframes, in metres."""
+"""Folders of robots and scanners with a pose for each image: TUM RGB-D, Open3D, 7-Scenes, RTAB-Map
+exports; each reader returns keyframes, in metres."""
 
 import re
 from collections import Counter
@@ -20,7 +20,8 @@ from mgs.images import image_size
 TUM_DEPTH_UNIT = 1 / 5000  # metres in a step of a TUM RGB-D depth image
 LARGEST_NUMBER = 1e15  # numbers beyond it are mistakes, also of times
 SYNCHRONOUS = 0.02  # most seconds between a colour and its depth image (TUM's associate.py)
-OPEN3D_INTERVAL = 0.5  # seconds between images of an Open3D folder, without times: all are taken
+INTERVAL = 0.5  # seconds between images of folders without times: by default all are taken
+COLOUR, POSE = ".color", ".pose.txt"  # ends of names of 7-Scenes
 
 
 def rows(path: Path, least: int) -> list[list[str]]:
@@ -53,8 +54,9 @@ def poses(path: Path) -> list[list[float]]:
 
 
 def calibration(folder: Path) -> tuple[np.ndarray, Lens | None]:
-    """K [3,3] and lens by camera_intrinsic.json (Open3D), else calibration.txt (fx fy cx cy
-    and k1 k2 p1 p2 k3). Both count pixel centres as whole numbers."""
+    """K [3,3] and lens by camera_intrinsic.json (Open3D), else camera-intrinsics.txt (3x3, of
+    3DMatch, also in the folder above), else calibration.txt (fx fy cx cy and k1 k2 p1 p2 k3). All
+    count pixel centres as whole numbers."""
     path = folder / "camera_intrinsic.json"
     if path.is_file():
         record: Any = read_json(path)
@@ -64,6 +66,11 @@ def calibration(folder: Path) -> tuple[np.ndarray, Lens | None]:
             raise InputError(f"{path}: has no intrinsic_matrix of 9 numbers; correct it") from None
         K[:2, 2] += 0.5
         return K, None
+    for place in (folder, folder.resolve().parent):
+        if (path := place / "camera-intrinsics.txt").is_file():
+            K = _matrix(path, 3)
+            K[:2, 2] += 0.5
+            return K, None
     path = folder / "calibration.txt"
     if not path.is_file():
         raise InputError(
@@ -77,6 +84,15 @@ def calibration(folder: Path) -> tuple[np.ndarray, Lens | None]:
     fx, fy, cx, cy, *distortion = values
     K = np.array([[fx, 0, cx + 0.5], [0, fy, cy + 0.5], [0, 0, 1]])
     return K, opencv_lens(str(path), K, distortion)
+
+
+def _matrix(path: Path, size: int) -> np.ndarray:
+    """Square matrix of a file that has nothing else. Raises InputError."""
+    values = numbers(path, [word for words in rows(path, 1) for word in words])
+    if len(values) != size * size:
+        cure = f"give a {size}x{size} matrix"
+        raise InputError(f"{path}: has {len(values)} numbers; {cure}")
+    return np.reshape(values, (size, size))
 
 
 def is_tum(folder: Path) -> bool:
@@ -126,8 +142,7 @@ def read_open3d(folder: Path, spacing: Spacing) -> Source:
     if not len(values) or len(values) % 19:
         cure = "record it again"
         raise InputError(f"{path}: needs three numbers and a 4x4 matrix for each image; {cure}")
-    raw = np.array(values).reshape(-1, 19)[:, 3:].reshape(-1, 4, 4)
-    matrices, mended = zip(*map(orthonormal, raw), strict=True)
+    matrices = [*np.array(values).reshape(-1, 19)[:, 3:].reshape(-1, 4, 4)]
     images, depths = (
         sorted((path for path in (folder / name).glob("*") if path.is_file()), key=natural)
         for name in ("color", "depth")
@@ -139,14 +154,51 @@ def read_open3d(folder: Path, spacing: Spacing) -> Source:
     if unnumbered := [path for path in images if not re.search(r"\d", path.name)]:
         cure = "rename it"
         raise InputError(f"{unnumbered[0]}: its name has no number, which gives its pose; {cure}")
-    times = OPEN3D_INTERVAL * np.arange(len(images))
+    return Source("Open3D", _untimed(folder, spacing, matrices, images, depths), unit="m")
+
+
+def is_seven_scenes(folder: Path) -> bool:
+    """Whether a folder is a sequence of 7-Scenes or 3DMatch."""
+    return any(folder.glob(f"*{POSE}"))
+
+
+def read_seven_scenes(folder: Path, spacing: Spacing) -> Source:
+    """Keyframes of NAME.color.png (or .jpg), NAME.depth.png (mm) and NAME.pose.txt, a matrix
+    camera-to-world, in the order of the numbers in their names."""
+    left_out, poses, images = Counter[str](), list[np.ndarray](), list[Path]()
+    for image in sorted(folder.glob(f"*{COLOUR}.*"), key=natural):
+        path = image.with_name(f"{image.stem.removesuffix(COLOUR)}{POSE}")
+        text = read_text(path).lower() if path.is_file() else "nan"
+        if "inf" in text or "nan" in text:
+            left_out["without a pose"] += 1
+            continue
+        images.append(image)
+        poses.append(_matrix(path, 4))
+    if not images:
+        why = f"no image NAME{COLOUR}.png or .jpg with a pose in NAME{POSE}"
+        raise InputError(f"{folder}: has {why}; restore them")
+    depths = [path.with_name(f"{path.stem.removesuffix(COLOUR)}.depth.png") for path in images]
+    shots = _untimed(folder, spacing, poses, images, depths)
+    return Source("7-Scenes", shots, +left_out, unit="m")
+
+
+def _untimed(
+    folder: Path,
+    spacing: Spacing,
+    matrices: Sequence[np.ndarray],
+    images: Sequence[Path],
+    depths: Sequence[Path],
+) -> list[Shot]:
+    """Keyframes of images at poses camera-to-world, INTERVAL apart. depths: in mm, or none."""
     K, lens = calibration(folder)
+    times = (INTERVAL * np.arange(len(images))).tolist()
+    poses, mended = zip(*map(orthonormal, matrices), strict=True)
     shots: list[Shot] = []
-    for k in spacing.choose(list(zip(times.tolist(), matrices, strict=True))):
-        depth = depths[k] if depths else None
-        shot = _shot(images[k].stem, K, lens, matrices[k], times[k], images[k], depth)
+    for k in spacing.choose(list(zip(times, poses, strict=True))):
+        name, depth = images[k].stem.removesuffix(COLOUR), depths[k] if depths else None
+        shot = _shot(name, K, lens, poses[k], times[k], images[k], depth)
         shots.append(replace(shot, mended=mended[k]))
-    return Source("Open3D", shots, unit="m")
+    return shots
 
 
 def is_rtabmap(folder: Path) -> bool:

@@ -30,7 +30,16 @@ from mgs.data.photographs import (
     read_photographs,
     sharpest_frames,
 )
-from mgs.data.rgbd_folders import is_open3d, is_rtabmap, is_tum, read_open3d, read_rtabmap, read_tum
+from mgs.data.rgbd_folders import (
+    is_open3d,
+    is_rtabmap,
+    is_seven_scenes,
+    is_tum,
+    read_open3d,
+    read_rtabmap,
+    read_seven_scenes,
+    read_tum,
+)
 from mgs.data.shots import (
     PICTURE_SUFFIXES,
     ROUNDED,
@@ -64,6 +73,7 @@ RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
     "ROS bag": (is_bag, read_bag),
     "TUM RGB-D": (is_tum, lambda path, _, spacing, *__: read_tum(path, spacing)),
     "Open3D": (is_open3d, lambda path, _, spacing, *__: read_open3d(path, spacing)),
+    "7-Scenes": (is_seven_scenes, lambda path, _, spacing, *__: read_seven_scenes(path, spacing)),
     "RTAB-Map": (is_rtabmap, lambda path, _, spacing, *__: read_rtabmap(path, spacing)),
     **{kind: (partial(is_peer, kind), partial(read_peer, kind)) for kind in PEERS},
 }
