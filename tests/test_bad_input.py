@@ -78,6 +78,13 @@ def only_tests(root: Path) -> None:
     (root / "transforms.json").rename(root / "transforms_test.json")
 
 
+def scanned(root: Path) -> None:
+    """Pictures of another program with a matrix for each, as of ScanNet."""
+    (root / "transforms.json").unlink()
+    (root / "pose").mkdir()
+    np.savetxt(root / "pose/0.txt", np.eye(4))
+
+
 def points_in_one_place(root: Path) -> None:
     write_cloud(root / "points.ply", SparseCloud(np.ones((500, 3))))
     header(ply_file_path="points.ply")(root)
@@ -206,6 +213,7 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
     (synthetic.write_dataset, "import {d} --exclude kf_0000 --out {out}"): [
         ("exclude leaves no image", frames(lambda all: all[:1])),
         ("transforms_test.json: its poses would be ignored", only_tests),
+        ("pose/0.txt: its poses would be ignored; give its folder", scanned),
     ],
     **{
         (lambda d: synthetic.write_dataset(d / "deep"), words): [

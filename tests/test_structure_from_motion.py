@@ -239,6 +239,20 @@ def test_photographs_of_one_name_or_none_are_left_out(frames, tmp_path):
     assert (usable, [*dropped]) == (paths[:1], ["a_1.png", r"'b\n.png'"])
 
 
+def test_depth_among_photographs_is_left_out_and_its_place_is_named(frames, tmp_path):
+    paths = [frame.image_path for frame in frames[:3]]
+    deep = [paths[0].parent / f"depth_{k}.png" for k in range(2)]
+    for k, path in enumerate(deep):
+        write_png(path, np.full((4, 4), 1000 + k, np.uint16))
+    usable, dropped = photographs._usable(paths[0].parent, [*paths, *deep])
+    alone = photographs._usable(paths[0].parent, deep)
+    for path in deep:
+        path.unlink()
+    assert (usable, [*dropped]) == (paths, [path.name for path in deep])
+    assert "its place is a folder `depth`" in dropped["depth_0.png"]
+    assert alone == (deep, {})  # photographs may be grey, of 16 bits
+
+
 def test_neighbours_by_gps_are_matched(frames, placed, monkeypatch):
     """A blank picture, the first by name, has none."""
     monkeypatch.setattr(photographs, "NEAR", 2)

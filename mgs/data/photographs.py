@@ -3,6 +3,7 @@ structure from motion (pycolmap)."""
 
 import hashlib
 import os
+import re
 import shutil
 import warnings
 from collections import Counter
@@ -40,6 +41,11 @@ UNREAD = (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw")  # left out 
 PLACED = "models/*/images.bin"  # files of a folder of matches where photographs are placed
 STATES = "states"  # its folder of models that are not finished, from which another call continues
 STEP = 100  # photographs that are placed from one state to the next
+# Files that hold poses by their name, or that of their folder.
+POSES = re.compile(
+    r"(?<![a-z])((pose|traj|ground_?truth|odometry)[^/]*(/[^/]+)?|cameras/[^/]+)\.(txt|csv|log|json)$",
+    re.I,
+)
 NAMED = 10  # most photographs that a line names
 
 
@@ -67,6 +73,10 @@ def check_alone(source: Path) -> None:
     for poses in chain(source.glob("transforms*.json"), *inside):
         cure = "give it, or its folder, as the source, or move it away"
         raise InputError(f"{poses}: its poses would be ignored; {cure}")
+    others = (path for path in source.rglob("*") if POSES.search(f"{path.relative_to(source)}"))
+    if other := min(others, default=None):
+        cure = "give its folder if that can be read, or make a transforms.json, or move it away"
+        raise InputError(f"{other}: its poses would be ignored; {cure}")
 
 
 def read_photographs(
@@ -131,7 +141,7 @@ def read_photographs(
 def _usable(source: Path, paths: Sequence[Path]) -> tuple[list[Path], dict[str, str]]:
     """Photographs that can be read and are no copies, also by the name of their frame, and why the
     others are left out, by name."""
-    usable, dropped, seen = [], dict[str, str](), set[str]()
+    usable, dropped, seen, deep = [], dict[str, str](), set[str](), []
     for k, path in enumerate(paths):
         report("reading photographs", k, len(paths))
         name = path.relative_to(source).as_posix()
@@ -142,7 +152,7 @@ def _usable(source: Path, paths: Sequence[Path]) -> tuple[list[Path], dict[str, 
             dropped[ascii(name)] = "with a name that cannot be printed: rename"
             continue
         try:
-            read_rgba(path)
+            pixels = read_rgba(path)
         except InputError:
             dropped[name] = "not readable: damaged, or neither grey nor RGB"
             continue
@@ -152,6 +162,12 @@ def _usable(source: Path, paths: Sequence[Path]) -> tuple[list[Path], dict[str, 
             continue
         seen |= same
         usable.append(path)
+        if pixels.dtype == np.uint16 and (pixels[..., :2] == pixels[..., 1:3]).all():
+            deep.append(path)
+    if len(deep) < len(usable):
+        why = "grey of 16 bits, as depth: its place is a folder `depth` in the source"
+        dropped |= {path.relative_to(source).as_posix(): why for path in deep}
+        usable = [path for path in usable if path not in deep]
     return usable, dropped
 
 
