@@ -604,7 +604,7 @@ def pickled(path: Path) -> None:
         ("Bundler", "bundle.out", halved, "9 cameras and 1 points of 9 listed images"),
         ("Bundler", "list.txt", Path.unlink, "list.txt: no such file"),
         ("LLFF", "poses_bounds.npy", halved, "not a readable file of LLFF"),
-        ("LLFF", "kf_0003.png", Path.unlink, "(8, 17) for 7 images"),
+        ("LLFF", "kf_0003.png", Path.unlink, "has 8 poses for 7 pictures in"),
         ("LLFF", "images", shutil.rmtree, "has no pictures; give their folder as `images`"),
         ("LLFF", "poses_bounds.npy", pickled, "allow_pickle=False"),
         ("MVSNet", "kf_0000_cam.txt", halved, "not a readable file of MVSNet"),

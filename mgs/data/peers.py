@@ -192,8 +192,12 @@ def _llff(path: Path, folders: list[Path]) -> Contents:
     names = sorted(one.name for one in folder.iterdir() if one.suffix.lower() in PICTURE_SUFFIXES)
     if not names:
         raise InputError(f"{path}: {folder} has no pictures; give their folder as `images`")
-    if table.shape != (len(names), 17):
-        raise ValueError(f"an array of {table.shape} for {len(names)} images, not [N,17]")
+    if table.ndim != 2 or table.shape[1] != 17:
+        raise ValueError(f"an array of {table.shape}, not [N,17]")
+    if len(table) != len(names):
+        why = f"has {len(table)} poses for {len(names)} pictures in {folder}"
+        cure = "restore what lacks, or give their folder as `images`"
+        raise InputError(f"{path}: {why}; {cure}")
     views = []
     for name, row in zip(names, table.astype(np.float64), strict=True):
         down, right, back, eye, (height, width, f) = row[:15].reshape(3, 5).T
