@@ -261,17 +261,29 @@ def test_distortion_is_undone(tmp_path, model):
     assert 0.3 < copy.mask().sum() / source.mask().sum() < 3
 
 
-@pytest.mark.parametrize(("steps", "unit"), [(1000, None), (4000, 0.00025), (0.5, 2.0)])
-def test_depth_is_in_millimetres_or_the_units_that_are_named(dataset, tmp_path, steps, unit):
+UNIT = "depth_unit_scale_factor"
+
+
+@pytest.mark.parametrize(
+    ("steps", "about", "path"),
+    [
+        (1000, {}, "depth_file_path"),
+        (4000, {UNIT: 0.00025}, "depth_file_path"),
+        (0.5, {UNIT: 2.0}, "depth_file_path"),
+        (4096, {"integer_depth_scale": 1 / 4096}, "depth_path"),  # instant-ngp, NeRFCapture
+        (4096, {"integer_depth_scale": -1, UNIT: 1 / 4096}, "depth_file_path"),
+    ],
+)
+def test_depth_is_in_millimetres_or_the_units_that_are_named(dataset, tmp_path, steps, about, path):
     """As whole numbers of 16 bits, or floats of a TIFF."""
     ending, kind = (".tif", np.float32) if steps < 1 else (".png", np.uint16)
     for frame in dataset.frames:
         depth = frame.depth() * steps if steps < 1 else np.round(frame.depth() * steps)
         cv2.imwrite(str(frame.depth_path.with_suffix(ending)), depth.astype(kind))
     text = (dataset.root / "transforms.json").read_text()
-    (dataset.root / "transforms.json").write_text(text.replace(".exr", ending))
-    if unit:
-        synthetic.edit(dataset.root, lambda data: data.update(depth_unit_scale_factor=unit))
+    text = text.replace(".exr", ending).replace("depth_file_path", path)
+    (dataset.root / "transforms.json").write_text(text)
+    synthetic.edit(dataset.root, lambda data: data.update(about))
     copy = _import(dataset.root, tmp_path / "copy")
     for one, other in zip(dataset.frames, copy.frames, strict=True):
         assert np.abs(one.depth() - other.depth()).max() < 0.51 / 1000

@@ -62,6 +62,7 @@ COEFFICIENTS = (  # keys of transforms.json that COLMAP's camera models name ali
     *("p1", "p2", "sx1", "sy1", "omega", "k", "k0", "alpha", "beta"),
 )
 
+NGP_STEP = "integer_depth_scale"  # instant-ngp's name of a step of depth, that of `depth_path`
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's lists of images
 
 Reader = Callable[[Path, Path | None, Spacing, Path, str | None], Source]
@@ -232,6 +233,9 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
     key = "depth_unit_scale_factor"
     scale = finite_number(str(path), key, data.get(key, 1e-3))
     of_floats = scale if key in data else 1.0
+    steps = finite_number(str(path), NGP_STEP, data.get(NGP_STEP) or 0.0)
+    if steps > 0 and key not in data:
+        scale = steps
     tests, without = _splits(path, data, records)
     left_out, shots = Counter[str](), []
     for index, record in enumerate(records):
@@ -244,6 +248,8 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
             continue
         keys = ("depth_file_path", "mask_path", "rock_file_path")
         names = [record.get(key) or "" for key in keys]
+        if steps > 0 and not names[0]:
+            names[0] = str(record.get("depth_path") or "")
         depth, mask, rock = (
             (_named(path.parent, None, one) or path.parent / one) if one else None for one in names
         )
