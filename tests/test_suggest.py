@@ -201,7 +201,9 @@ def test_nothing_is_taken_from_behind_a_facade(site, walls):
 
 def test_gains_of_a_model_without_a_surface_are_no_guide(run, monkeypatch, capsys):
     monkeypatch.setattr(Prior, "kind", "random")
-    assert "nothing tells seen from unseen" in output(capsys, "suggest", run, "--dome", 5)
+    said = output(capsys, "suggest", run, "--dome", 5)
+    assert "nothing tells seen from unseen" in said
+    assert "; import with masks, or fit with `prior`" in said  # depth is there
 
 
 def test_a_coarse_model_keeps_the_best(run, site, monkeypatch):

@@ -272,7 +272,8 @@ def _write_plan(path: Path, run: Run, result: Suggestion, place: Any, limits: Fl
 def _print(console: Terminal, result: Suggestion, run: Run, crossed: str, place: Any) -> None:
     if run.prior.kind == "random":
         lacks = "the model has no surface of an object: nothing tells seen from unseen"
-        cure = "import with masks or depth, or fit with `prior`"
+        deep = any(frame.depth_path for frame in run.dataset.frames)  # of a room, which has none
+        cure = f"import with masks{'' if deep else ' or depth'}, or fit with `prior`"
         if (run.dataset.root / CLOUD).is_file():
             cure = f"`mgs suggest {run.dataset.root}` builds one of the points"
         console.print(f"{lacks}, and gains are no guide; {cure}", soft_wrap=True)
