@@ -306,12 +306,6 @@ def on_white(frame: mgs.Frame) -> np.ndarray:
     return np.asarray(np.round(255 * (colour * alpha + 1 - alpha)), np.uint8)
 
 
-def rows_of(work: Work) -> list[Row]:
-    """A row for each run that is done."""
-    done = [cell for cell in work.cells if cell.about and cell.name in work.results]
-    return [dict(cell.about) | work.results[cell.name] for cell in done]
-
-
 def means_of(rows: Sequence[Row]) -> list[Row]:
     """A row for each number of views and policy, best first: means over scenes and draws. PSNR and
     lead over `random` have 95 % intervals over the scenes, each a mean over the draws; where there
@@ -362,7 +356,7 @@ def tables(rows: Sequence[Row]) -> str:
 
 def write(work: Work) -> list[Path]:
     """Write blender.csv, a row for each run, .json, .md and .png."""
-    rows = rows_of(work)
+    rows = work.rows()
     means = means_of(rows)
     keys = ("views", "policy")
     ordered = [row for mean in means for row in rows if all(row[k] == mean[k] for k in keys)]

@@ -98,10 +98,8 @@ def cells_of(size: CertificateSize) -> list[Cell]:
         one = size if part == "plans" else replace(size, gaussians=size.fitted)
         for rock in rocks:
             name = f"certificate/{rock.name}/{part}"
-            how = {"seed": rock.index, **arguments}
-            *data, last = case_of(rock, SETUP, one).with_task(name, f"{__name__}:{task}", **how)
-            about = {"rock": rock.name, "scene": rock.scene, "part": part.partition("/")[0]}
-            cells += [*data, replace(last, about=about)]
+            how = {"about": {"part": part.partition("/")[0]}, "seed": rock.index, **arguments}
+            cells += case_of(rock, SETUP, one).with_task(name, f"{__name__}:{task}", **how)
     return cells
 
 

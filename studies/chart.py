@@ -196,7 +196,7 @@ def cells_of(size: ChartSize) -> list[Cell]:
     cells: list[Cell] = []
     points = [point for kind in size.kinds for point in points_of(size, kind)]
     for rock, point in product(size.rocks, points):
-        how = {"repeats": size.repeats, "settings": point.settings(size.seeds)}
+        how: dict[str, Any] = {"repeats": size.repeats, "settings": point.settings(size.seeds)}
         how["reference"] = list(size.reference)
         case, task = size.case(rock, point.density), f"{__name__}:measure"
         cells += case.with_task(name_of(rock, point), task, alone=True, **how)

@@ -40,12 +40,11 @@ SIZES = {
 
 def cells_of(size: SetupSize) -> list[Cell]:
     """Cells of every rock, with its dataset and prior."""
-    cells = []
+    cells: list[Cell] = []
     for rock in size.rocks:
         case = case_of(rock, SETUPS["hemisphere"], size)
-        how = {"choices": size.images - SEEDS}
-        *data, last = case.with_task(f"couplings/{rock.name}", f"{__name__}:run", True, **how)
-        cells += [*data, replace(last, about={"rock": rock.name, "scene": rock.scene})]
+        how: dict[str, Any] = {"about": {}, "choices": size.images - SEEDS}
+        cells += case.with_task(f"couplings/{rock.name}", f"{__name__}:run", True, **how)
     return cells
 
 
@@ -114,8 +113,7 @@ def tables(rows: list[Row]) -> str:
 
 def write(work: Work) -> list[Path]:
     """Write couplings.csv, .json and .md."""
-    cells = [cell for cell in work.cells if cell.about]
-    rows = [{**cell.about, **row} for cell in cells for row in work.results[cell.name]["rows"]]
+    rows = work.rows()
     return write_table(work, "couplings", rows, tables(rows))
 
 

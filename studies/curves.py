@@ -28,12 +28,12 @@ POLICIES = (setups.LEADER, "cover", ANGLE, setups.RANDOM)
 
 def cells_of(size: setups.SetupSize) -> list[Cell]:
     """Cells of every number of images: each is a run of its own, since a plan is for a number."""
-    cells: dict[str, Cell] = {}
+    cells: list[Cell] = []
     for count in COUNTS:
         for cell in setups.cells_of(replace(size, images=count, draws=DRAWS), POLICIES, SOME):
             about = dict(cell.about) | {"images": count} if cell.about else cell.about
-            cells[cell.name] = replace(cell, about=about)
-    return list(cells.values())
+            cells.append(replace(cell, about=about))
+    return cells
 
 
 def rows_of(work: Work) -> list[Row]:

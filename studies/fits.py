@@ -94,7 +94,7 @@ VARIANT: Options = {
 def cells_of(size: SetupSize, names: Sequence[str] | None = None) -> list[Cell]:
     """Cells of every variant, or of those named, on every rock, with datasets and priors."""
     variants = {n: v for n, v in VARIANTS.items() if n in (DEFAULT, *(names or VARIANTS))}
-    cells: dict[str, Cell] = {}
+    cells: list[Cell] = []
     for rock in size.rocks:
         spiral = spiral_of(rock, size)
         for pool, counts in POOLS.items():
@@ -103,20 +103,16 @@ def cells_of(size: SetupSize, names: Sequence[str] | None = None) -> list[Cell]:
                 case = replace(plain, settings={**plain.settings, **variant.prior})
                 for count in counts:
                     label = name.replace(" ", "-").replace("=", "-").replace(":", "")
-                    *made, last = case.with_task(
+                    cells += case.with_task(
                         f"fit/{rock.name}/{pool.replace(' ', '-')}-{count}/{label}",
                         f"{__name__}:fit_and_judge",
+                        about={"pool": f"{pool}, {count}", "variant": name},
+                        made=[*case.cells(), *spiral.cells()[:1]],
                         spiral=spiral.dataset,
                         variant=name,
                         views=count,
                     )
-                    made = [*made, *spiral.cells()[:1]]
-                    needs = tuple(cell.name for cell in made)
-                    about = {"rock": rock.name, "scene": rock.scene, "pool": f"{pool}, {count}"}
-                    about |= {"variant": name}
-                    made.append(replace(last, needs=needs, about=about))
-                    cells |= {cell.name: cell for cell in made}
-    return list(cells.values())
+    return cells
 
 
 def fit_and_judge(
@@ -155,8 +151,7 @@ def fit_and_judge(
 
 def rows_of(work: Work) -> list[Row]:
     """A row for each rock, pool and variant: PSNR, and KEY_change from the default's."""
-    cells = [cell for cell in work.cells if cell.about]
-    rows = [dict(cell.about) | work.results[cell.name] for cell in cells]
+    rows = work.rows()
     usual = {(row["rock"], row["pool"]): row for row in rows if row["variant"] == DEFAULT}
     for row in rows:
         before = usual[row["rock"], row["pool"]]

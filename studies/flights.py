@@ -118,19 +118,18 @@ FLIERS: Mapping[str, tuple[Flier, dict[str, Any]]] = {
 
 def cells_of(size: SetupSize) -> list[Cell]:
     """A cell for each rock and pool, with its dataset and prior."""
-    cells: dict[str, Cell] = {}
+    cells: list[Cell] = []
     for rock, (name, setup) in product(size.rocks, POOLS.items()):
         count = "" if size.gaussians is None else f"-{size.gaussians}"
         folder = f"{name.replace(' ', '-')}-{size.width}x{size.height}{count}"
-        *data, last = case_of(rock, setup, size).with_task(
+        cells += case_of(rock, setup, size).with_task(
             f"flights/{rock.name}/{folder}",
             f"{__name__}:fly_and_judge",
+            about={"pool": name},
             frames=setup.frames // size.fewer,
             passes=size.passes,
         )
-        about = {"rock": rock.name, "scene": rock.scene, "pool": name}
-        cells |= {cell.name: cell for cell in (*data, replace(last, about=about))}
-    return list(cells.values())
+    return cells
 
 
 def fly_and_judge(

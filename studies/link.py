@@ -56,9 +56,8 @@ def cells_of(size: LinkSize) -> list[Cell]:
         case = case_of(rock, SETUPS["hemisphere"], size)
         settings = {"policy": policy, "seeds": SEEDS, "budget": views - SEEDS, "seed": rock.index}
         name, task = f"link/{rock.name}/{policy}-{views}", f"{__name__}:send"
-        *data, last = case.with_task(name, task, sent=list(size.sent), settings=settings)
-        about = {"rock": rock.name, "scene": rock.scene, "views": views, "by": POLICIES[policy]}
-        cells += [*data, replace(last, about=about)]
+        about, sent = {"views": views, "by": POLICIES[policy]}, list(size.sent)
+        cells += case.with_task(name, task, about=about, sent=sent, settings=settings)
     return cells
 
 
@@ -78,12 +77,7 @@ def send(
 def rows_of(work: Work) -> list[Row]:
     """A row for each model and size. "gain": PSNR over that of the fewest evenly spaced views of
     the same rock in as many bytes, dB."""
-    rows = [
-        dict(cell.about) | row
-        for cell in work.cells
-        if cell.about
-        for row in work.results[cell.name]["rows"]
-    ]
+    rows = work.rows()
     first = {"views": min(work.size.views), "by": EVEN}
     base = {
         (row["rock"], row["bytes"]): row["psnr"] for row in rows if first.items() <= row.items()

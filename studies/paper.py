@@ -105,7 +105,7 @@ def scene_of(whole: mgs.Scene, variant: str) -> mgs.Scene:
 
 def cells_of(size: SetupSize) -> list[Cell]:
     """Cells of every variant on every rock, with datasets and priors."""
-    cells: dict[str, Cell] = {}
+    cells: list[Cell] = []
     for rock in size.rocks:
         plain = case_of(rock, SETUPS["ring"], size)
         for k, variant in enumerate(VARIANTS):
@@ -113,10 +113,9 @@ def cells_of(size: SetupSize) -> list[Cell]:
             settings = plain.settings if backed else {**plain.settings, "backing": 0.0}
             case = replace(plain, settings=settings)
             label = f"paper/{rock.name}/{k}"
-            *made, last = case.with_task(label, f"{__name__}:run", variant=variant)
-            about = {"rock": rock.name, "scene": rock.scene, "variant": variant}
-            cells |= {cell.name: cell for cell in (*made, replace(last, about=about))}
-    return list(cells.values())
+            about = {"variant": variant}
+            cells += case.with_task(label, f"{__name__}:run", about=about, variant=variant)
+    return cells
 
 
 def run(root: Path, out: Path, dataset: str, prior: str, variant: str) -> dict[str, float | None]:
@@ -146,7 +145,7 @@ def run(root: Path, out: Path, dataset: str, prior: str, variant: str) -> dict[s
 
 def rows_of(work: Work) -> list[Row]:
     """A row for each rock and variant, and KEY_change from the paper's."""
-    rows = [dict(cell.about) | work.results[cell.name] for cell in work.cells if cell.about]
+    rows = work.rows()
     usual = {row["rock"]: row for row in rows if row["variant"] == LETTER}
     for row in rows:
         row |= {

@@ -58,7 +58,7 @@ DEFAULT, REFIT, PRUNED = "default", "refit", "pruned"
 
 def cells_of(size: SetupSize) -> list[Cell]:
     """Cells of each rock: dataset, priors, fits, and the refit."""
-    cells: dict[str, Cell] = {}
+    cells: list[Cell] = []
     for rock in size.rocks:
         case = case_of(rock, SETUPS["hemisphere"], size)
         choices = [(NUMBER, n, ALL, 0) for n in COUNTS] + [(DEFAULT, None, ALL, 0)]
@@ -66,22 +66,15 @@ def cells_of(size: SetupSize) -> list[Cell]:
         choices += [(DEGREE, None, ALL, degree) for degree in DEGREES]
         for choice, number, learned, degree in choices:
             settings = case.settings if number is None else {"gaussians": number, "seed": 0}
-            more = {
-                "learned": list(LEARNED[learned]),
-                "degree": degree,
-                "pruned": choice == DEFAULT,
-            }
+            more: dict[str, Any] = {"learned": list(LEARNED[learned]), "degree": degree}
+            more["pruned"] = choice == DEFAULT
             name = f"fit/{rock.name}/{number or 'auto'}-{'-'.join(LEARNED[learned])}-{degree}"
-            *own, last = replace(case, settings=settings).with_task(
-                name, f"{__name__}:fit_and_judge", False, **more
-            )
-            about: Row = {"rock": rock.name, "scene": rock.scene, "choice": choice}
-            about |= {"asked": number or 0, "learned": learned, "degree": degree}
-            cells |= {cell.name: cell for cell in (*own, replace(last, about=about))}
-        last = case.with_task(f"refit/{rock.name}", f"{__name__}:refit_and_judge")[-1]
-        about = {"rock": rock.name, "scene": rock.scene, "choice": REFIT}
-        cells[last.name] = replace(last, about=about)
-    return list(cells.values())
+            about = {"choice": choice, "asked": number or 0, "learned": learned, "degree": degree}
+            task = f"{__name__}:fit_and_judge"
+            cells += replace(case, settings=settings).with_task(name, task, about=about, **more)
+        task, about = f"{__name__}:refit_and_judge", {"choice": REFIT}
+        cells += case.with_task(f"refit/{rock.name}", task, about=about)
+    return cells
 
 
 def scene_of(root: Path, dataset: str, prior: str) -> mgs.Scene:
@@ -145,8 +138,7 @@ def refit_and_judge(root: Path, out: Path, dataset: str, prior: str) -> dict[str
 
 def rows_of(work: Work) -> list[Row]:
     """Rows with the PSNR over that of the default, and the share of its parameters."""
-    cells = [cell for cell in work.cells if cell.about]
-    rows = [cell.about | row for cell in cells for row in work.results[cell.name]["rows"]]
+    rows = work.rows()
     default = {row["rock"]: row for row in rows if row["choice"] == DEFAULT}
     for row in rows:
         usual = default[row["rock"]]

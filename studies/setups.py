@@ -207,13 +207,12 @@ def cells_of(
 ) -> list[Cell]:
     """Cells of every policy in every set-up on every rock, with datasets and priors; policies and
     set-ups are those of the size by default."""
-    cells: dict[str, Cell] = {}
+    cells: list[Cell] = []
     pairs = product(size.rocks, (size.setups if setups is None else setups).items())
     for rock, (name, setup) in pairs:
         case = case_of(rock, setup, size)
         case, data = case.surveyed(rock.index) if setup.survey else (case, case.cells())
         spiral = spiral_of(rock, size)
-        data = [*data, spiral.cells()[0]]
         common = {"seeds": setup.seeds, "budget": size.images - setup.seeds, **setup.settings}
         every_policy = size.policies if policies is None else policies
         for draw, policy in product(range(size.draws), every_policy):
@@ -223,21 +222,19 @@ def cells_of(
             version = "".join(f"-{digest[:8]}" for digest in policy_record(policy).values())
             shape = f"{size.images}x{size.width}x{size.height}"
             where = f"{rock.name}/{name.replace(' ', '-')}-{shape}"
-            about = {"rock": rock.name, "scene": rock.scene, "setup": name, "policy": shown}
             settings = common | {"policy": policy, "seed": rock.index + 1000 * draw}
-            *_, last = case.with_task(
+            cells += case.with_task(
                 f"setup/{where}/{shown}{version}-{draw}",
                 f"{__name__}:choose_and_judge",
+                about={"setup": name, "policy": shown},
+                made=[*data, spiral.cells()[0]],
                 spiral=spiral.dataset,
                 every=setup.every,
                 drawn=setup.drawn,
                 passes=size.passes,
                 settings=settings,
             )
-            needs = tuple(cell.name for cell in data)
-            made = (*data, replace(last, needs=needs, about=about))
-            cells |= {cell.name: cell for cell in made}
-    return list(cells.values())
+    return cells
 
 
 def choose_and_judge(

@@ -71,23 +71,22 @@ WORDS |= {ANOTHER: "{:g}", SUN: "{:g}°"}
 
 def cells_of(size: SetupSize) -> list[Cell]:
     """Cells of both parts on every rock, with datasets and priors."""
-    cells: dict[str, Cell] = {}
+    cells: list[Cell] = []
     rocks = dict.fromkeys((*size.rocks, *FRESH))  # a prior of another rock, also for one rock
     cases = [case_of(rock, SETUPS["hemisphere"], size) for rock in rocks]
     for k, case in enumerate(cases[: len(size.rocks)]):
         others = [cases[(k + step) % len(cases)] for step in (1, 2, 3)]
         moved = [under_sun(case, degrees) for degrees in SUN_MOVES]
-        made = [one for other in others for one in other.cells()]
+        made = [one for each in (case, *others) for one in each.cells()]
         made += [one.cells()[0] for one in moved]
         wrong: dict[str, Any] = {"others": [other.prior for other in others]}
         wrong["moved"] = [one.dataset for one in moved]
         for part, more in (("faults", wrong), ("few_views", {"counts": FEW})):
-            *own, last = case.with_task(f"{part}/{case.rock.name}", f"{__name__}:{part}", **more)
-            needs = tuple(dict.fromkeys(one.name for one in (*own, *made)))
+            name, task = f"{part}/{case.rock.name}", f"{__name__}:{part}"
+            *own, last = case.with_task(name, task, made=made, **more)
             about = {"part": part, "rock": case.rock.name, "scene": case.rock.scene}
-            last = replace(last, needs=needs, about=about)
-            cells |= {cell.name: cell for cell in (*own, *made, last)}
-    return list(cells.values())
+            cells += [*own, replace(last, about=about)]
+    return cells
 
 
 def under_sun(case: Case, degrees: float) -> Case:
@@ -240,12 +239,11 @@ def few_views(
 def rows_of(work: Work) -> list[Row]:
     """Rows of both parts; of faults with the names of the warnings, of few views with the PSNR
     `over` that of frozen means with a prior."""
-    rows = []
-    for cell in work.cells:
-        for row in work.results[cell.name]["rows"] if cell.about else ():
-            signs = {name: row.get(f"sign {name}") for name in DETECTORS}
-            above = [n for n, v in signs.items() if v is not None and v > DETECTORS[n].limit]
-            rows.append({**cell.about, **row, "warnings": " ".join(above)})
+    rows = work.rows()
+    for row in rows:
+        signs = {name: row.get(f"sign {name}") for name in DETECTORS}
+        above = [n for n, v in signs.items() if v is not None and v > DETECTORS[n].limit]
+        row["warnings"] = " ".join(above)
     usual = {(r["rock"], r["views"]): r["psnr"] for r in rows if r.get("means") == "frozen"}
     for row in rows:
         if row["part"] == "few_views":

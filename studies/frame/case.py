@@ -17,7 +17,7 @@ from mgs.files import atomic_folder
 from mgs.resources import scene_path
 from mgs.run.inputs import file_digest
 from studies.frame.program import Options, at_least
-from studies.frame.statistics import MOST_ROCKS
+from studies.frame.statistics import MOST_ROCKS, Row
 from studies.frame.sweep import CELLS, Cell
 
 MESH_SCENE = "boulder"
@@ -227,11 +227,22 @@ class Case:
         prior = replace(case.cells()[-1], needs=(flown.name,))
         return case, [*first, flown, prior]
 
-    def with_task(self, name: str, task: str, alone: bool = False, **arguments: Any) -> list[Cell]:
-        """The cells above, and last a cell of a task that gets their folders."""
-        cells = self.cells()
-        needs = tuple(cell.name for cell in cells)
-        return [*cells, Cell(name, task, {**self.folders, **arguments}, needs, alone)]
+    def with_task(
+        self,
+        name: str,
+        task: str,
+        alone: bool = False,
+        about: Row | None = None,
+        made: Sequence[Cell] | None = None,
+        **arguments: Any,
+    ) -> list[Cell]:
+        """The cells above, or those in `made`, and last a cell of a task that gets the folders and
+        needs them all. about: columns of its rows after the rock's; None: it has no rows."""
+        made = self.cells() if made is None else made
+        needs = tuple(dict.fromkeys(cell.name for cell in made))
+        rock = {"rock": self.rock.name, "scene": self.rock.scene}
+        columns = {} if about is None else rock | about
+        return [*made, Cell(name, task, {**self.folders, **arguments}, needs, alone, columns)]
 
 
 def make_dataset(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from mgs import InputError, runtime
 from mgs.errors import Notice, from_interrupt, missing, printable_lines, row_named
 from mgs.files import check_new_folder, check_writable, folder_locked, read_json, write_json
+from studies.frame.statistics import Row
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -71,6 +72,12 @@ class Work:
     def out(self) -> Path:
         """Folder of the study."""
         return Path(self.options.out)
+
+    def rows(self) -> list[Row]:
+        """A row for each result of a cell that is about something, or for each of its "rows"."""
+        done = [cell for cell in self.cells if cell.about and cell.name in self.results]
+        pairs = [(cell.about, self.results[cell.name]) for cell in done]
+        return [about | row for about, result in pairs for row in result.get("rows", [result])]
 
 
 class Parser(ArgumentParser):
@@ -149,7 +156,8 @@ class Study:
             raise InputError("--scheduler: has workers of its own; leave out --workers")
         size = self.sized(row_named(self.sizes, options.scale, "--scale"), options)
         work = replace(work, size=size)
-        work = replace(work, cells=self.cells(work))
+        cells = {cell.name: cell for cell in self.cells(work)}  # of one name: the same
+        work = replace(work, cells=list(cells.values()))
         with _begun(work.out, options.scale):
             self.tell(self.write(replace(work, results=self._results(work))))
 
