@@ -1,10 +1,9 @@
 """`mgs suggest`: the next pictures to take, from the images so far and candidate poses."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -15,19 +14,22 @@ from mgs.cli.options import Count, Settings, not_none, parse_gaussians, parse_se
 from mgs.cli.terminal import Terminal, progress_bar
 from mgs.data.dataset import load_dataset, read_records
 from mgs.data.flight_plan import Stop, check_plan_path, parse_origin, write_flight_plan
+from mgs.data.meshes import distances_to_mesh
+from mgs.data.on_site import dataset_at, holds_photographs
+from mgs.data.photographs import photographs_in
 from mgs.data.structure import CLOUD
 from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
 from mgs.fit.settings import Frozen
 from mgs.policy.criteria import GAIN_UNIT
+from mgs.prior.photographs import check_enough
+from mgs.reports.suggestion import write_suggestion
+from mgs.run.candidates import MOST_POSES, Named, Site, inside, place_poses, read_poses
+from mgs.run.folder import Run, holds_run, open_run
+from mgs.run.nbv import resume_nbv, start_run
 from mgs.run.settings import FlightLimits, Positive, SearchLimits, validated
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from mgs.run.candidates import Named
-    from mgs.run.folder import Run
-    from mgs.run.suggest import Suggestion, View
+from mgs.run.suggest import Suggestion, View, taken_in_order
+from mgs.run.suggest import suggest as suggested
 
 Degrees = Annotated[float, Field(ge=-90, le=90)]
 
@@ -106,8 +108,6 @@ def suggest(
     - policy: Default: that of the run, or of `mgs nbv`.
     - prior: Folder of `mgs prior`. Default: DATASET/prior, or one built now.
     - gaussians N|auto: Build a prior of this many Gaussians."""
-    from mgs.data.on_site import holds_photographs
-
     console = Terminal()
     for path in plan or ():
         check_plan_path(path)
@@ -138,8 +138,6 @@ def suggest(
         if plan and run.dataset.unit != "m":
             raise InputError(f"{source}: a flight plan needs metres; import the data with `unit`")
         candidates, safe, band = _candidates(run, poses, shape, asked)
-        from mgs.run.suggest import suggest as suggested
-
         changes |= {"safe_distance": safe, "elevations": band, "refine": asked.refine}
         result = suggested(run, candidates, count, **changes)
         crossed = _crossed(run, result)
@@ -147,8 +145,6 @@ def suggest(
             cure = "so no flight plan is written; give flight.no_fly"
             raise InputError(f"suggest: {crossed}, {cure}")
         if out is not None:
-            from mgs.reports.suggestion import write_suggestion
-
             with atomic_folder(out, ours) as unfinished:
                 write_suggestion(unfinished, run, result)
         for path in plan or ():
@@ -159,10 +155,6 @@ def suggest(
 
 
 def _placed(photographs: Path, site: Path, console: Terminal) -> Path:
-    from mgs.data.on_site import dataset_at
-    from mgs.data.photographs import photographs_in
-    from mgs.prior.photographs import check_enough
-
     # Refuses minutes before pictures are placed.
     check_enough(len(photographs_in(photographs)), str(photographs))
     with progress_bar("reading", console):
@@ -174,8 +166,6 @@ def _placed(photographs: Path, site: Path, console: Terminal) -> Path:
 
 def _place(source: Path) -> Any:
     """Place of the world's origin, as the import of photographs with GPS wrote it; else None."""
-    from mgs.run.folder import holds_run, open_run
-
     root = open_run(source).settings.dataset if holds_run(source) else source
     if not (root / "transforms.json").is_file():  # which `load_dataset` says better
         return None
@@ -185,9 +175,6 @@ def _place(source: Path) -> Any:
 
 def _run(source: Path, scratch: Path, settings: dict[str, Any]) -> Run:
     """The run itself, or a new one in `scratch`, fitted to all images of a dataset."""
-    from mgs.run.folder import holds_run, open_run
-    from mgs.run.nbv import resume_nbv, start_run
-
     if holds_run(source):
         for name in ("prior", "gaussians"):
             if settings[name] is not None:
@@ -201,8 +188,6 @@ def _run(source: Path, scratch: Path, settings: dict[str, Any]) -> Run:
 def _shape(poses: Path | None, dome: int | None, asked: Candidates) -> tuple[str, int] | None:
     """Kind and number of the candidates that are asked for, if they are. Raises InputError where
     there are two kinds, too many, or no file of them: placing and fitting pictures takes long."""
-    from mgs.run.candidates import MOST_POSES
-
     shapes = not_none(dome=dome, ring=asked.ring, grid=asked.grid)
     if len(shapes) + (poses is not None) > 1:
         raise InputError("suggest: `poses`, `dome`, `ring`, `grid`: give one of them")
@@ -218,9 +203,6 @@ def _candidates(
     run: Run, poses: Path | None, shape: tuple[str, int] | None, asked: Candidates
 ) -> tuple[Sequence[Named], float, tuple[float, float] | None]:
     """Candidates, their least distance from the mesh, and their elevations."""
-    from mgs.data.meshes import distances_to_mesh
-    from mgs.run.candidates import Site, place_poses, read_poses
-
     site = Site(run.prior, run.taken[-1].camera, run.dataset.world)
     left = [frame for frame in run.dataset.frames if frame not in run.taken]
     safe, band = asked.safe_distance, asked.elevations
@@ -240,9 +222,6 @@ def _candidates(
 
 def _crossed(run: Run, result: Suggestion) -> str:
     """Say which leg crosses the object, if one does."""
-    from mgs.run.candidates import inside
-    from mgs.run.suggest import taken_in_order
-
     home = taken_in_order(run)[0].camera.position
     ends = [*(view.camera.position for view in result.plan), home]
     names = [*(view.name for view in result.plan), "the first image"]
@@ -257,8 +236,6 @@ def _crossed(run: Run, result: Suggestion) -> str:
 
 def _write_plan(path: Path, run: Run, result: Suggestion, place: Any, limits: FlightLimits) -> None:
     """Write a flight plan; home is on the ground under the first image."""
-    from mgs.run.suggest import taken_in_order
-
     home = taken_in_order(run)[0].camera.position
     ground = float(run.prior.mesh.vertices[:, 2].min())
     stops = [Stop(np.array([*home[:2], ground]))]
