@@ -12,6 +12,7 @@ import synthetic
 import tiny
 from PIL import Image
 from refusals import refused
+from test_recordings import halved
 
 from mgs.camera import look_at
 from mgs.data.clouds import SparseCloud, write_cloud
@@ -39,12 +40,7 @@ def text(name: str, content: str) -> Change:
 
 def truncate(name: str) -> Change:
     """Cut a file in half, as a full disk does."""
-
-    def apply(root: Path) -> None:
-        data = (root / name).read_bytes()
-        (root / name).write_bytes(data[: len(data) // 2])
-
-    return apply
+    return lambda root: halved(root / name)
 
 
 def remove(name: str) -> Change:

@@ -125,6 +125,15 @@ class Frame:
         return path
 
 
+def outlines_apart(mask: np.ndarray, body: np.ndarray, margin: int) -> float:
+    """Share of the pixels of two areas [H,W] where these disagree: outside the mask or inside it by
+    more than `margin` pixels."""
+    outside = ~binary_dilation(mask, iterations=margin)
+    inside = binary_erosion(mask, iterations=margin, border_value=1)
+    wrong = (body & outside) | (inside & ~body)
+    return float(wrong.sum() / max((mask | body).sum(), 1))
+
+
 def capture_record(frame: Frame) -> Path:
     """Path of the record of a frame's live capture; its image lies in ROOT/images."""
     return frame.image_path.parent.parent / CAPTURED / f"{frame.name}.json"

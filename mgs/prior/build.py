@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from plyfile import PlyData
-from scipy.ndimage import binary_dilation, binary_erosion
 
 from mgs.camera import Camera
 from mgs.data.clouds import SparseCloud, write_cloud
 from mgs.data.dataset import Dataset, load_dataset
-from mgs.data.frames import Frame, in_mask, visible
+from mgs.data.frames import Frame, in_mask, outlines_apart, visible
 from mgs.data.lens import shrunk_to
 from mgs.data.meshes import Mesh, distances_to_mesh, mesh_of, read_mesh
 from mgs.data.world import UPRIGHT, World, unit_up
@@ -308,10 +307,7 @@ def outline_error(mesh: Mesh, frames: Sequence[Frame]) -> float:
         report("comparing the surface with masks", k, len(frames))
         if frame.mask_path is None and frame.rock_path is None:
             continue
-        mask, silhouette = frame.mask(), depth(frame.camera) > 0
-        wrong = silhouette & ~binary_dilation(mask, iterations=2)
-        wrong |= binary_erosion(mask, iterations=2, border_value=1) & ~silhouette
-        errors.append(float(wrong.sum() / max((mask | silhouette).sum(), 1)))
+        errors.append(outlines_apart(frame.mask(), depth(frame.camera) > 0, 2))
     return float(np.median(errors)) if errors else math.nan
 
 

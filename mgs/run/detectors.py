@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_erosion
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
+from mgs.data.frames import outlines_apart
 from mgs.gaussians import Gaussians
 from mgs.metrics import MOST_BLUR
 
@@ -56,14 +56,9 @@ class ViewIndicators:
 def before_fit(mask: np.ndarray, alpha: np.ndarray, margin: int) -> Before:
     """Compare a view with the Gaussians before training.
 
-    mask: bool [H,W]. alpha: [H,W], drawn from 0.5 up. margin: pixels; a pixel disagrees where it is
-    drawn farther outside the mask, or not drawn farther inside."""
+    mask: bool [H,W]. alpha: [H,W], drawn from 0.5 up. margin: pixels, as in `outlines_apart`."""
     body = alpha >= 0.5
-    either = int((mask | body).sum())
-    outside = ~binary_dilation(mask, iterations=margin)
-    inside = binary_erosion(mask, iterations=margin, border_value=1)
-    wrong = int(((body & outside) | (inside & ~body)).sum())
-    return Before(wrong / max(either, 1), _distance(mask, body))
+    return Before(outlines_apart(mask, body, margin), _distance(mask, body))
 
 
 def _distance(one: np.ndarray, other: np.ndarray) -> float:
