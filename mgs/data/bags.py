@@ -12,6 +12,7 @@ import numpy as np
 
 from mgs.camera import Camera
 from mgs.data.lens import Lens
+from mgs.data.rgbd_folders import opencv_lens
 from mgs.data.shots import Shot, Source, Spacing, Track, posed, rigid
 from mgs.errors import InputError
 from mgs.files import atomic_path, parsing, read_bytes, reading
@@ -31,10 +32,8 @@ COLOURS = {  # encoding of a colour image -> its channels in the order R, G, B
 # Encoding of a depth image -> type of its numbers, and metres in a step (REP 118).
 DEPTHS = {"16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)}
 DEPTH_HEADER = 12  # bytes before the PNG of a compressedDepth image: a number; a and b as float32
-LENSES = {  # distortion model of a camera_info -> names of its first coefficients
-    **dict.fromkeys(("plumb_bob", "rational_polynomial", ""), ("k1", "k2", "p1", "p2", "k3")),
-    **dict.fromkeys(("equidistant", "fisheye"), ("k1", "k2", "k3", "k4")),
-}
+# Distortion models of a camera_info: those of `opencv_lens`, and fisheyes.
+LENSES, FISHEYES = ("plumb_bob", "rational_polynomial", ""), ("equidistant", "fisheye")
 
 YAML_BYTES = 1 << 20  # most bytes of the metadata of a bag
 UNMOVED = 1e-6  # change of all entries of a pose, up to which a camera does not move
@@ -240,25 +239,24 @@ def _lens(path: Path, reader: Any, topic: str) -> tuple[Any, Lens | None, str]:
     info, rectified = same[0], "rect" in topic.rpartition("/")[2] or "/image_rect" in topic
     K = np.asarray(getattr(info, "k", getattr(info, "K", None)), np.float64).reshape(3, 3).copy()
     D = np.asarray(getattr(info, "d", getattr(info, "D", None)), np.float64)
+    model, where = info.distortion_model, f"{path}: {topic}"
     if rectified:
         P = np.asarray(getattr(info, "p", getattr(info, "P", None)), np.float64)
-        K, D = P.reshape(3, 4)[:, :3].copy(), np.zeros(5)
-    names = LENSES.get(info.distortion_model, ())
-    if D.any() and (not names or len(D) > 8):
-        why = f"the lens of {topic} is {info.distortion_model}, which is not supported"
+        K, D, model = P.reshape(3, 4)[:, :3].copy(), np.zeros(5), ""
+    if D.any() and (model not in (*LENSES, *FISHEYES) or len(D) > 8):
+        why = f"the lens of {topic} is {model}, which is not supported"
         raise InputError(f"{path}: {why}; give the topic of its rectified images as `images`")
     K[:2, 2] += 0.5  # from pixel centres at whole numbers to ours
-    size, model, window = (int(info.width), int(info.height)), "FULL_OPENCV", info.roi
+    size, window = (int(info.width), int(info.height)), info.roi
     cut = size != (getattr(image, "width", 0), getattr(image, "height", 0))
     if cut and window.width and window.height:  # binning shows by the size of the images
         K[:2, 2] -= window.x_offset, window.y_offset
         size = int(window.width), int(window.height)
-    if len(names) == 4:
-        model = "OPENCV_FISHEYE"
+    if model in FISHEYES:
+        values = dict(zip(("k1", "k2", "k3", "k4"), D.tolist(), strict=False))
+        lens = Lens.of(where, "OPENCV_FISHEYE", K, values)
     else:
-        names = (*names, "k4", "k5", "k6")
-    values = dict(zip(names, D.tolist(), strict=False))
-    lens = None if rectified else Lens.of(f"{path}: {topic}", model, K, values)
+        lens = opencv_lens(where, K, D.tolist())
     return lambda pose: Camera(K, *size, pose), lens, frame_of(image)
 
 
