@@ -383,7 +383,7 @@ STUDY = Study(
     __doc__,
     write,
     SIZES,
-    lambda work: cells_of(work.size),
+    cells_of,
     {
         "--dir": {
             "type": Path,

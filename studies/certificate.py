@@ -319,9 +319,7 @@ def write(work: Work) -> list[Path]:
     return [*paths, work.out / "certificate.png"]
 
 
-STUDY = Study(
-    "certificate", __doc__, write, SIZES, lambda work: cells_of(work.size), ROCKS | WORKERS, sized
-)
+STUDY = Study("certificate", __doc__, write, SIZES, cells_of, ROCKS | WORKERS, sized)
 
 if __name__ == "__main__":
     study_of("certificate")()

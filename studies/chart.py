@@ -282,7 +282,7 @@ STUDY = Study(
     __doc__,
     write,
     SIZES,
-    lambda work: cells_of(work.size),
+    cells_of,
     {
         **ROCKS,
         "--dataset": {

@@ -117,9 +117,7 @@ def write(work: Work) -> list[Path]:
     return write_table(work, "couplings", rows, tables(rows))
 
 
-STUDY = Study(
-    "couplings", __doc__, write, SIZES, lambda work: cells_of(work.size), ROCKS | WORKERS, sized
-)
+STUDY = Study("couplings", __doc__, write, SIZES, cells_of, ROCKS | WORKERS, sized)
 
 if __name__ == "__main__":
     study_of("couplings")()

@@ -80,7 +80,7 @@ STUDY = replace(
     setups.STUDY,
     name="curves",
     about="Compare policies as `setups` does, for several numbers of images.",
-    cells=lambda work: cells_of(work.size),
+    cells=cells_of,
     write=write,
     options=ROCKS | WORKERS,
 )

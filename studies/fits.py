@@ -4,6 +4,7 @@ Fits to even views of rocks that chose nothing, judged on the test views and on 
 distances. The last rows have poses with noise, as given and refined (`mgs fit --refine-poses`).
 """
 
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,21 +19,13 @@ from mgs.learning import refine_poses
 from mgs.policy.criteria import PRIOR_STD
 from mgs.policy.poses import medoids
 from mgs.seeds import generator
+from studies import setups
 from studies.frame.case import ROCKS
 from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
 from studies.frame.program import WORKERS, Options, Study, Work, study_of
 from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
-from studies.setups import (
-    SETUPS,
-    SIZES,
-    SetupSize,
-    case_of,
-    shared_scene,
-    sized,
-    spiral_of,
-    views_of,
-)
+from studies.setups import SETUPS, SetupSize, case_of, shared_scene, spiral_of, views_of
 
 DEFAULT = "default"
 
@@ -91,9 +84,19 @@ VARIANT: Options = {
 }
 
 
-def cells_of(size: SetupSize, names: Sequence[str] | None = None) -> list[Cell]:
-    """Cells of every variant, or of those named, on every rock, with datasets and priors."""
-    variants = {n: v for n, v in VARIANTS.items() if n in (DEFAULT, *(names or VARIANTS))}
+@dataclass(frozen=True)
+class FitsSize(SetupSize):
+    """Size of the study. variants: beside the default; without any, all."""
+
+    variants: tuple[str, ...] = ()
+
+
+SIZES = {name: FitsSize(**vars(size)) for name, size in setups.SIZES.items()}
+
+
+def cells_of(size: FitsSize) -> list[Cell]:
+    """Cells of the variants on every rock, with datasets and priors."""
+    variants = {n: v for n, v in VARIANTS.items() if n in (DEFAULT, *(size.variants or VARIANTS))}
     cells: list[Cell] = []
     for rock in size.rocks:
         spiral = spiral_of(rock, size)
@@ -183,15 +186,13 @@ def write(work: Work) -> list[Path]:
     return [*write_table(work, "fits", rows, tables(rows)), path]
 
 
-STUDY = Study(
-    "fits",
-    __doc__,
-    write,
-    SIZES,
-    lambda work: cells_of(work.size, work.options.variant),
-    ROCKS | VARIANT | WORKERS,
-    sized,
-)
+def sized(size: FitsSize, options: Namespace) -> Any:
+    """Size with the options."""
+    changed: Any = setups.sized(size, options)
+    return replace(changed, variants=tuple(options.variant or ()))
+
+
+STUDY = Study("fits", __doc__, write, SIZES, cells_of, ROCKS | VARIANT | WORKERS, sized)
 
 if __name__ == "__main__":
     study_of("fits")()

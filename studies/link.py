@@ -106,9 +106,7 @@ def write(work: Work) -> list[Path]:
     return [*paths, work.out / "link.png"]
 
 
-STUDY = Study(
-    "link", __doc__, write, SIZES, lambda work: cells_of(work.size), ROCKS | WORKERS, sized
-)
+STUDY = Study("link", __doc__, write, SIZES, cells_of, ROCKS | WORKERS, sized)
 
 if __name__ == "__main__":
     study_of("link")()

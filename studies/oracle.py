@@ -37,10 +37,7 @@ STUDY = replace(
     name="oracle",
     about="Compare policies as `setups` does, with an oracle that chooses the view which raises "
     "the PSNR of the test views most: an upper bound for policies, which cannot see test views.",
-    cells=lambda work: [
-        *setups.cells_of(work.size),
-        *setups.cells_of(work.size, (setups.ORACLE,)),
-    ],
+    cells=lambda size: [*setups.cells_of(size), *setups.cells_of(size, (setups.ORACLE,))],
     sized=sized,
 )
 

@@ -177,9 +177,7 @@ def write(work: Work) -> list[Path]:
     return [*write_table(work, "paper", rows, tables(rows)), path]
 
 
-STUDY = Study(
-    "paper", __doc__, write, SIZES, lambda work: cells_of(work.size), ROCKS | WORKERS, sized
-)
+STUDY = Study("paper", __doc__, write, SIZES, cells_of, ROCKS | WORKERS, sized)
 
 if __name__ == "__main__":
     study_of("paper")()

@@ -206,9 +206,7 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     draw_panels(path, [panel], shown)
 
 
-STUDY = Study(
-    "parsimony", __doc__, write, SIZES, lambda work: cells_of(work.size), ROCKS | WORKERS, sized
-)
+STUDY = Study("parsimony", __doc__, write, SIZES, cells_of, ROCKS | WORKERS, sized)
 
 if __name__ == "__main__":
     study_of("parsimony")()

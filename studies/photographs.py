@@ -166,7 +166,7 @@ STUDY = Study(
     __doc__,
     write,
     SIZES,
-    lambda work: [cell for *_, cell in work.size.each()],
+    lambda size: [cell for *_, cell in size.each()],
     {
         "--dataset": {
             "action": "append",

@@ -20,7 +20,7 @@ STUDY = replace(
     setups.STUDY,
     name="pools",
     about="Compare policies as `setups` does, over five random pools with random seeds each.",
-    cells=lambda work: setups.cells_of(work.size, POLICIES, DRAWN),
+    cells=lambda size: setups.cells_of(size, POLICIES, DRAWN),
     options=ROCKS | WORKERS,
     write=lambda work: setups.write(work, "pools", work.cells),
 )

@@ -288,7 +288,7 @@ STUDY = Study(
         "quick": RateSize(Size(128, 96, 36, 16), (AUTO, 5000)),
         "full": RateSize(Size(320, 240, 36, 16), (AUTO, 30_000, 10_000, 3000)),
     },
-    lambda work: work.size.cells(),
+    RateSize.cells,
     ROCKS
     | {
         "--splat-transform": {

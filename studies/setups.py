@@ -487,15 +487,7 @@ def write(work: Work, name: str = "setups", cells: Sequence[Cell] | None = None)
     return [*paths, work.out / f"{name}.png", write_csv(work.out / f"{name}-leads.csv", leads)]
 
 
-STUDY = Study(
-    "setups",
-    __doc__,
-    write,
-    SIZES,
-    lambda work: cells_of(work.size),
-    ROCKS | CHOICES | WORKERS,
-    sized,
-)
+STUDY = Study("setups", __doc__, write, SIZES, cells_of, ROCKS | CHOICES | WORKERS, sized)
 
 if __name__ == "__main__":
     study_of("setups")()

@@ -345,9 +345,7 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
 
 IMAGES, PRIOR = "Faults of images", "Faults of the prior"
 
-STUDY = Study(
-    "stress", __doc__, write, SIZES, lambda work: cells_of(work.size), ROCKS | WORKERS, sized
-)
+STUDY = Study("stress", __doc__, write, SIZES, cells_of, ROCKS | WORKERS, sized)
 
 if __name__ == "__main__":
     study_of("stress")()

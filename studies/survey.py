@@ -11,7 +11,7 @@ STUDY = replace(
     setups.STUDY,
     name="survey",
     about="Compare policies as `setups` does, with the poses, depth and prior of `mgs survey`.",
-    cells=lambda work: setups.cells_of(work.size, setups=setups.SURVEYED),
+    cells=lambda size: setups.cells_of(size, setups=setups.SURVEYED),
     write=lambda work: setups.write(work, "survey", work.cells),
 )
 

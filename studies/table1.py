@@ -344,7 +344,7 @@ STUDY = Study(
     __doc__,
     write,
     SIZES,
-    lambda work: [cell for run in table_runs(work.size).values() for cell in run.cells()],
+    lambda size: [cell for run in table_runs(size).values() for cell in run.cells()],
     {
         "--batch": {
             "type": at_least(1),

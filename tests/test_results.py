@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from studies import all as every
-from studies import fits, setups
+from studies import fits
 from studies.frame.case import FRESH
 from studies.frame.output import read_rows, tables_of, write_csv
 from studies.frame.sweep import run_cells
@@ -44,7 +44,7 @@ def test_rows_made_anew_are_compared_with_those_of_their_rock(tmp_path):
 def test_two_rows_of_the_pages_are_those_of_this_commit(tmp_path):
     """Fits to 12 and to 4 even views of a fresh rock, from its rendering on. A change that moves
     them moves the pages: `make results`."""
-    size = replace(setups.SIZES["quick"], rocks=FRESH[:1])
+    size = replace(fits.SIZES["quick"], rocks=FRESH[:1])
     cells = {cell.name: cell for cell in fits.cells_of(size)}
     chosen = [
         cell

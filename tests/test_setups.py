@@ -137,7 +137,8 @@ def test_a_fit_with_changed_settings_is_compared_with_the_default(tmp_path, caps
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(fits, "VARIANTS", chosen)
         patched.setattr(fits, "POOLS", {"hemisphere": (4,)})
-        done(capsys, "fits", tmp_path, "--rocks", 1, sizes={"quick": replace(FEW, tests=4)})
+        size = fits.FitsSize(**vars(replace(FEW, tests=4)))
+        done(capsys, "fits", tmp_path, "--rocks", 1, sizes={"quick": size})
     rows = {row["variant"]: row for row in read_rows(tmp_path / "fits.csv")}
     assert tuple(rows) == variants
     assert rows["default"]["test_change"] == 0

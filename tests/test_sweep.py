@@ -57,8 +57,6 @@ def test_cells_come_after_those_they_need_and_are_done_once(tmp_path):
 
 def studies():
     """Cells of each study by its name, of every size."""
-    from studies.frame.program import Work
-
     for path in Path(program.__file__).parent.parent.glob("[!_]*.py"):
         if "STUDY = " not in path.read_text():
             continue
@@ -67,8 +65,7 @@ def studies():
             if study.name in ("photographs", "blender"):
                 continue  # their cells are of datasets that are given
             options = study.parser().parse_args(["OUT", "--scale", scale])
-            work = Work(options, "", study.sized(size, options))
-            yield study.name, study.cells(work)
+            yield study.name, study.cells(study.sized(size, options))
 
 
 def test_cells_of_a_study_have_one_name_each_and_all_they_need():

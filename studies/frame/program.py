@@ -57,7 +57,7 @@ WORKERS: Options = {
 
 @dataclass(frozen=True)
 class Work:
-    """A study with the options given: what `Study.cells` and `Study.write` read.
+    """A study with the options given, which `Study.write` reads.
 
     size: one of the sizes, after `Study.sized`. results: of the cells that are done.
     """
@@ -95,7 +95,7 @@ class Study:
     - about: text of --help. sizes: by the name of --scale; without any the program has neither OUT
       nor --scale, and no cells. options: further options.
     - sized(size, options): checks the options and changes the size by them.
-    - cells(work): what is to be done. write(work): writes the files from `work.results` and returns
+    - cells(size): what is to be done. write(work): writes the files from `work.results` and returns
       their paths; the Markdown files are printed.
     - growing: the files are also written before each cell, from the cells done alone by then.
     """
@@ -104,7 +104,7 @@ class Study:
     about: str
     write: Callable[[Work], list[Path]]
     sizes: Mapping[str, Any] = field(default_factory=dict)
-    cells: "Callable[[Work], list[Cell]]" = lambda work: []
+    cells: "Callable[[Any], list[Cell]]" = lambda size: []
     options: Options = field(default_factory=dict)
     sized: Callable[[Any, Namespace], Any] = lambda size, options: size
     growing: bool = False
@@ -156,7 +156,7 @@ class Study:
             raise InputError("--scheduler: has workers of its own; leave out --workers")
         size = self.sized(row_named(self.sizes, options.scale, "--scale"), options)
         work = replace(work, size=size)
-        cells = {cell.name: cell for cell in self.cells(work)}  # of one name: the same
+        cells = {cell.name: cell for cell in self.cells(size)}  # of one name: the same
         work = replace(work, cells=list(cells.values()))
         with _begun(work.out, options.scale):
             self.tell(self.write(replace(work, results=self._results(work))))
