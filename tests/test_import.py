@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from program import command, exit_code, output, python, said, stop_at
 from refusals import fails, listing, refused
+from scipy.ndimage import gaussian_filter
 
 from mgs import Frame
 from mgs.camera import Camera, look_at, opengl_from_opencv
@@ -628,3 +629,12 @@ def test_a_folder_of_something_else_keeps_its_temporary_files(many, tmp_path, ca
     (tmp_path / "out/deep").mkdir(parents=True)
     (tmp_path / "out/deep/.import.1073741824-01234567.part.json").touch()
     assert "is there already" in refused(capsys, [*many, tmp_path / "out"], tmp_path / "out")
+
+
+def test_an_import_names_a_blurred_image(dataset, tmp_path, capsys):
+    frame = dataset.frames[1]
+    write_png(frame.image_path, gaussian_filter(frame.rgb(), (2, 2, 0)))
+    command("import", dataset.root, "--out", tmp_path / "out")
+    assert f"frame {frame.name}: is blurred, by " in said(capsys)[1]
+    command("import", dataset.root, "--out", tmp_path / "left", "--exclude", frame.name)
+    assert "blurred" not in said(capsys)[1]

@@ -17,10 +17,12 @@ from mgs.cli.options import parse_up
 from mgs.cli.terminal import Terminal, progress_bar
 from mgs.data.agreement import MATCHED, Agreement, agreement
 from mgs.data.bags import is_bag
+from mgs.data.check import blur_problems
 from mgs.data.clouds import SparseCloud, write_cloud
 from mgs.data.colmap import models_in
 from mgs.data.dataset import Dataset
 from mgs.data.depth_beside import depth_files
+from mgs.data.frames import frame_blur
 from mgs.data.importers import RECORD, import_source, least_factor
 from mgs.data.meshes import GLTF
 from mgs.data.photographs import KIND as PHOTOGRAPHS
@@ -147,11 +149,12 @@ def import_data(
             refine = refine_poses and not record
             about = shots, larger, scratch, mesh is None, console if refine else None
             result, fit, cloud = _checked(result, *about)
+        advice = list(_advice(shots, result))
         if not record:
             write_json(out / RECORD, read_json(out / RECORD) | files)
     if mesh is not None and mesh.suffix.lower() in GLTF:
         console.print(f"{mesh}: turned from +Y up, as its format prescribes, to +Z up")
-    for note in [*shots.notes, *_advice(shots, result)]:
+    for note in [*shots.notes, *advice]:
         notes.print(f"mgs: {note}", soft_wrap=True)
     if fit and fit.problem:
         cure = "correct them, and import with --force"
@@ -312,6 +315,11 @@ def _advice(source: Source, result: Dataset) -> Iterator[str]:
     rims = [(mask[0], mask[-1], mask[:, 0], mask[:, -1]) for mask in masks]
     if masks and min(np.concatenate(rim).mean() for rim in rims) > WHITE_RIM:
         yield "the masks are white along their borders: only the object must be white in them"
+    blurs: dict[str, float] = {}
+    for done, frame in enumerate(result.frames):
+        report("looking for blur", done, len(result))
+        blurs[frame.name] = frame_blur(frame, frame.mask())
+    yield from blur_problems(blurs)
     stops = [value for shot in source.shots if (value := exif_exposure(shot.image)) is not None]
     if stops and max(stops) - min(stops) > EXPOSURE_DIFFERS:
         most = f"by up to {max(stops) - min(stops):.1f} stops between photographs"

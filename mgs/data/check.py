@@ -85,28 +85,28 @@ def check_dataset(dataset: Dataset) -> Check:
             "poses, intrinsics or depth follow another convention; "
             "poses must be OpenGL camera-to-world, depth z-depth in metres"
         )
-    problems.extend(_blur_problems(blurs))
+    problems.extend(blur_problems(blurs))
     problems.extend(_test_problems(dataset))
     low, high = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if ranges else (0.0, 0.0)
     share = float(np.mean(shares)) if shares else 0.0
     return Check(problems, share, (float(low), float(high)), median)
 
 
-def _blur_problems(blurs: Mapping[str, float]) -> Iterator[str]:
-    """Problems of images that are blurred by these pixels: one of all of them, or of each."""
-    soft = {name: value for name, value in blurs.items() if value > MOST_BLUR}
+def blur_problems(blurs: Mapping[str, float]) -> Iterator[str]:
+    """Yield a line for each image that is blurred, or one for all. blurs: `frame_blur` by name."""
     median = float(np.median(list(blurs.values()))) if blurs else 0.0
     if median > MOST_BLUR:
         yield (
             f"the images are blurred, by {median:.1f} pixels in the median; take them again, "
-            "sharp, or import them smaller (`--downscale`), by which they lose nothing"
+            "sharp, or import them smaller (`--downscale`), by which they lose little"
         )
         return
-    for name, value in soft.items():
-        yield (
-            f"frame {name}: is blurred, by {value:.1f} pixels (median {median:.1f}); take it "
-            f"again, or leave it out (`mgs import --exclude {name}`)"
-        )
+    for name, value in blurs.items():
+        if value > MOST_BLUR:
+            yield (
+                f"frame {name}: is blurred, by {value:.1f} pixels (median {median:.1f}); take it "
+                f"again, or leave it out (`mgs import --exclude {name}`)"
+            )
 
 
 def _test_problems(dataset: Dataset) -> Iterator[str]:

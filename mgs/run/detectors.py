@@ -213,8 +213,8 @@ DETECTORS: dict[str, Detector] = {
     "blur": Detector(
         MOST_BLUR,
         "the images are blurred by {value:.1f} pixels, that of the median view (limit "
-        "{limit:.2f}); take them again, sharp; if that is impossible, import them smaller "
-        "(`mgs import --downscale`), by which they lose nothing",
+        "{limit:.1f}); take them again, sharp; if that is impossible, import them smaller "
+        "(`mgs import --downscale`), by which they lose little",
     ),
     "prior": Detector(
         0.006,
