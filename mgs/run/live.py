@@ -24,7 +24,7 @@ import numpy as np
 from mgs.camera import Camera, heading_and_pitch, opengl_from_opencv
 from mgs.colour import srgb_from_linear
 from mgs.data.dataset import FILES, Dataset, intrinsics, load_dataset, read_records
-from mgs.data.frames import Frame, as_captured, capture_record
+from mgs.data.frames import Frame, as_captured, capture_record, frame_blur
 from mgs.data.importers import Silhouette, import_shot, silhouette_of
 from mgs.data.lens import Lens, fitted
 from mgs.data.shots import Shot
@@ -33,6 +33,7 @@ from mgs.data.world import World
 from mgs.errors import InputError, Notice
 from mgs.files import below, read_json, remove_file, write_json
 from mgs.images import read_rgba
+from mgs.metrics import MOST_BLUR
 from mgs.prior.build import Prior
 
 Transport = Callable[[Path, Path], None]
@@ -141,7 +142,7 @@ REACH = 0.25  # default of `Live.distance`, as a share of the distance to the ob
 DEPTH_UNIT = 1e-3  # metres in a step of a PNG depth image
 WHITE, MOST_WHITE = 254 / 255, 0.5  # least white sRGB value, most of the object that may be
 BLACK, MOST_BLACK = 2 / 255, 0.95  # the same of black. Shadows on the Moon are black
-MOST_BLUR = 0.6  # largest blur, 0 to 1, by Crete et al. (2007). Sharp pictures have 0.12 to 0.37
+REFUSED_BLUR = 2 * MOST_BLUR  # pixels; some lenses are never as sharp as MOST_BLUR
 
 
 @dataclass(frozen=True)
@@ -332,8 +333,6 @@ def _set_aside(out: Path) -> None:
 
 def check_photograph(frame: Frame) -> None:
     """Raises InputError where an image does not show the object, is black or white, or blurred."""
-    from skimage.measure import blur_effect
-
     mask, path = frame.mask(), frame.image_path.name
     if not mask.any():
         raise InputError(f"{path}: the object is not in the picture")
@@ -344,6 +343,5 @@ def check_photograph(frame: Frame) -> None:
     ):
         if share > most:
             raise InputError(f"{path}: {name}exposed, {100 * share:.0f} % of the object")
-    blur = float(blur_effect(grey)) if np.ptp(grey) > 0 else 0.0
-    if blur > MOST_BLUR:
-        raise InputError(f"{path}: blurred ({blur:.2f}, at most {MOST_BLUR})")
+    if (blur := frame_blur(frame, mask)) > REFUSED_BLUR:
+        raise InputError(f"{path}: blurred by {blur:.1f} pixels, more than {REFUSED_BLUR:.1f}")
