@@ -72,8 +72,8 @@ def blur(image: np.ndarray, counted: np.ndarray) -> float:
 def _differences(
     grey: np.ndarray, counted: np.ndarray, rows: int, columns: int
 ) -> tuple[float, float]:
-    """Sums of (c - a)^2 and (a - 2 b + c)^2 over all pixels a, b, c in a row, whose first lies in
-    the first STRIP rows. For a step of L pixels, I' = (c - a) / 2 L, I'' = (a - 2 b + c) / L^2."""
+    """Sums of (c - a)^2 and (a - 2 b + c)^2 over all a, b, c: three pixels in a line that starts in
+    the first STRIP rows. At a step of L pixels, I' = (c - a) / 2 L, I'' = (a - 2 b + c) / L^2."""
     height, width = len(grey[: STRIP + 2 * rows]) - 2 * rows, grey.shape[1] - 2 * abs(columns)
     if height <= 0 or width <= 0:
         return 0.0, 0.0
