@@ -6,7 +6,7 @@ images alone, without a prior, alpha or antialiasing; H sums the squared gradien
 loss. Where the paper says nothing (loss, rates, passes, scales) it is as in mgs.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -125,11 +125,8 @@ def run(root: Path, out: Path, dataset: str, prior: str, variant: str) -> dict[s
     policy: Policy = mgs.Paper() if variant in (OURS, DUMMY) else Letter()
     if variant == DEFAULT:
         policy = mgs.Directional()
-    state, gains = mgs.learn(scene, scene.seeds(SEEDS)), []
-    for _ in range(CHOICES):
-        view, gain = mgs.choose(scene, state, policy)
-        state = mgs.learn(scene, [*state.taken, view], state)
-        gains.append(gain)
+    steps = list(follow(scene, policy, CHOICES))
+    state, gains = steps[-1][0], [gain for _, gain in steps[1:]]
     comparable = variant != DEFAULT  # its scores are no gain by Eq. 7
     rises = sum(b > a for a, b in pairwise(gains))
     on_tests, on_pool = tests(state.gaussians), pool(state.gaussians)
@@ -141,6 +138,16 @@ def run(root: Path, out: Path, dataset: str, prior: str, variant: str) -> dict[s
         "last_gain": gains[-1] if comparable else None,
         "rises": rises if comparable else None,
     }
+
+
+def follow(scene: mgs.Scene, policy: Policy, count: int) -> Iterator[tuple[mgs.State, float]]:
+    """Yield the state after SEEDS, with the score 0, and after each of `count` choices its own."""
+    state = mgs.learn(scene, scene.seeds(SEEDS))
+    yield state, 0.0
+    for _ in range(count):
+        view, score = mgs.choose(scene, state, policy)
+        state = mgs.learn(scene, [*state.taken, view], state)
+        yield state, score
 
 
 def rows_of(work: Work) -> list[Row]:

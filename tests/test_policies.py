@@ -22,7 +22,10 @@ from mgs.splat import groups, reference
 from mgs.synth.orbit import orbit_positions
 from mgs.synth.scene_file import Orbit
 from studies import policies as studied
-from studies.paper import Letter
+from studies import ring
+from studies.frame.program import Work
+from studies.frame.sweep import Cell
+from studies.paper import LETTER, Letter
 
 LAM = criteria.regularisation(groups(0))
 N = 5
@@ -208,6 +211,21 @@ def test_the_papers_h_squares_the_gradient_of_the_training_loss(linear):
             assert found[row, column] == pytest.approx(slope, rel=2e-3, abs=1e-9)
     assert found.shape == (6, 11)
     assert (found > 1e-8).any()
+
+
+def test_rows_of_the_ring_count_rises_and_choices_that_observe_more():
+    result = {"score": [0.3, 0.1, 0.2, 0.1], "observed": [0.5, 0.6, 0.6, 0.6, 0.7]}
+    about = {"rock": "boulder-11", "scene": "boulder"}
+    cells = [Cell(name, "", about=about | {"variant": name}) for name in (LETTER, ring.GREEDY)]
+    work = Work(SimpleNamespace(), "", None, cells, {cell.name: result for cell in cells})
+    letter, greedy = ring.rows_of(work)
+    assert {key: letter[key] for key in ("first", "last", "rises", "useful")} == {
+        "first": 0.3, "last": 0.1, "rises": 1, "useful": 2,
+    }  # fmt: skip
+    assert letter["largest_rise"] == pytest.approx(0.1)
+    assert [letter["seen"], letter["seen_last"]] == pytest.approx([50, 70])
+    assert greedy["rises"] is None
+    assert greedy["useful"] == 2
 
 
 def test_visibility_baselines_prefer_the_other_side():

@@ -1,0 +1,119 @@
+"""The paper's figures 2 and 3: gain and coverage over fifty choices of the 100 views of a ring.
+
+Four even seeds, then one view at a time, by Eq. 7 or by coverage-greedy choice. To the letter is as
+in `studies.paper`, but what counts as observed (Eq. 9) is as in mgs.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mgs
+from mgs.policy.criteria import coverage
+from mgs.run.policies import Policy
+from studies.frame.case import ROCKS
+from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
+from studies.frame.program import WORKERS, Study, Work, study_of
+from studies.frame.statistics import Row
+from studies.frame.sweep import Cell
+from studies.paper import LETTER, OURS, Letter, follow, scene_of
+from studies.setups import RING, Setup, SetupSize, case_of, shared_scene, sized
+
+VIEWS, CHOICES = 100, 50
+
+SIZES = {"quick": SetupSize(96, 72), "paper": SetupSize(320, 240, 24, 16)}
+
+GREEDY = "coverage-greedy, to the letter"
+
+POLICIES: dict[str, Policy] = {LETTER: Letter(), OURS: mgs.Paper(), GREEDY: mgs.Coverage()}
+
+
+def cells_of(size: SetupSize) -> list[Cell]:
+    """A cell for each rock and policy, with datasets and priors."""
+    cells: list[Cell] = []
+    for rock in size.rocks:
+        case = case_of(rock, Setup(RING, VIEWS), size)
+        for k, variant in enumerate(POLICIES):
+            plain = {} if variant == OURS else {"backing": 0.0}
+            one, about = replace(case, settings={**case.settings, **plain}), {"variant": variant}
+            name, task = f"ring/{rock.name}/{k}", f"{__name__}:run"
+            cells += one.with_task(name, task, about=about, variant=variant)
+    return cells
+
+
+def run(root: Path, out: Path, dataset: str, prior: str, variant: str) -> dict[str, Any]:
+    """Task: choose CHOICES views. Returns "test" and "pool", PSNR of the last model on test views
+    and over all views, dB; "score" of each choice; and "observed", share of the Gaussians that the
+    views taken observe (Eq. 9), after the seeds and after each choice."""
+    whole, tests, pool = shared_scene(root / dataset, root / prior, None)
+    scene, scores, observed = scene_of(whole, variant), [], []
+    scene.__dict__["surface_lam"] = whole.surface_lam
+    for state, score in follow(scene, POLICIES[variant], CHOICES):
+        scores.append(score)
+        observed.append(coverage(state.surface, scene.surface_lam))
+    on_tests, on_pool = tests(state.gaussians), pool(state.gaussians)
+    return {
+        "test": float(on_tests["psnr"].mean()),
+        "pool": float(on_pool["psnr"].mean()),
+        "score": scores[1:],
+        "observed": observed,
+    }
+
+
+def rows_of(work: Work) -> list[Row]:
+    """A row for each rock and policy: "first" and "last" gain, "rises" and "largest_rise" between
+    neighbouring choices, all None for coverage-greedy choice; shares "seen" after the seeds and
+    "seen_last" at the end, in %; "useful", choices after which more is observed."""
+    rows = work.rows()
+    for row in rows:
+        gains, observed = row.pop("score"), row.pop("observed")
+        steps = np.diff(gains)
+        by_gain = {
+            "first": gains[0],
+            "last": gains[-1],
+            "rises": int((steps > 0).sum()),
+            "largest_rise": float(max(steps.max(), 0.0)),
+        }
+        row |= by_gain if row["variant"] != GREEDY else dict.fromkeys(by_gain)
+        row |= {"seen": 100 * observed[0], "seen_last": 100 * observed[-1]}
+        row["useful"] = sum(b > a for a, b in pairwise(observed))
+    return rows
+
+
+def tables(rows: Sequence[Row]) -> str:
+    """Table of the policies, means over scenes; some with 95 % intervals."""
+    columns: dict[str, Any] = {"4 + 50 of 100 views": "variant"}
+    columns |= {"all views (dB)": scene_mean("pool", ".2f")}
+    columns |= {"observed by the seeds (%)": scene_mean("seen", ".1f")}
+    columns |= {"choices that observe more": scene_mean("useful", ".1f")}
+    columns |= {"first gain": scene_mean("first", ".3f")}
+    columns |= {"last": scene_mean("last", ".4f")}
+    columns |= {"rises of 49": scene_mean("rises", ".1f")}
+    return table(columns, grouped(rows, "variant"))
+
+
+def write(work: Work) -> list[Path]:
+    """Write ring.csv, ring.json, ring.md and ring.png."""
+    rows, steps = rows_of(work), []
+    for row in work.rows():
+        gains = [None, *row["score"]] if row["variant"] != GREEDY else [None] * (CHOICES + 1)
+        for k, (gain, seen) in enumerate(zip(gains, row["observed"], strict=True)):
+            shown = {"choice": k, "seen": 100 * seen} | ({} if gain is None else {"gain": gain})
+            steps.append({"variant": row["variant"]} | shown)
+    panels = [
+        Panel("choice", "gain", "choice", "gain of the view taken (Eq. 7)", "variant"),
+        Panel("choice", "seen", "choice", "Gaussians observed (%)", "variant"),
+    ]
+    path = work.out / "ring.png"
+    draw_panels(path, panels, steps)
+    return [*write_table(work, "ring", rows, tables(rows), rocks=len(work.size.rocks)), path]
+
+
+STUDY = Study("ring", __doc__, write, SIZES, cells_of, ROCKS | WORKERS, sized)
+
+if __name__ == "__main__":
+    study_of("ring")()
