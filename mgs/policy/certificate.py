@@ -255,11 +255,12 @@ def greedy(criterion: Criterion, share: float, most: int | None = None) -> list[
     """Candidates by greedy choice, until they have `share` of the gain of all of them together.
 
     most: number of views after which it stops anyway."""
-    views, enough = list[int](), share * criterion.gain(range(criterion.candidates))
+    views, gain, enough = list[int](), 0.0, share * criterion.gain(range(criterion.candidates))
     while len(views) < (most or criterion.candidates):
         gains = criterion.added(views)
         gains[views] = -1
         views.append(int(gains.argmax()))
-        if criterion.gain(views) >= enough:
+        gain += gains[views[-1]]
+        if gain >= enough:
             break
     return views
