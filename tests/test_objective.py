@@ -11,9 +11,10 @@ from scipy.ndimage import correlate1d
 from splat.scenes import cameras_around
 
 from mgs import TrainSettings, fit_gaussians
-from mgs.colour import srgb_from_linear
+from mgs.colour import linear_from_pixels, srgb_from_linear
+from mgs.fit import objective as module
 from mgs.fit.losses import LOSSES, similarity
-from mgs.fit.objective import objective
+from mgs.fit.objective import as_target, objective
 from mgs.gaussians import Gaussians, learned
 from mgs.memory import padded
 from mgs.metrics import _similarity
@@ -205,3 +206,29 @@ def test_a_fit_has_the_loss_of_its_settings():
     found = fit_gaussians(model, [camera], [black], TrainSettings(passes=1))
     expected = slow_loss(drawn, 0 * drawn, np.ones_like(drawn)).mean()
     assert found.losses == pytest.approx([expected] * 2, rel=1e-4)
+
+
+@pytest.mark.parametrize(("linear", "alpha_weight"), [(True, 0.3), (False, 0.3), (False, 0.0)])
+def test_images_of_eight_bits_take_a_quarter_of_the_memory_for_the_same_fit(
+    monkeypatch, linear, alpha_weight
+):
+    model = replace(surface_gaussians(50), linear=linear)
+    cameras, rng = cameras_around(model, (0.3, 2.0), 24, 20), np.random.default_rng(0)
+    channels = 5 if alpha_weight else 4
+    pixels = [rng.integers(0, 256, (20, 24, channels), np.uint8) for _ in cameras]
+    shares = [image[..., 3:] / np.float32(255) for image in pixels]
+    targets = [
+        np.dstack([linear_from_pixels(image[..., :3]), share])
+        for image, share in zip(pixels, shares, strict=True)
+    ]
+    settings = TrainSettings(passes=2, alpha_weight=alpha_weight)
+    coded = fit_gaussians(model, cameras, targets, settings).gaussians
+    held = as_target(targets[0], linear, alpha_weight).nbytes
+    assert held == pixels[0].size
+    nearly = targets[0].copy()
+    nearly[3, 4, 0] += 1e-5 + nearly[3, 4, 0] * 1e-5
+    assert as_target(nearly, linear, alpha_weight).nbytes == 4 * held
+    monkeypatch.setattr(module, "_levels", lambda linear: np.full((2, 256), -1, np.float32))
+    plain = fit_gaussians(model, cameras, targets, settings).gaussians
+    for name in ("sh", "log_scales", "quats", "logit_opacities"):
+        assert np.array_equal(getattr(coded, name), getattr(plain, name)), name

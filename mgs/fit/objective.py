@@ -9,6 +9,7 @@ Alpha may be a fourth channel, whose squared differences count (sigma / sigma_al
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
@@ -17,7 +18,7 @@ import numpy as np
 
 from mgs import runtime
 from mgs.camera import Camera
-from mgs.colour import srgb_from_linear
+from mgs.colour import linear_from_pixels, srgb_from_linear
 from mgs.errors import InputError
 from mgs.fit.losses import Size, loss_named
 from mgs.gaussians import Gaussians, learned
@@ -28,6 +29,7 @@ from mgs.splat.projection import camera_array, project, projected
 from mgs.splat.recording import frozen, one_at_a_time
 from mgs.splat.rendering import composite_channels, splats_and_lists
 
+LEVELS = 256  # values of a pixel of 8 bits
 Vector = list[Any]  # of each array of `mgs.gaussians.learned`, a TensorXf of its shape
 
 
@@ -35,14 +37,20 @@ Vector = list[Any]  # of each array of `mgs.gaussians.learned`, a TensorXf of it
 class Target:
     """Target of a fit as the kernels take it."""
 
-    values: Any  # mi.Float [H*W*S], channels as in `mgs.fit.fitting.fit_gaussians`
+    values: Any  # mi.Float [H*W*S], channels as in `mgs.fit.fitting.fit_gaussians`; or mi.UInt8
     alpha_factor: Any  # of the differences in alpha, mi.Float [1]; None: not compared
     stored: int  # S, 3 to 5
+    levels: Any = None  # of `values` of 8 bits, mi.Float [512]: colours, then weights and alpha
 
     @property
     def channels(self) -> int:
         """Number C of channels that are compared: three colours, and alpha."""
         return 3 if self.alpha_factor is None else 4
+
+    @property
+    def recorded(self) -> tuple[int, ...]:
+        """What a recording holds as constants (`mgs.splat.recording.frozen`)."""
+        return self.stored, self.levels is None
 
     def __len__(self) -> int:
         """H*W*C, the number of values that are compared."""
@@ -51,14 +59,13 @@ class Target:
     @property
     def nbytes(self) -> int:
         """Memory held, bytes."""
-        return 4 * len(self.values)
+        return len(self.values) * (4 if self.levels is None else 1)
 
     @property
     def pixels(self) -> Any:
         """Values that are compared, mi.Float [H*W*C]."""
         pixel, channel = self._places()
-        channel = dr.select(channel == 3, 4, channel)
-        return dr.gather(mi.Float, self.values, pixel * self.stored + channel)
+        return self._at(pixel, dr.select(channel == 3, 4, channel))
 
     @property
     def weights(self) -> Any:
@@ -66,7 +73,7 @@ class Target:
         if self.stored == 3:
             return dr.full(mi.Float, 1, len(self))
         pixel, channel = self._places()
-        weight = dr.gather(mi.Float, self.values, pixel * self.stored + 3)
+        weight = self._at(pixel, mi.UInt32(3))
         if self.alpha_factor is None:
             return weight
         return weight * dr.select(channel == 3, self.alpha_factor, 1)
@@ -75,6 +82,13 @@ class Target:
         """Pixel and channel of each value that is compared, mi.UInt32 [H*W*C]."""
         index = dr.arange(mi.UInt32, len(self))
         return index // self.channels, index % self.channels
+
+    def _at(self, pixel: Any, channel: Any) -> Any:
+        value = dr.gather(type(self.values), self.values, pixel * self.stored + channel)
+        if self.levels is None:
+            return value
+        first = dr.select(channel < 3, mi.UInt32(0), LEVELS)
+        return dr.gather(mi.Float, self.levels, mi.UInt32(value) + first)
 
 
 @dataclass(frozen=True)
@@ -105,7 +119,7 @@ class View:
     @property
     def recorded_sizes(self) -> tuple[int, ...]:
         """Sizes that a recording holds as constants (`mgs.splat.recording.frozen`)."""
-        return len(self.lists.splat), len(self.lists.block), *self.size, self.target.stored
+        return len(self.lists.splat), len(self.lists.block), *self.size, *self.target.recorded
 
     def rendered(self, model: Gaussians, shift: Sequence[Any] = ()) -> Any:
         """Pixels of a model, TensorXf [H,W,C], differentiable. shift: x and y [N] of zeros, px, to
@@ -303,8 +317,9 @@ def _photo(
 
 
 def as_target(target: np.ndarray, linear: bool, alpha_weight: float) -> Target:
-    """A target of a fit [H,W,3 to 5] for Gaussians that are blended as linear RGB, or as sRGB.
-    Raises InputError if alpha has a weight and is missing."""
+    """A target of a fit [H,W,3 to 5] for Gaussians that are blended as linear RGB, or as sRGB. An
+    image of 8 bits is kept as that, with the same values in a quarter of the memory. Raises
+    InputError if alpha has a weight and is missing."""
     runtime.start()
     factor, channels = None, target.shape[-1]
     if alpha_weight:
@@ -314,9 +329,24 @@ def as_target(target: np.ndarray, linear: bool, alpha_weight: float) -> Target:
                 "alpha as the last"
             )
         factor = dr.opaque(mi.Float, float(np.sqrt(alpha_weight)))
-    if not linear:
-        target = padded(np.dstack([srgb_from_linear(target[..., :3]), target[..., 3:]]))
-    return Target(mi.Float(adopted(target).ravel()), factor, channels)
+    encoded = np.dstack([srgb_from_linear(target[..., :3]), target[..., 3:]])
+    values, levels = target if linear else padded(encoded), _levels(linear)
+    bits = np.rint(np.clip(encoded, 0, 1) * (LEVELS - 1)).astype(np.uint8)
+    if all(
+        np.array_equal(some[bits[..., k]], values[..., k])
+        for k, some in enumerate(levels[[0, 0, 0, 1, 1][:channels]])
+    ):
+        of_bits = mi.UInt8(padded(bits, np.uint8).ravel())
+        return Target(of_bits, factor, channels, mi.Float(padded(levels).ravel()))
+    return Target(mi.Float(adopted(values).ravel()), factor, channels)
+
+
+@lru_cache(2)
+def _levels(linear: bool) -> np.ndarray:
+    """Values of the 256 levels of a colour, linear RGB or sRGB, and of a weight [2,256]."""
+    colours = linear_from_pixels(np.arange(LEVELS, dtype=np.uint8))
+    weights = np.arange(LEVELS, dtype=np.float32) / (LEVELS - 1)
+    return np.array([colours if linear else srgb_from_linear(colours), weights], np.float32)
 
 
 @one_at_a_time
@@ -326,7 +356,7 @@ def _rendered(model: Gaussians, photo: Photo, cache: ListCache) -> Any:
     return composite_channels(splats, packed, lists, *photo.size).array
 
 
-@frozen(lambda error, image, target, size, linear: (error, *size, target.stored, linear))
+@frozen(lambda error, image, target, size, linear: (error, *size, *target.recorded, linear))
 def _errors(error: str, image: Any, target: Target, size: Size, linear: bool) -> Any:
     """Loss `error` of each pixel value of a render, Float [H*W*C]."""
     return loss_named(error)(image, target.pixels, target.weights, size, linear)
