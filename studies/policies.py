@@ -8,7 +8,9 @@ import numpy as np
 import mgs
 from mgs.colour import SH_C0
 from mgs.data.frames import in_image
+from mgs.evaluation import psnr_measure
 from mgs.gaussians import sh_from_rgb
+from mgs.learning import fit_views
 from mgs.policy import criteria
 from mgs.policy.criteria import Array
 from mgs.policy.poses import angles
@@ -303,3 +305,22 @@ def gavis_like(scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarr
         return float(0.5 * np.log1p(ratio * unseen.clip(0)).sum())
 
     return each(views, gain)
+
+
+# --- Upper bound ----------------------------------------------------------------------------------
+
+
+class Oracle:
+    """Sees the truth: fits to every candidate, and scores it by mean PSNR over the test views, dB.
+
+    It reads the images of all candidates, so it is no policy. It is greedy, so better choices may
+    exist."""
+
+    name, needs_fit = "oracle", True
+
+    def __init__(self, tests: mgs.Dataset) -> None:
+        self.measure = psnr_measure(tests, mgs.ListCache())
+
+    def __call__(self, scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
+        fits = (fit_views(scene, state.frames, (*state.taken, view), state)[0] for view in views)
+        return np.array([self.measure(fit.gaussians, [])["psnr"] for fit in fits])

@@ -40,6 +40,7 @@ from studies.frame.output import (
 from studies.frame.program import WORKERS, Options, Study, Work, at_least, study_of
 from studies.frame.statistics import Row, holm, interval, permutation_p
 from studies.frame.sweep import Cell, results_so_far
+from studies.policies import Oracle
 
 Results = Mapping[str, Mapping[str, Any]]
 """Results of cells by name."""
@@ -259,7 +260,9 @@ def choose_and_judge(
     further = views_of(root / spiral)
     scene = shared.with_seed(seed)
     mission = mgs.Mission(**{k: v for k, v in settings.items() if k not in ("policy", "seed")})
-    policy = policy_file.policy_of(name) if name != ORACLE else _oracle(shared)
+    policy = (
+        Oracle(test_views_of(shared.dataset)) if name == ORACLE else policy_file.policy_of(name)
+    )
     start = _after_seeds if policy.needs_fit else before_any_fit
     count = mission.seeds
     state = start(shared, tuple(range(count) if drawn else shared.seeds(count)))
@@ -295,12 +298,6 @@ def choose_views(
         else:
             state = with_view(scene, state, view, unused)
     return state, seconds
-
-
-def _oracle(scene: mgs.Scene) -> Any:
-    from studies.oracle import Oracle  # which imports this module
-
-    return Oracle(test_views_of(scene.dataset))
 
 
 Measure = Callable[..., dict[str, np.ndarray]]
