@@ -31,6 +31,7 @@ STAGES = {
     "henge": ("pools", "--scene", "henge"),
     "oracle": ("oracle", "--rocks", "1"),
     "paper": ("paper", "--rocks", "8"),
+    "ring": ("ring", "--rocks", "6"),
     "table1": ("table1",),
     "couplings": ("couplings", "--rocks", "6"),
     "flights": ("flights", "--rocks", "8"),
@@ -47,10 +48,10 @@ are run by hand: `studies.rate`, `studies.blender` and `studies.photographs`."""
 QUICK = {
     name: (*arguments[: arguments.index("--rocks") + 1], "1")
     for name, arguments in STAGES.items()
-    if "--rocks" in arguments and name not in ("curves", "oracle")
+    if "--rocks" in arguments and name not in ("curves", "oracle", "ring")
 }
-"""Each study with --rocks, for the first; curves repeats two set-ups with other numbers of images,
-and oracle has one rock anyway."""
+"""Each study with --rocks, for the first; curves and ring repeat others with other numbers of
+images, and oracle has one rock anyway."""
 
 ENOUGH = 0.05
 """Largest difference of a number, in its unit. Processors of another type round differently: with 8

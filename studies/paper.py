@@ -27,6 +27,8 @@ from studies.setups import SETUPS, SIZES, SetupSize, case_of, shared_scene, size
 SEEDS, CHOICES = 4, 8
 
 LETTER, OURS, DEFAULT = "to the letter", "`paper` of mgs", "default of mgs"
+EXACT = "`d-optimal` of mgs"
+OF_MGS = OURS, DEFAULT, EXACT
 
 FREE = 1e3
 """Factor on the standard deviations of the prior, with which it has no effect on a fit."""
@@ -86,7 +88,7 @@ class SeedColours(mgs.Scene):
 
 def scene_of(whole: mgs.Scene, variant: str) -> mgs.Scene:
     """The scene of a variant. whole: with the prior of the variant and settings of mgs."""
-    if variant in (OURS, DEFAULT):
+    if variant in OF_MGS:
         return whole
     ours, model = whole.settings, {}
     train: dict[str, Any] = {"optimiser": "adam", "antialiased": False, "alpha_weight": 0.0}
@@ -109,7 +111,7 @@ def cells_of(size: SetupSize) -> list[Cell]:
     for rock in size.rocks:
         plain = case_of(rock, SETUPS["ring"], size)
         for k, variant in enumerate(VARIANTS):
-            backed = variant in (BACKING, OURS, DEFAULT)
+            backed = variant in (BACKING, *OF_MGS)
             settings = plain.settings if backed else {**plain.settings, "backing": 0.0}
             case = replace(plain, settings=settings)
             label = f"paper/{rock.name}/{k}"
@@ -140,9 +142,11 @@ def run(root: Path, out: Path, dataset: str, prior: str, variant: str) -> dict[s
     }
 
 
-def follow(scene: mgs.Scene, policy: Policy, count: int) -> Iterator[tuple[mgs.State, float]]:
-    """Yield the state after SEEDS, with the score 0, and after each of `count` choices its own."""
-    state = mgs.learn(scene, scene.seeds(SEEDS))
+def follow(
+    scene: mgs.Scene, policy: Policy, count: int, seeds: int = SEEDS
+) -> Iterator[tuple[mgs.State, float]]:
+    """Yield the state after the seeds, with the score 0, and after each choice with its own."""
+    state = mgs.learn(scene, scene.seeds(seeds))
     yield state, 0.0
     for _ in range(count):
         view, score = mgs.choose(scene, state, policy)

@@ -1,7 +1,8 @@
 """The paper's figures 2 and 3: gain and coverage over fifty choices of the 100 views of a ring.
 
-Four even seeds, then one view at a time, by Eq. 7 or by coverage-greedy choice. To the letter is as
-in `studies.paper`, but what counts as observed (Eq. 9) is as in mgs.
+Four even seeds, then one view at a time, by Eq. 7 or by coverage-greedy choice; and one seed, by
+which Eq. 13 is tested. To the letter is as in `studies.paper`, but what counts as observed (Eq. 9)
+is as in mgs.
 """
 
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table,
 from studies.frame.program import WORKERS, Study, Work, study_of
 from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
-from studies.paper import LETTER, OURS, Letter, follow, scene_of
+from studies.paper import DEFAULT, EXACT, LETTER, OF_MGS, OURS, Letter, follow, scene_of
 from studies.setups import RING, Setup, SetupSize, case_of, shared_scene, sized
 
 VIEWS, CHOICES = 100, 50
@@ -31,17 +32,23 @@ GREEDY = "coverage-greedy, to the letter"
 
 POLICIES: dict[str, Policy] = {LETTER: Letter(), OURS: mgs.Paper(), GREEDY: mgs.Coverage()}
 
+POLICIES_FROM_ONE: dict[str, Policy] = {
+    LETTER: Letter(), OURS: mgs.Paper(), EXACT: mgs.DOptimal(), DEFAULT: mgs.Directional(),
+}  # fmt: skip
+
 
 def cells_of(size: SetupSize) -> list[Cell]:
     """A cell for each rock and policy, with datasets and priors."""
     cells: list[Cell] = []
     for rock in size.rocks:
         case = case_of(rock, Setup(RING, VIEWS), size)
-        for k, variant in enumerate(POLICIES):
-            plain = {} if variant == OURS else {"backing": 0.0}
-            one, about = replace(case, settings={**case.settings, **plain}), {"variant": variant}
-            name, task = f"ring/{rock.name}/{k}", f"{__name__}:run"
-            cells += one.with_task(name, task, about=about, variant=variant)
+        for seeds, policies in ((4, POLICIES), (1, POLICIES_FROM_ONE)):
+            task, end = ("run", "") if seeds == 4 else ("run_from_one", "-one")
+            for k, variant in enumerate(policies):
+                plain = {} if variant in OF_MGS else {"backing": 0.0}
+                one = replace(case, settings={**case.settings, **plain})
+                name, about = f"ring/{rock.name}/{k}{end}", {"variant": variant, "seeds": seeds}
+                cells += one.with_task(name, f"{__name__}:{task}", about=about, variant=variant)
     return cells
 
 
@@ -64,12 +71,33 @@ def run(root: Path, out: Path, dataset: str, prior: str, variant: str) -> dict[s
     }
 
 
+def run_from_one(root: Path, out: Path, dataset: str, prior: str, variant: str) -> dict[str, float]:
+    """Task: choose three views after one seed. Returns "opposite", score of the view opposite to
+    the seed over the mean of its two neighbours'; "apart", degrees between the seed and the first
+    choice; and "seen" as `rows_of`, of these four views."""
+    whole = shared_scene(root / dataset, root / prior, None)[0]
+    scene, policy = scene_of(whole, variant), POLICIES_FROM_ONE[variant]
+    scene.__dict__["surface_lam"] = whole.surface_lam
+    states = [state for state, _ in follow(scene, policy, 3, seeds=1)]
+    seed, first = states[-1].taken[:2]
+    opposite, *beside = policy(scene, states[0], [(seed + k) % VIEWS for k in (VIEWS // 2, 1, -1)])
+    steps = abs(first - seed)
+    return {
+        "opposite": float(opposite / np.mean(beside)),
+        "apart": 360 / VIEWS * min(steps, VIEWS - steps),
+        "seen": 100 * coverage(states[-1].surface, scene.surface_lam),
+    }
+
+
 def rows_of(work: Work) -> list[Row]:
-    """A row for each rock and policy: "first" and "last" gain, "rises" and "largest_rise" between
-    neighbouring choices, all None for coverage-greedy choice; shares "seen" after the seeds and
-    "seen_last" at the end, in %; "useful", choices after which more is observed."""
+    """A row for each rock, policy and number of seeds. From four: "first" and "last" gain, "rises"
+    and "largest_rise" between neighbouring choices, all None for coverage-greedy choice; shares
+    "seen" after the seeds and "seen_last" at the end, in %; "useful", choices after which more is
+    observed."""
     rows = work.rows()
     for row in rows:
+        if row["seeds"] == 1:
+            continue
         gains, observed = row.pop("score"), row.pop("observed")
         steps = np.diff(gains)
         by_gain = {
@@ -85,7 +113,7 @@ def rows_of(work: Work) -> list[Row]:
 
 
 def tables(rows: Sequence[Row]) -> str:
-    """Table of the policies, means over scenes; some with 95 % intervals."""
+    """Tables of the policies from four seeds and from one, means over scenes with intervals."""
     columns: dict[str, Any] = {"4 + 50 of 100 views": "variant"}
     columns |= {"all views (dB)": scene_mean("pool", ".2f")}
     columns |= {"observed by the seeds (%)": scene_mean("seen", ".1f")}
@@ -93,13 +121,19 @@ def tables(rows: Sequence[Row]) -> str:
     columns |= {"first gain": scene_mean("first", ".3f")}
     columns |= {"last": scene_mean("last", ".4f")}
     columns |= {"rises of 49": scene_mean("rises", ".1f")}
-    return table(columns, grouped(rows, "variant"))
+    one: dict[str, Any] = {"1 + 3 of 100 views": "variant"}
+    one |= {"opposite view's score over a neighbour's": scene_mean("opposite", ".1f")}
+    one |= {"first choice, degrees from the seed": scene_mean("apart", ".0f")}
+    one |= {"observed by the four (%)": scene_mean("seen", ".1f")}
+    parts = [[row for row in rows if row["seeds"] == count] for count in (4, 1)]
+    pairs = zip((columns, one), parts, strict=True)
+    return "\n".join(table(heads, grouped(part, "variant")) for heads, part in pairs)
 
 
 def write(work: Work) -> list[Path]:
     """Write ring.csv, ring.json, ring.md and ring.png."""
     rows, steps = rows_of(work), []
-    for row in work.rows():
+    for row in (row for row in work.rows() if row["seeds"] > 1):
         gains = [None, *row["score"]] if row["variant"] != GREEDY else [None] * (CHOICES + 1)
         for k, (gain, seen) in enumerate(zip(gains, row["observed"], strict=True)):
             shown = {"choice": k, "seen": 100 * seen} | ({} if gain is None else {"gain": gain})

@@ -215,7 +215,7 @@ def test_the_papers_h_squares_the_gradient_of_the_training_loss(linear):
 
 def test_rows_of_the_ring_count_rises_and_choices_that_observe_more():
     result = {"score": [0.3, 0.1, 0.2, 0.1], "observed": [0.5, 0.6, 0.6, 0.6, 0.7]}
-    about = {"rock": "boulder-11", "scene": "boulder"}
+    about = {"rock": "boulder-11", "scene": "boulder", "seeds": 4}
     cells = [Cell(name, "", about=about | {"variant": name}) for name in (LETTER, ring.GREEDY)]
     work = Work(SimpleNamespace(), "", None, cells, {cell.name: result for cell in cells})
     letter, greedy = ring.rows_of(work)
