@@ -95,26 +95,26 @@ def test_a_wrong_focal_length_is_named(frames, tmp_path):
 ARCH = [([-0.4, 0, 0.25], [0.15, 0.2, 0.35]), ([0.5, 0.1, 0.3], [0.2, 0.1, 0.4])]
 
 
-@pytest.mark.parametrize("name", [*MISTAKES][:3])
 @pytest.mark.parametrize("evidence", ["depth", "outlines", "directions"])
-def test_without_matches_others_tell(tmp_path, evidence, name):
+def test_without_matches_others_tell(tmp_path, evidence):
     """Pictures of little texture, where cameras are far apart."""
-    depth, folder = evidence == "depth", tmp_path / "matches"
     rocks = [(np.array(c), np.array(a)) for c, a in ARCH]
-    frames = synthetic.write_dataset(tmp_path, None, rocks, depth=depth).frames
+    frames = synthetic.write_dataset(tmp_path, None, rocks, depth=evidence == "depth").frames
     if evidence == "directions":
         frames = [replace(frame, mask_path=None) for frame in frames]
-    right, found = agreement(frames, folder), agreement(wrong(frames, MISTAKES[name]), folder)
-    assert evidence in found.evidence
-    assert name in found.problem
+    right = agreement(frames, tmp_path / "matches")
     assert right is None or (right.error < 1 and not right.problem)
     assert (right is None) == (evidence == "directions")
+    for name in [*MISTAKES][:3]:
+        found = agreement(wrong(frames, MISTAKES[name]), tmp_path / "matches")
+        assert evidence in found.evidence
+        assert name in found.problem
 
 
 @pytest.mark.parametrize("rocks", [ARCH, [([0, 0, 0.3], [0.5, 0.4, 0.2])]])
 def test_masks_tell_shuffled_pictures(tmp_path, rocks):
     rocks = [(np.array(c), np.array(a)) for c, a in rocks]
-    cameras = synthetic.orbit_cameras(9, 160, 120) + synthetic.orbit_cameras(5, 160, 120, 2.0, 2.5)
+    cameras = synthetic.orbit_cameras(9, 96, 72) + synthetic.orbit_cameras(5, 96, 72, 2.0, 2.5)
     frames = synthetic.write_dataset(tmp_path, cameras, rocks, depth=False).frames
     order = np.random.default_rng(7).permutation(len(frames))
     shuffled = [replace(f, camera=frames[k].camera) for f, k in zip(frames, order, strict=True)]
@@ -155,7 +155,7 @@ def test_poses_of_other_pictures_are_noticed_and_said(frames, tmp_path, capsys):
 
 @pytest.mark.parametrize("depth", [True, False])
 def test_errors_are_in_pixels_of_either_side(tmp_path, depth):
-    cameras, errors = synthetic.orbit_cameras(8, 160, 120), []
+    cameras, errors = synthetic.orbit_cameras(8, 80, 60), []
     for across in (True, False):
         root, several = tmp_path / f"{across}", synthetic.halved(cameras, across)
         frames = synthetic.write_dataset(root, several, depth=depth).frames

@@ -222,6 +222,18 @@ ROWS: dict[tuple[Change, str], list[tuple[str, Change]]] = {
         ("without cameras.bin and images.bin", model_without("images", "cameras")),
     ],
     (synthetic.write_dataset, "import {d}/images --out {out}"): [("can be placed", nothing)],
+    **{
+        (synthetic.write_dataset, f"import {{d}}/{words} --out {{out}}"): [(said, nothing)]
+        for words, said in {
+            " --pose /slam": "is no ROS bag, so it has no topic /slam; leave out --pose",
+            "images --pose /slam": "is no ROS bag, so it has no topic /slam; leave out --pose",
+            "images --refine-poses": "its pictures come without poses",
+            " --keyframes 2s": "is no recording or video, and all images are taken; leave out",
+        }.items()
+    },
+    (synthetic.write_dataset, "import {d}/film.mp4 --out {out} --refine-poses"): [
+        ("its pictures come without poses", text("film.mp4", ""))
+    ],
     (synthetic.write_dataset, "import {d}/images --out {d}/images/e/f"): [
         ("images: the output would lie among its photographs", nothing)
     ],

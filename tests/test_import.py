@@ -333,24 +333,6 @@ def test_what_is_missing_is_skipped_and_said(dataset, tmp_path, capsys):
     assert not (tmp_path / "copy/sparse.ply").exists()
 
 
-def test_a_topic_of_poses_is_refused_where_there_is_no_bag(dataset, tmp_path, capsys):
-    for source in (dataset.root, dataset.root / "images"):
-        line = refused(capsys, ["import", source, "--out", tmp_path / "out", "--pose", "/slam"])
-        assert "is no ROS bag, so it has no topic /slam; leave out --pose" in line
-
-
-def test_poses_to_refine_are_refused_where_there_are_none(dataset, tmp_path, capsys):
-    (tmp_path / "film.mp4").touch()
-    for source in (dataset.root / "images", tmp_path / "film.mp4"):
-        line = refused(capsys, ["import", source, "--out", tmp_path / "out", "--refine-poses"])
-        assert "its pictures come without poses" in line
-
-
-def test_keyframes_are_refused_where_there_is_no_recording(dataset, tmp_path, capsys):
-    line = refused(capsys, ["import", dataset.root, "--out", tmp_path / "out", "--keyframes", "2s"])
-    assert "is no recording or video, and all images are taken; leave out --keyframes" in line
-
-
 def test_images_are_excluded_by_name(dataset, tmp_path, capsys):
     names = [frame.name for frame in dataset.frames]
     given = ["import", dataset.root, "--exclude", f"images/{names[2]}.png"]

@@ -16,7 +16,7 @@ import tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from program import change_settings, steps, timeless
+from program import steps, timeless
 from refusals import fails
 from tiny import resume, run
 
@@ -220,16 +220,6 @@ def test_a_policy_that_returns_no_number_is_named(loaded, tmp_path, monkeypatch,
     monkeypatch.setitem(policies.POLICIES, "mine", mine)
     fails("policy mine: .*NaN or infinite", run, tmp_path / "run", loaded, policy="mine")
     assert len(steps(tmp_path / "run")) == 1
-
-
-def test_a_run_of_other_frames_or_without_settings_is_named(loaded, tmp_path):
-    out = tmp_path / "run"
-    run(out, loaded, budget=0)
-    other = tiny.write_dataset(tmp_path / "other", frames=5)
-    change_settings(out, dataset=str(other))
-    fails("frames differ", getattr, run_folder.open_run(out), "dataset")
-    (out / "config.json").write_text("{}")
-    fails(r"is damaged \(settings: ", run_folder.open_run, out)
 
 
 def test_a_step_is_a_view_and_the_last_of_a_batch_has_its_fit(loaded, tmp_path):

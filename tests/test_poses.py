@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import synthetic
-from program import command, exit_code, said
+from program import command, said
 from splat.scenes import calm, make_camera, make_clamped, relative_error
 
 from mgs import read_ply
@@ -94,11 +94,10 @@ def test_the_command_refines_the_poses_of_a_run(tmp_path, coarse_priors, capsys)
         assert np.allclose(one.world_to_camera, other.world_to_camera)
 
 
-@pytest.mark.parametrize("density", ["fixed", "split"])
-def test_a_refinement_with_free_means_is_bitwise_the_same_again(tmp_path, coarse_priors, density):
+def test_a_refinement_with_free_means_is_bitwise_the_same_again(tmp_path, coarse_priors):
     write_noisy(tmp_path / "data", synthetic.orbit_cameras(5, 32, 24))
     fit = ["fit", tmp_path / "data", "--gaussians", 100, "--passes", 2, "--means", "free"]
-    fit += ["--refine-poses", "--set", f"train.density={density}"]
+    fit += ["--refine-poses", "--set", "train.density=split"]
     files = "gaussians.ply", "poses.json", "dataset/transforms.json"
     found = []
     for out in (tmp_path / "once", tmp_path / "again"):
@@ -106,12 +105,7 @@ def test_a_refinement_with_free_means_is_bitwise_the_same_again(tmp_path, coarse
         found.append([(out / file).read_bytes() for file in files if (out / file).exists()])
     assert len(found[0]) > 1
     assert found[0] == found[1]
-    assert (len(read_ply(tmp_path / "once/gaussians.ply")) > 100) == (density == "split")
-
-
-def test_poses_are_refined_where_all_images_are_there(tmp_path):
-    data = synthetic.orbit(tmp_path / "data", 8, 32, 24)
-    assert exit_code("nbv", data.root, "--out", tmp_path / "run", "--set", "refine_poses=true") == 2
+    assert len(read_ply(tmp_path / "once/gaussians.ply")) > 100
 
 
 def test_refined_poses_keep_the_points(tmp_path):

@@ -131,11 +131,11 @@ def test_two_workers_of_which_one_is_killed_find_silently_what_a_serial_run_find
 
 @pytest.fixture(scope="module")
 def scheduler():
-    """Address of a Dask scheduler with two worker processes."""
+    """Address of a Dask scheduler with one worker process, of which each imports for seconds."""
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0}),
         LocalCluster(
-            n_workers=2, threads_per_worker=1, host="127.0.0.1", memory_limit=0,
+            n_workers=1, threads_per_worker=1, host="127.0.0.1", memory_limit=0,
             dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL + 1,
         ) as cluster,
     ):  # fmt: skip
