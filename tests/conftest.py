@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from mgs import runtime
+from mgs import plotting, runtime
 from mgs.cli import terminal
 
 if WORKER := os.environ.get("PYTEST_XDIST_WORKER"):
@@ -23,6 +23,18 @@ terminal.SECONDS_BETWEEN = float("inf")  # a busy machine would print lines of p
 # No deadline: the machine may be busy, and a first call loads libraries.
 settings.register_profile("mgs", deadline=None)
 settings.load_profile("mgs")
+
+NEW_FIGURE = plotting.new_figure
+
+
+def plain_figure(width, height, dpi=0):
+    """A small figure, in which nothing is moved to fit: that takes most of the time to draw one."""
+    from matplotlib.figure import Figure
+
+    return Figure((width, height), 20)
+
+
+plotting.new_figure = plain_figure
 
 import tiny  # noqa: E402
 
@@ -107,7 +119,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def features_once():
-    """Features of the same PNG are extracted once, since that takes most of a matcher's seconds."""
+    """Few features, and those of the same PNG once: they take most of a matcher's seconds."""
     import pycolmap
 
     extract, found = pycolmap.extract_features, {}
@@ -130,21 +142,23 @@ def features_once():
 
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(pycolmap, "extract_features", once)
+        patched.setattr("mgs.data.structure.FEATURES", 600)
         yield
 
 
 @pytest.fixture(scope="module")
 def coarse_arena():
-    """Ground of few vertices and texels, and one stone in place of 16, since they are most of a
-    scene's cost."""
+    """Ground of few vertices and texels, one stone in place of 16, and noise of few samples, since
+    they are most of a scene's cost."""
     import numpy as np
 
-    from mgs.synth import arena
+    from mgs.synth import arena, rock
 
     stone = arena._stone(arena.Noise(np.random.default_rng(0)), 0.08)
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(arena, "ROWS", 60)
         patched.setattr(arena, "TEXELS", 64)
+        patched.setattr(rock, "LATTICE", 48)
         patched.setattr(arena, "_stone", lambda *_: stone)
         yield
 
@@ -174,19 +188,15 @@ def coarse_priors():
         # pymeshlab's grid is full down to a depth of 5.
         patched.setattr(surface, "POISSON_DEPTHS", (4, 4))
         patched.setattr(surface, "CUBES", ((1, 0), (2, 0)))
+        patched.setattr(surface, "TRUTH_SAMPLES", 2000)
         yield
 
 
 @pytest.fixture
-def plain_figures(monkeypatch):
-    """Nothing is moved to fit into figures, which is half of their cost: for tests that do not look
-    at them."""
-    from matplotlib.figure import Figure
-
-    from mgs import plotting
-
-    plain = lambda width, height, dpi: Figure((width, height), dpi)  # noqa: E731
-    monkeypatch.setattr(plotting, "new_figure", plain)
+def figures(monkeypatch):
+    """Figures as they are, for tests that look at them."""
+    for module in ("mgs.plotting", "mgs.reports.video"):
+        monkeypatch.setattr(f"{module}.new_figure", NEW_FIGURE)
 
 
 @pytest.fixture

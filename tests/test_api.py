@@ -14,6 +14,8 @@ import mgs
 from mgs.evaluation import render_view
 from mgs.progress import listening
 
+pytestmark = pytest.mark.usefixtures("coarse_priors")
+
 
 def test_public_names_are_present_and_documented():
     values = {name: getattr(mgs, name) for name in mgs.__all__}
@@ -234,7 +236,7 @@ def test_a_run_that_blends_srgb(dataset, prior, tmp_path):
     np.testing.assert_allclose(linear[seen], start.rgb[seen], atol=1e-5)
 
 
-@pytest.mark.usefixtures("coarse_rocks", "coarse_priors", "plain_figures")
+@pytest.mark.usefixtures("coarse_rocks")
 def test_the_whole_paper_in_a_few_calls(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("mgs.reports.diagnostics.VIEWS", 1)
@@ -242,8 +244,7 @@ def test_the_whole_paper_in_a_few_calls(tmp_path, monkeypatch):
     prior = mgs.build_prior(rock, gaussians=200)
     model = mgs.ModelSettings(train={"passes": 2, "alpha_weight": 0.1}, warm_passes=1)
     scene = mgs.Scene(rock, prior, model)
-    policies = mgs.Paper(), mgs.DOptimal(), mgs.Coverage(), mgs.Directional(), mgs.Uniform()
-    for policy in policies:
+    for policy in (mgs.Paper(), mgs.Directional()):
         run = mgs.nbv(scene, policy, seeds=4, budget=1, out=f"runs/{policy.name}")
         assert len(run.state.taken) == 5
         metrics = mgs.evaluate(run)

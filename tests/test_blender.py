@@ -22,7 +22,7 @@ from studies import blender
 from studies.frame.output import read_rows
 
 FEW = replace(blender.SIZES["quick"], downscale=1, gaussians=60, views=((2, 4),), passes=1, draws=1)
-pytestmark = pytest.mark.usefixtures("short_fits", "plain_figures")
+pytestmark = pytest.mark.usefixtures("short_fits")
 
 
 @pytest.fixture

@@ -98,7 +98,7 @@ SMALL = chart.ChartSize(
 )  # fmt: skip
 
 
-@pytest.mark.usefixtures("coarse_priors")
+@pytest.mark.usefixtures("coarse_priors", "figures")
 def test_a_chart_is_measured_once_and_written(dataset, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(timing, "MOST_REPEATS", 1)
     tiny.write_dataset(dataset / "test", frames=3)
@@ -123,7 +123,7 @@ def test_a_chart_is_measured_once_and_written(dataset, tmp_path, capsys, monkeyp
     assert (out / "chart.png").stat().st_size > 10_000
 
 
-@pytest.mark.usefixtures("coarse_priors")
+@pytest.mark.usefixtures("coarse_priors", "figures")
 def test_photographs_are_charted_beside_another_program(dataset, tmp_path, capsys):
     tiny.write_dataset(dataset / "test", frames=3)
     peer, out = tmp_path / "other.csv", tmp_path / "chart"

@@ -75,7 +75,7 @@ def test_a_pixel_is_unobserved_where_most_of_its_weight_is(near):
     assert maps["unobserved"][12, 16] == near
 
 
-def test_maps_of_an_empty_view_are_zero(tmp_path):
+def test_maps_of_an_empty_view_are_zero(tmp_path, figures):
     gaussians, camera = two_in_a_row()
     away = Camera(camera.K, 33, 25, look_at((0, -2, 0), (0, -3, 0)))
     scalars = {name: np.ones(2) for name in diagnostics.PANELS if name != "Z"}
@@ -85,7 +85,7 @@ def test_maps_of_an_empty_view_are_zero(tmp_path):
     assert (tmp_path / "empty.png").is_file()
 
 
-def test_files(whole):
+def test_files(whole, figures):
     written = diagnostics.diagnose(whole, ["kf_0007"])
     assert [path.name for path in written] == ["information.ply", "kf_0007.exr", "kf_0007.png"]
     channels = read_exr(whole / "diagnostics/kf_0007.exr")

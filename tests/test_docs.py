@@ -196,8 +196,8 @@ def data(tmp_path_factory, coarse_priors):
 
 
 @pytest.fixture
-def quick(coarse_rocks, coarse_priors, short_fits, plain_figures):
-    """Coarse rocks and priors, short fits and plain figures."""
+def quick(coarse_rocks, coarse_priors, short_fits):
+    """Coarse rocks and priors, and short fits."""
 
 
 @pytest.fixture
@@ -226,7 +226,7 @@ def test_the_tutorial_prints_the_words_that_it_shows(pages, tmp_path):
     """With smaller images and shorter fits, so that the numbers are others."""
     text, small = pages.TUTORIAL.read_text(), tmp_path / "tutorial.md"
     for old, new in (
-        ("width=160, height=120, frames=12, spp=4", "width=48, height=36, frames=12, spp=1"),
+        ("width=160, height=120, frames=12, spp=4", "width=48, height=36, frames=8, spp=1"),
         ("gaussians=2000", "gaussians=300"),
     ):
         assert old in text
@@ -252,8 +252,11 @@ def test_the_notebooks_are_their_pages(pages):
 
 SMALLER = {
     "--dome 40": "--dome 12", "120x90": "48x36", "width=120, height=90": "width=48, height=36",
-    "images=8": "images=2", "(1, 16, 256)": "(1, 4, 64)",
-    "errors[256] < errors[16]": "errors[64] < errors[4]",
+    "images=8": "images=2", "(1, 16, 256)": "(1, 4, 64)", "frames=2, spp=4": "frames=2, spp=1",
+    "errors[256] < errors[16]": "errors[64] < errors[4]", "tolerance=0.1": "tolerance=0.5",
+    "Information(model, cameras[:4])": "Information(model, cameras[:1])",
+    "--spp 4 --test-views 4": "--spp 1 --test-views 1",
+    **{f"--budget {count}": "--budget 1" for count in (2, 3, 4)},
 }  # fmt: skip
 
 

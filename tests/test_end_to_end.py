@@ -141,7 +141,7 @@ def test_ctrl_c_inside_a_call_of_drjit_is_one_line_too(capsys, monkeypatch):
         main(["doctor"])
 
 
-@pytest.mark.usefixtures("short_fits", "plain_figures")
+@pytest.mark.usefixtures("short_fits")
 def test_demo_shows_the_table_and_the_pictures_and_can_be_repeated(tmp_path, capsys, monkeypatch):
     """All of `mgs demo` but the rendering of its dataset; the second time it changes nothing."""
     out = tmp_path / "demo"

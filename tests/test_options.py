@@ -22,6 +22,7 @@ mgs: fly; dataset check {long}; eval {out}; dataset check {out};
     render {ply} --cameras {data} --out {out} --width 100000000;
     render {ply} --cameras {data} --out {out} --background 255 255 255; video {run} --out {out}.avi
 mgs eval {run}: --dataset {data}; --prior {prior}
+mgs video {run} --out {out}.gif --story: --fps 20; --width 20
 mgs view: {out}.ply; {root}; {ply} --follow; {run} --host 192.0.2.1
 mgs simplify {run}: --noise 1e300
 mgs export {run} --out {out}.mgs: --psnr nan
@@ -39,7 +40,7 @@ mgs nbv {data} --prior {prior} --seeds 3 --budget 1 --out {out}: --set estimator
     --set stop_uncertainty=1; --policy best; --seeds 13; --set train.means=loose;
     --set train.means=free --set estimator=loss-gradient; --set train.means=free --policy paper;
     --set flight.length=9; --set flight.no_fly=4; --set flight.clearance=30;
-    --set flight.length=30 --set travel=2
+    --set flight.length=30 --set travel=2; --set refine_poses=true
 mgs synth-orbit {out}: --scene moon; --scene nowhere/x.toml; --preset huge; --orbit figure-eight;
     --distances 1,far; --distances 1e-300; --size 320; --size 99999999x99999999; --size 3²x24;
     --size 100000x1; --mesh nowhere.glb; --mesh-up y; --spp 100000000000; --pose-noise 1e300
@@ -166,6 +167,7 @@ def test_force_replaces_what_the_command_made_and_nothing_else(capsys, dataset, 
 ONE_FILE = {
     "report {run} --html {out}/kept.html": "kept.html",
     "simplify {run}": "run/gaussians_pruned.ply",
+    "video {run} --out {out}/kept.gif": "kept.gif",
 }
 """Command -> the file that it would write."""
 
@@ -206,7 +208,7 @@ WHOLE = {
 
 
 @pytest.mark.parametrize("name", WHOLE)
-def test_a_result_appears_whole(tmp_path, monkeypatch, name):
+def test_a_result_appears_whole(tmp_path, figures, monkeypatch, name):
     """Nothing is under its name while its picture, the last file, is drawn."""
     module, files = importlib.import_module(WHOLE[name][0]), WHOLE[name][1]
     draw, drawn, out = getattr(module, f"draw_{name}"), [], tmp_path / "out"

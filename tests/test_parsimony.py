@@ -59,7 +59,7 @@ def test_only_cameras_count_that_see_the_face():
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
+def data(tmp_path_factory, coarse_priors):
     return synthetic.orbit(tmp_path_factory.mktemp("parsimony") / "data")
 
 
@@ -115,7 +115,7 @@ def test_tables_compare_choices_with_the_default():
 
 
 @pytest.mark.slow
-def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, ellipsoids, monkeypatch):
+def test_the_command_does_the_study_and_goes_on(tmp_path, capsys, ellipsoids, figures, monkeypatch):
     monkeypatch.setattr(parsimony, "COUNTS", (60, 200))
     size = SetupSize(48, 36, tests=3, fewer=3)
     out = tmp_path / "out"

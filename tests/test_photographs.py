@@ -304,7 +304,7 @@ def test_points_of_any_ply_can_be_given(tmp_path, capsys):
     root = synthetic.write_dataset(tmp_path / "d", depth=False).root
     far = np.random.default_rng(0).uniform(5, 6, (300, 3))
     trimesh.PointCloud(far).export(tmp_path / "far.ply")
-    given = ["prior", root, "--gaussians", "300", "--points"]
+    given = ["prior", root, "--gaussians", "300", "--poisson-depth", "5", "--points"]
     assert exit_code(*given, tmp_path / "far.ply") == 2
     assert "only 0 of 300 points lie inside the masks" in said(capsys)[1]
     assert (root / "prior-refused.png").is_file()
@@ -444,7 +444,7 @@ def test_up_is_that_of_the_picture_as_it_was_held(tag, tmp_path):
     assert degrees_between(Source("COLMAP", shots).up_or_estimate()[0], (0, 0, 1)) < 1
 
 
-def test_the_unit_scales_cameras_and_points_to_metres(colmap, tmp_path, capsys):
+def test_the_unit_scales_cameras_and_points_to_metres(colmap, coarse_priors, tmp_path, capsys):
     command("import", colmap, "--out", tmp_path / "metres", "--unit", str(1 / SCALE))
     command("import", colmap, "--out", tmp_path / "raw", "--up", "0,0,2")
     assert "up (0, 0, 1), as --up says; lengths in units" in said(capsys)[0]
@@ -638,7 +638,7 @@ def test_a_room_with_depth_starts_whole_from_its_walls(tmp_path, capsys):
     on_wall = np.abs(np.linalg.norm(points, axis=1) - WALL) < 0.02 * WALL
     assert numbers["triangulated"] == on_wall[:364].sum() == 364  # 1 / 1.1 of all
     assert (normals[:364] * points[:364]).sum(1).max() < 0
-    command("fit", data.root, "--passes", 6, "--out", tmp_path / "run")
+    command("fit", data.root, "--passes", 2, "--out", tmp_path / "run")
     assert load_prior(tmp_path / "run/prior").kind == "random"
     synthetic.edit(data.root, lambda d: [f.pop("depth_file_path") for f in d["frames"]])
     line = refused(capsys, ["fit", data.root, "--out", tmp_path / "bare"], tmp_path / "bare")
@@ -649,8 +649,8 @@ def test_an_object_in_masks_starts_with_few_gaussians_that_are_split(
     tmp_path, coarse_priors, capsys
 ):
     synthetic.write_dataset(tmp_path / "d", depth=False)
-    fitted = ["fit", tmp_path / "d", "--passes", 8, "--gaussians"]
-    kinds = ("split", 500, 104), ("fixed", 500, 500), ("split", 10, 10)
+    fitted = ["fit", tmp_path / "d", "--passes", 4, "--gaussians"]
+    kinds = ("split", 500, 228), ("fixed", 500, 500), ("split", 10, 10)
     for kind, asked, start in kinds:
         out = tmp_path / f"{kind}{asked}"
         command(*fitted, asked, "--density", kind, "--out", out)
@@ -670,7 +670,7 @@ def test_a_fit_with_adaptive_density_is_a_run_as_3dgs(tmp_path, capsys, monkeypa
     fitted = ["fit", tmp_path / "d", "--density", "adaptive", "--out", tmp_path / "run"]
     line = refused(capsys, [*fitted, "--set", "train.most_gaussians=0"], tmp_path / "run")
     assert "train.most_gaussians = 0: must be at least 1" in line
-    more = "--passes 8 --set train.most_gaussians=310 --set train.rates.mean=0.01"
+    more = "--passes 3 --set train.most_gaussians=310 --set train.rates.mean=0.01"
     command(*fitted, *more.split())
     settings = read_json(tmp_path / "run/config.json")["settings"]
     train = settings["train"]

@@ -57,7 +57,7 @@ def no_line_has(word):
 
 
 @pytest.fixture
-def drawn(monkeypatch):
+def drawn(figures, monkeypatch):
     """{file name: figure} of every figure that is saved, and the style that extents depend on."""
     found, save = {}, plotting.save_figure
 

@@ -47,7 +47,9 @@ def done(capsys, *arguments, **changes):
     return capsys.readouterr().out
 
 
-def test_setups_are_made_once_and_compare_a_policy_of_ones_own(tmp_path, capsys, monkeypatch):
+def test_setups_are_made_once_and_compare_a_policy_of_ones_own(
+    tmp_path, figures, capsys, monkeypatch
+):
     out = tmp_path / "out"
     assert setups.sized(FEW, setups.STUDY.parser().parse_args(["OUT"])).images == FEW.images
     some = ("setups", out, "--rocks", 1, "--images", 5)
@@ -80,9 +82,9 @@ def test_setups_are_made_once_and_compare_a_policy_of_ones_own(tmp_path, capsys,
     assert "/mine.py:first" in done(capsys, *one), "another file is another policy"
 
 
-def test_no_set_of_a_study_is_above_its_bound(tmp_path, capsys):
+def test_no_set_of_a_study_is_above_its_bound(tmp_path, figures, capsys):
     size = certificate.CertificateSize(
-        **vars(FEW), counts=(2,), shares=(0.8,), sets=3, batches=2, batch=2, views=2, fitted=100,
+        **vars(FEW), counts=(2,), shares=(0.8,), sets=3, batches=1, batch=2, views=2, fitted=100,
         training=certificate.TRAINING[:1],
     )  # fmt: skip
     out = tmp_path / "out"
@@ -117,7 +119,7 @@ def test_flights_keep_their_length_and_are_compared_with_even_spacing(tmp_path, 
 
 
 def test_models_of_chosen_views_are_sent_over_a_link(tmp_path, capsys, monkeypatch, short_fits):
-    for name, value in (("HALVINGS", 4), ("THINNINGS", 1)):
+    for name, value in (("HALVINGS", 4), ("THINNINGS", 1), ("ROUNDS", 1), ("HOLDS", 2)):
         monkeypatch.setattr(f"mgs.reports.compacting.{name}", value)
     size = link.LinkSize(**vars(FEW) | {"views": (5,), "sent": (500, 4000)})
     done(capsys, "link", tmp_path, "--rocks", 1, sizes={"quick": size})

@@ -130,10 +130,10 @@ def test_candidates_of_one_pose_are_one_and_those_that_see_nothing_none(run, sit
     assert result.dropped == {"sees nothing of the object": 1, "the same as one before": 1}
 
 
-def test_a_model_of_split_gaussians_is_rated_by_all_of_them(tmp_path, site):
-    data = synthetic.write_rock(tmp_path / "d", synthetic.orbit_cameras(14, 48, 36)[:8], 300)
-    train = {"means": "free", "density": "split", "passes": 6}
-    split = mgs.resume_nbv(start_fit(data.root, tmp_path / "run", train=train))
+def test_a_model_of_split_gaussians_is_rated_by_all_of_them(run, site, tmp_path):
+    train = {"means": "free", "density": "split", "passes": 3}
+    data = open_run(run).dataset.root
+    split = mgs.resume_nbv(start_fit(data, tmp_path / "run", train=train))
     assert len(split.gaussians) > 1.5 * len(split.prior.points)
     found = suggest(split, place_poses("ring", 12, 2.6, (25, 35), site))
     assert 180 < found.ranking[0].azimuth < 360
@@ -218,11 +218,13 @@ def test_a_coarse_model_keeps_the_best(run, site, monkeypatch):
     assert np.corrcoef(ranks, np.arange(20)[::-1])[0, 1] > 0.9
 
 
-def test_a_dataset_is_one_command_and_its_flight_plan_is_read_by_pymavlink(run, tmp_path, capsys):
+def test_a_dataset_is_one_command_and_its_flight_plan_is_read_by_pymavlink(
+    run, figures, tmp_path, capsys
+):
     out, data = tmp_path / "next", open_run(run).dataset.root
     plans = [tmp_path / f"next.{kind}" for kind in ("plan", "waypoints", "kml")]
     written = [word for path in plans for word in ("--plan", path)]
-    asked = "--dome 30 --views 3 --origin 47,8,400,90 --set flight.no_fly=1.5 --set flight.hover=2"
+    asked = "--dome 16 --views 3 --origin 47,8,400,90 --set flight.no_fly=1.5 --set flight.hover=2"
     asked += " --set flight.speed=1.5"
     command("suggest", data, "--out", out, *written, *asked.split())
     assert "ruled out by flight.no_fly or flight.clearance" in said(capsys)[0]
@@ -264,7 +266,7 @@ def test_a_dataset_is_one_command_and_its_flight_plan_is_read_by_pymavlink(run, 
     assert len(root.find(".//{*}LineString/{*}coordinates").text.split()) >= 5
 
 
-def test_a_plan_in_a_world_that_is_not_upright(run, tmp_path):
+def test_a_plan_in_a_world_that_is_not_upright(run, coarse_priors, tmp_path):
     """+Y of the world, made level, is north."""
     data, up = tmp_path / "data", np.array([-0.48, 0.6, 0.64])
     shutil.copytree(open_run(run).dataset.root, data)

@@ -170,7 +170,8 @@ def test_the_survey_repeats_by_seed(dataset, survey):
     again = fly(dataset, SurveySettings(sensor=0.2, drift=1.0))
     assert np.array_equal(again.optimised, survey.optimised)
     assert all(np.array_equal(a, b) for a, b in zip(again.depths, survey.depths, strict=True))
-    other = fly(dataset, SurveySettings(sensor=0.2, drift=1.0, seed=1))
+    few = Dataset(dataset.root, dataset.frames[:3])
+    other = fly(few, SurveySettings(sensor=0.2, drift=1.0, seed=1))
     assert not np.array_equal(other.depths[0], survey.depths[0])
 
 

@@ -94,7 +94,7 @@ def test_the_command_draws_pictures_side_by_side(run, tmp_path):
         assert image.size == (2 * tiny.WIDTH + 4, tiny.HEIGHT)
 
 
-def test_the_story_has_a_frame_for_each_view(run, tmp_path, monkeypatch):
+def test_the_story_has_a_frame_for_each_view(run, figures, tmp_path, monkeypatch):
     change_settings(run, policy="python:mine.best")  # the story chooses nothing
 
     def models(run, problem):
@@ -112,13 +112,7 @@ def test_nothing_is_unknown_in_a_view_of_nothing():
     assert _left({"uncertainty": np.ones((2, 2)), "A": np.zeros((2, 2))}) == 0
 
 
-def test_refusals(run, tmp_path, monkeypatch, capsys):
-    (tmp_path / "a.gif").write_text("keep me")
-    line = refused(capsys, ["video", run, "--out", tmp_path / "a.gif"], tmp_path)
-    assert "is there already" in line
+def test_a_missing_encoder_is_one_line(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     line = refused(capsys, ["video", run, "--out", tmp_path / "a.mp4"], tmp_path)
     assert "`pip install imageio-ffmpeg`, or write a .gif" in line
-    for option in ("--fps", "--width"):
-        given = ["video", run, "--out", tmp_path / "b.gif", option, 20, "--story"]
-        assert f"{option}: is not used with --story" in refused(capsys, given, tmp_path)
