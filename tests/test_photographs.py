@@ -13,7 +13,7 @@ import trimesh
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from program import command, exit_code, said
+from program import command, exit_code, output, said
 from refusals import fails, refused
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
@@ -640,6 +640,14 @@ def test_a_room_with_depth_starts_whole_from_its_walls(tmp_path, capsys):
     assert (normals[:364] * points[:364]).sum(1).max() < 0
     command("fit", data.root, "--passes", 2, "--out", tmp_path / "run")
     assert load_prior(tmp_path / "run/prior").kind == "random"
+    lattice = "grid=300", "radius=4.5", "elevations=-60,80"
+    asked = [item for setting in lattice for item in ("--set", setting)]
+    words = output(capsys, "suggest", tmp_path / "run", *asked, "--out", tmp_path / "next")
+    left = read_json(tmp_path / "next/suggestions.json")["ranking"]
+    away = [np.linalg.norm(np.array(view["transform_matrix"])[:3, 3]) for view in left]
+    assert "beyond what the images show" in words
+    assert 0 < max(away) < WALL - 1  # half of the least distance of an image from the wall
+    assert any(view["elevation"] < 0 for view in left)
     synthetic.edit(data.root, lambda d: [f.pop("depth_file_path") for f in d["frames"]])
     line = refused(capsys, ["fit", data.root, "--out", tmp_path / "bare"], tmp_path / "bare")
     assert "a whole scene needs points, which `mgs import` triangulates" in line

@@ -14,7 +14,6 @@ from mgs.cli.options import Count, Settings, not_none, parse_gaussians, parse_se
 from mgs.cli.terminal import Terminal, progress_bar
 from mgs.data.dataset import load_dataset, read_records
 from mgs.data.flight_plan import Stop, check_plan_path, parse_origin, write_flight_plan
-from mgs.data.meshes import distances_to_mesh
 from mgs.data.on_site import dataset_at, holds_photographs
 from mgs.data.photographs import photographs_in
 from mgs.data.structure import CLOUD
@@ -24,11 +23,11 @@ from mgs.fit.settings import Frozen
 from mgs.policy.criteria import GAIN_UNIT
 from mgs.prior.photographs import check_enough
 from mgs.reports.suggestion import write_suggestion
-from mgs.run.candidates import MOST_POSES, Named, Site, inside, place_poses, read_poses
+from mgs.run.candidates import MOST_POSES, Named, inside, place_poses, read_poses
 from mgs.run.folder import Run, holds_run, open_run
 from mgs.run.nbv import resume_nbv, start_run
 from mgs.run.settings import FlightLimits, Positive, SearchLimits, validated
-from mgs.run.suggest import Suggestion, View, taken_in_order
+from mgs.run.suggest import Suggestion, View, site_of, taken_in_order
 from mgs.run.suggest import suggest as suggested
 
 Degrees = Annotated[float, Field(ge=-90, le=90)]
@@ -52,8 +51,8 @@ class Candidates(Frozen):
     elevations: tuple[Degrees, Degrees] | None = None
     """Lowest and highest elevation, degrees. Default: 10,80 with dome, ring or grid, else any."""
     safe_distance: Positive | None = None
-    """Least distance from the prior's mesh. Default: half that of the images with dome, ring or
-    grid, else 0."""
+    """Least distance from the prior's mesh, or from the points of a whole scene. Default: half that
+    of the images with dome, ring or grid, else 0."""
     flight: FlightLimits = FlightLimits()
     """Limits of the flight and of its poses."""
     certificate: SearchLimits = SearchLimits()
@@ -203,7 +202,7 @@ def _candidates(
     run: Run, poses: Path | None, shape: tuple[str, int] | None, asked: Candidates
 ) -> tuple[Sequence[Named], float, tuple[float, float] | None]:
     """Candidates, their least distance from the mesh, and their elevations."""
-    site = Site(run.prior, run.taken[-1].camera, run.dataset.world)
+    site = site_of(run)
     left = [frame for frame in run.dataset.frames if frame not in run.taken]
     safe, band = asked.safe_distance, asked.elevations
     if poses is not None:
@@ -214,8 +213,7 @@ def _candidates(
     eyes = np.stack([frame.camera.position for frame in run.taken])
     band = band or (10.0, 80.0)
     if safe is None:
-        mesh = run.prior.mesh
-        safe = float(distances_to_mesh(eyes, mesh.vertices, mesh.faces).min()) / 2
+        safe = float(site.clearance(eyes).min()) / 2
     far = float(np.median(np.linalg.norm(eyes - site.centre, axis=1)))
     return place_poses(kind, count, asked.radius or far, band, site), safe, band
 

@@ -5,10 +5,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from mgs.camera import Camera, look_at
 from mgs.data.clouds import towards
@@ -48,17 +49,25 @@ class Site:
     """The object, and the camera that looks at it.
 
     like: camera whose intrinsics candidates have by default. world: of files of poses. points:
-    triangulated from the images [N,3], if they are known."""
+    triangulated from the images [N,3], if they are known. whole: whether they are of a whole scene,
+    whose prior has no surface."""
 
     prior: Prior
     like: Camera
     world: World = UPRIGHT
     points: NDArray[np.float64] | None = None
+    whole: bool = False
 
     @property
     def centre(self) -> NDArray[np.float64]:
         """Middle of the object [3]."""
         return np.asarray(self.prior.points.mean(axis=0), np.float64)
+
+    def clearance(self, eyes: np.ndarray) -> NDArray[np.float64]:
+        """Distance of places [M,3] from the prior's mesh, or from the points of a whole scene."""
+        if self.whole:
+            return np.asarray(cKDTree(self.points).query(eyes)[0])
+        return distances_to_mesh(eyes, self.prior.mesh.vertices, self.prior.mesh.faces)
 
     def camera(self, eye: Sequence[float] | np.ndarray, target: np.ndarray | None = None) -> Camera:
         """A camera at `eye` [3] that looks at `target` [3], by default the middle of the object."""
@@ -255,28 +264,30 @@ def refusals(
 ) -> list[str]:
     """Why each candidate cannot be flown; empty if it can.
 
-    safe_distance: least distance from the prior's mesh, metres. elevations: lowest and highest
-    above the middle of the object, degrees."""
-    eyes = np.stack([camera.position for _, camera in poses])
-    mesh, centre = site.prior.mesh, site.centre
+    safe_distance: least `Site.clearance`, metres. elevations: lowest and highest above the middle
+    of the object, degrees."""
+    eyes, centre = np.stack([camera.position for _, camera in poses]), site.centre
     offset = eyes - centre
     far = np.linalg.norm(offset, axis=1)
     rise = np.degrees(np.arcsin(np.clip(offset[:, 2] / np.maximum(far, 1e-12), -1, 1)))
     low, high = elevations or (-90.0, 90.0)
     beyond = (rise < low - 1e-6) | (rise > high + 1e-6)
-    near = np.zeros(len(poses), bool)
+    walls, near = site.points, np.zeros(len(poses), bool)
     if safe_distance > 0:  # measuring takes seconds
-        near = distances_to_mesh(eyes, mesh.vertices, mesh.faces) < safe_distance
-    walls = site.points
-    if walls is not None:  # an object alone hides no place: its far side is what to suggest
-        own = OWN * np.linalg.norm(site.prior.points - centre, axis=1).max()
-        walls = walls[cKDTree(site.prior.points).query(walls)[0] > own]
+        near = site.clearance(eyes) < safe_distance
+    reasons: dict[str, Any] = {}
+    if site.whole and walls is not None:  # its mesh is a ball that says nothing
+        reasons["beyond what the images show"] = _beyond(eyes, taken, walls, safe_distance)
+    else:
+        reasons["inside the object"] = inside(site.prior.mesh, eyes)
+        if walls is not None:  # an object alone hides no place: its far side is what to suggest
+            own = OWN * np.linalg.norm(site.prior.points - centre, axis=1).max()
+            walls = walls[cKDTree(site.prior.points).query(walls)[0] > own]
     normals = site.prior.normals[:: -(-len(site.prior.normals) // NORMALS)]
     towards_eye = normals @ offset.T
     back = np.maximum(towards_eye, 0).sum(0) < FACING * np.abs(towards_eye).sum(0)
-    within, keys = inside(mesh, eyes), [camera.world_to_camera.tobytes() for _, camera in poses]
-    reasons = {
-        "inside the object": within,
+    keys = [camera.world_to_camera.tobytes() for _, camera in poses]
+    reasons |= {
         f"nearer to it than {safe_distance:.3g}": near,
         "behind a surface that faces one way": back,
         "behind what the images show": hidden(eyes, taken, walls),
@@ -285,6 +296,18 @@ def refusals(
         "the same as one before": [keys.index(key) < k for k, key in enumerate(keys)],
     }
     return [next((why for why, hit in reasons.items() if hit[k]), "") for k in range(len(poses))]
+
+
+def _beyond(
+    eyes: np.ndarray, taken: Sequence[Camera], points: np.ndarray, margin: float
+) -> NDArray[np.bool_]:
+    """Whether places [M,3] lie outside the convex hull of the points [N,3] and the cameras, or
+    within `margin` of a face of points alone, as a ceiling."""
+    corners = np.concatenate([points, [camera.position for camera in taken]])
+    hull = ConvexHull(corners, qhull_options="QJ")
+    depth = -hull.equations[:, :3] @ eyes.T - hull.equations[:, 3:]
+    least = np.where(hull.simplices < len(points), margin, 0).min(axis=1)
+    return np.asarray((depth < least[:, None]).any(axis=0))
 
 
 def _are_taken(

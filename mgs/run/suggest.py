@@ -115,10 +115,7 @@ def suggest(
     if policy is None and (in_file(own) or is_function(own)):
         raise InputError(f"{run.folder}: its policy is a program, {own}; name it with `policy`")
     settings |= {} if policy is None else {"policy": name_of(policy)}
-    images = taken_in_order(run)
-    cloud = run.dataset.root / CLOUD
-    points = read_cloud(cloud).upright(run.dataset.world).points if cloud.is_file() else None
-    site = Site(run.prior, images[-1].camera, points=points)
+    images, site = taken_in_order(run), site_of(run)
     taken = [frame.camera for frame in images]
     with listening(progress):
         why = refusals(poses, taken, site, safe_distance, elevations)
@@ -172,6 +169,18 @@ def suggest(
     metres = tour.tour_length(flight_of(scene, state, mission).legs, way)
     seconds = metres / mission.flight.speed + mission.flight.hover * len(plan)
     return Suggestion(ranking, plan, metres, seconds, dropped, corners, worth, gains)
+
+
+def site_of(run: Run) -> Site:
+    """The object of a run, or its whole scene, and the points that its images show."""
+    prior, data = run.prior, run.dataset
+    shown = prior.points[: prior.numbers.get("triangulated", 0)]
+    whole, points = run.of_scene and len(shown) > 0, None
+    if whole:
+        points = shown
+    elif (cloud := data.root / CLOUD).is_file():
+        points = read_cloud(cloud).upright(data.world).points
+    return Site(prior, run.taken[-1].camera, data.world, points, whole)
 
 
 def taken_in_order(run: Run) -> list[Frame]:
