@@ -328,6 +328,7 @@ ROBOTS = (
     ("Open3D", "open3d/camera_intrinsic.json"),
     ("7-Scenes", "seq-01/frame-000001.pose.txt"),
     ("7-Scenes", "camera-intrinsics.txt"),
+    ("3D Scanner App", "scan/frame_00006.json"),
     ("RTAB-Map", "rtabmap/rtabmap_camera_poses.txt"),
     ("RTAB-Map", "rtabmap/rtabmap_calib/1.yaml"),
     ("Metashape", "metashape/cameras.xml"),

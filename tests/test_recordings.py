@@ -246,6 +246,26 @@ def write_seven_scenes(root: Path, dataset) -> Path:
     return root
 
 
+def write_scanner(root: Path, dataset) -> Path:
+    """Export "All Data" of 3D Scanner App: ARKit's world is +Y up, and most poses have no image."""
+    copy_images(dataset, root / "colour", root / "depth")
+    to_arkit = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    for k, frame in enumerate(dataset.frames):
+        camera, number = frame.camera, f"{6 * k:05d}"
+        pose = to_arkit @ camera.camera_to_world @ np.diag([1, -1, -1, 1])
+        record = {"cameraPoseARFrame": pose.ravel().tolist(), "time": 90 + frame.timestamp}
+        (root / f"frame_{number}.json").write_text(
+            json.dumps(record | {"intrinsics": camera.K.ravel().tolist()})
+        )
+        (root / f"frame_{6 * k + 1:05d}.json").write_text(json.dumps(record))
+        # A PNG by content, so that pixels stay; the program writes JPEG.
+        (root / f"colour/{k}.png").rename(root / f"frame_{number}.jpg")
+        (root / f"depth/{k}.png").rename(root / f"depth_{number}.png")
+        Image.new("L", (8, 6), 2).save(root / f"conf_{number}.png")
+        Image.new("RGB", (8, 6)).save(root / f"thumb_{number}.jpg")
+    return root
+
+
 def write_rtabmap(root: Path, dataset) -> Path:
     """Folder of `rtabmap-export`, with calibrations as OpenCV writes them."""
     copy_images(dataset, root / "rtabmap_rgb", root / "rtabmap_depth")
@@ -368,6 +388,7 @@ WRITERS = {
     "TUM RGB-D": lambda root, data: write_tum(root / "tum", data),
     "Open3D": lambda root, data: write_open3d(root / "open3d", data),
     "7-Scenes": lambda root, data: write_seven_scenes(root / "seq-01", data),
+    "3D Scanner App": lambda root, data: write_scanner(root / "scan", data),
     "RTAB-Map": lambda root, data: write_rtabmap(root / "rtabmap", data),
     "Metashape": lambda root, data: write_metashape(root / "metashape", data),
     "OpenSfM": lambda root, data: write_opensfm(root / "opensfm", data),
@@ -393,7 +414,8 @@ def test_cameras_pixels_and_depth_are_those_recorded(dataset, tmp_path, capsys, 
     assert not (tmp_path / "out.unpacked").exists()
     made = load_dataset(out)
     assert len(made) == len(dataset)
-    assert np.allclose(made.world.up, (0, 0, 1), atol=1e-9)
+    upward = (0, 1, 0) if kind == "3D Scanner App" else (0, 0, 1)
+    assert np.allclose(made.world.up, upward, atol=1e-9)
     for one, other in zip(dataset.frames, made.frames, strict=True):
         assert np.allclose(one.camera.world_to_camera, other.camera.world_to_camera, atol=1e-6)
         assert np.allclose(one.camera.K, other.camera.K, atol=1e-9)
@@ -573,6 +595,10 @@ def halved(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
+def unmeasured(path: Path) -> None:
+    path.write_text(path.read_text().replace("intrinsics", "lens"))
+
+
 def b2(path: Path) -> None:
     path.write_text(path.read_text().replace("</f>", "</f><b2>1</b2>"))
 
@@ -599,6 +625,8 @@ def pickled(path: Path) -> None:
         ("Metashape", "cameras.xml", b2, "b2 or k4"),
         ("7-Scenes", "frame-000001.pose.txt", halved, "has 8 numbers; give a 4x4 matrix"),
         ("7-Scenes", "camera-intrinsics.txt", Path.unlink, "no calibration; write fx fy cx cy"),
+        ("3D Scanner App", "frame_00006.json", halved, "not valid JSON"),
+        ("3D Scanner App", "frame_00006.json", unmeasured, "has no cameraPoseARFrame of 16"),
         ("RTAB-Map", "3.yaml", halved, "camera_matrix"),
         ("OpenSfM", "reconstruction.json", halved, "not valid JSON"),
         ("Bundler", "bundle.out", halved, "9 cameras and 1 points of 9 listed images"),

@@ -1,5 +1,5 @@
 """Folders of robots and scanners with a pose for each image: TUM RGB-D, Open3D, 7-Scenes, RTAB-Map
-exports; each reader returns keyframes, in metres."""
+exports, 3D Scanner App; each reader returns keyframes, in metres."""
 
 import re
 from collections import Counter
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mgs.camera import Camera
+from mgs.data.agreement import FLIP
 from mgs.data.lens import Lens
 from mgs.data.shots import Shot, Source, Spacing, Track, natural, orthonormal, posed, rigid
 from mgs.errors import InputError
@@ -22,6 +23,7 @@ LARGEST_NUMBER = 1e15  # numbers beyond it are mistakes, also of times
 SYNCHRONOUS = 0.02  # most seconds between a colour and its depth image (TUM's associate.py)
 INTERVAL = 0.5  # seconds between images of folders without times: by default all are taken
 COLOUR, POSE = ".color", ".pose.txt"  # ends of names of 7-Scenes
+ARKIT = "cameraPoseARFrame"  # key of a pose of 3D Scanner App
 
 
 def rows(path: Path, least: int) -> list[list[str]]:
@@ -199,6 +201,40 @@ def _untimed(
         shot = _shot(name, K, lens, poses[k], times[k], images[k], depth)
         shots.append(replace(shot, mended=mended[k]))
     return shots
+
+
+def is_scanner(folder: Path) -> bool:
+    """Whether a folder is "All Data" of the iOS program 3D Scanner App."""
+    first = min(folder.glob("frame_*.json"), default=None)
+    return first is not None and ARKIT in read_text(first)
+
+
+def read_scanner(folder: Path, spacing: Spacing) -> Source:
+    """Keyframes of the frame_N.json that have a frame_N.jpg, with depth_N.png (mm). Matrices are
+    row-major; a pose is camera-to-world of ARKit: camera axes of OpenGL, +Y up."""
+    there, lenses, images = list[tuple[float, np.ndarray]](), list[np.ndarray](), list[Path]()
+    for path in sorted(folder.glob("frame_*.json"), key=natural):
+        if (image := path.with_suffix(".jpg")).is_file():  # most frames have none
+            record: Any = read_json(path)
+            try:
+                K, pose = (np.array(record[key], np.float64) for key in ("intrinsics", ARKIT))
+                time = float(record.get("time", INTERVAL * len(images)))
+                if not abs(time) < LARGEST_NUMBER:
+                    raise ValueError
+                there.append((time, orthonormal(pose.reshape(4, 4) @ FLIP)[0]))
+                lenses.append(K.reshape(3, 3))
+            except (TypeError, KeyError, ValueError, OverflowError):
+                why = f"has no {ARKIT} of 16 numbers, intrinsics of 9 and time"
+                raise InputError(f"{path}: {why}; export it again") from None
+            images.append(image)
+    if not images:
+        raise InputError(f"{folder}: has no frame_N.jpg beside frame_N.json; export All Data")
+    shots: list[Shot] = []
+    for k in spacing.choose(there):
+        depth = images[k].with_name(f"{images[k].stem.replace('frame', 'depth', 1)}.png")
+        (time, pose), name = there[k], images[k].stem
+        shots.append(_shot(name, lenses[k], None, pose, time - there[0][0], images[k], depth))
+    return Source("3D Scanner App", shots, up=(0.0, 1.0, 0.0), unit="m")
 
 
 def is_rtabmap(folder: Path) -> bool:

@@ -33,10 +33,12 @@ from mgs.data.photographs import (
 from mgs.data.rgbd_folders import (
     is_open3d,
     is_rtabmap,
+    is_scanner,
     is_seven_scenes,
     is_tum,
     read_open3d,
     read_rtabmap,
+    read_scanner,
     read_seven_scenes,
     read_tum,
 )
@@ -75,6 +77,10 @@ RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
     "TUM RGB-D": (is_tum, lambda path, _, spacing, *__: read_tum(path, spacing)),
     "Open3D": (is_open3d, lambda path, _, spacing, *__: read_open3d(path, spacing)),
     "7-Scenes": (is_seven_scenes, lambda path, _, spacing, *__: read_seven_scenes(path, spacing)),
+    "3D Scanner App": (
+        is_scanner,
+        lambda path, _, spacing, *__: read_scanner(path, spacing),
+    ),
     "RTAB-Map": (is_rtabmap, lambda path, _, spacing, *__: read_rtabmap(path, spacing)),
     **{kind: (partial(is_peer, kind), partial(read_peer, kind)) for kind in PEERS},
 }
