@@ -220,6 +220,37 @@ def test_nerf_synthetic_with_alpha(dataset, tmp_path):
         assert np.array_equal(one.mask(), other.mask())
 
 
+def test_images_are_found_by_the_ends_of_paths_that_begin_elsewhere(dataset, tmp_path, capsys):
+    """As in transforms.json of a project of which one folder was copied; never outside of it."""
+    root = shutil.copytree(dataset.root, tmp_path / "phone")
+
+    def move(folder):
+        def edit(data):
+            for frame in data["frames"]:
+                frame["file_path"] = f"{folder}/images/{Path(frame['file_path']).name}"
+
+        return edit
+
+    for folder in ("./data/phone", "/home/me/phone", "..", "D:\\phone"):
+        synthetic.edit(root, move(folder))
+        source = read_source(root)
+        assert [shot.image.name for shot in source.shots] == [
+            frame.image_path.name for frame in dataset.frames
+        ]
+        found = f"images found in {root} by the ends of their paths, which begin elsewhere: 8"
+        assert found in source.notes[-1]
+    (root / "images").rename(tmp_path / "images")
+    for folder in ("./data/phone", "phone/../.."):
+        synthetic.edit(root, move(folder))
+        line = refused(capsys, ["import", root, "--out", tmp_path / "out"], tmp_path / "out")
+        assert "none of the 8 images it lists exists" in line
+    (tmp_path / "images").rename(root / "images")
+    synthetic.edit(root, move("a"))
+    synthetic.edit(root, lambda d: d["frames"][1].update(file_path="b/images/kf_0000.png"))
+    line = refused(capsys, ["import", root, "--out", tmp_path / "out"], tmp_path / "out")
+    assert "has the end of several of its paths; give the folder of its images" in line
+
+
 FISHEYE = np.array([0.05, -0.01, 0.002, 0.001])
 UNDISTORTERS: dict[str, tuple[Callable[..., Any], np.ndarray, tuple[str, ...]]] = {
     "OPENCV": (cv2.undistortPoints, DISTORTION, ("k1", "k2", "p1", "p2", "k3")),

@@ -221,16 +221,19 @@ def _split_apart(source: Path, images: Path | None, test_split: str) -> Source:
 
 
 def _named(folder: Path, images: Path | None, name: str) -> Path | None:
-    """File that transforms.json names: in its folder, or by its end in the folder of the images.
-    Names written on Windows have backslashes."""
+    """File that transforms.json names: in its folder, there by the end of a path that begins
+    elsewhere, or by its end in the folder of the images. Names written on Windows have
+    backslashes."""
+    parts = PureWindowsPath(name).parts
+    ends = ["/".join(parts[k:]) for k in range(len(parts))]
+    if images is not None:
+        return next((image for end in ends if (image := find_image(images, end))), None)
     path = folder / name
     if not path.exists() and "\\" in name:
         path = folder / PureWindowsPath(name).as_posix()
-    if images is None:
-        return find_image(path.parent, path.name)
-    parts = PureWindowsPath(name).parts
-    ends = ("/".join(parts[k:]) for k in range(len(parts)))
-    return next((image for end in ends if (image := find_image(images, end))), None)
+    inner = [end for end in ends[1:-1] if ".." not in end.split("/")]
+    places = [path, *(folder / end for end in inner)]
+    return next((image for one in places if (image := find_image(one.parent, one.name))), None)
 
 
 def _read_transforms(path: Path, images: Path | None) -> Source:
@@ -243,7 +246,7 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
     if steps > 0 and key not in data:
         scale = steps
     tests, without = _splits(path, data, records)
-    left_out, shots = Counter[str](), []
+    left_out, shots, notes, elsewhere = Counter[str](), [], list[str](), Counter[Path]()
     for index, record in enumerate(records):
         image = _named(path.parent, images, record["file_path"])
         if record["file_path"] in without:
@@ -252,6 +255,8 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
         if image is None:
             left_out["whose file is missing"] += 1
             continue
+        listed_in = (path.parent / PureWindowsPath(record["file_path"]).as_posix()).parent
+        elsewhere[image] += images is None and image.parent != listed_in
         keys = ("depth_file_path", "mask_path", "rock_file_path")
         names = [record.get(key) or "" for key in keys]
         if steps > 0 and not names[0]:
@@ -267,7 +272,12 @@ def _read_transforms(path: Path, images: Path | None) -> Source:
         shots.append(Shot(name, camera, lens, time, *files, of_floats, mended=mended))
     if not shots and left_out["whose file is missing"]:
         raise none_exists(path, len(records), records[0]["file_path"])
-    notes = []
+    if twice := next((image for image, count in elsewhere.items() if count > 1), None):
+        why = f"{twice} has the end of several of its paths"
+        raise InputError(f"{path}: {why}; give the folder of its images as `images`")
+    if count := elsewhere.total():
+        where = f"{path.parent} by the ends of their paths, which begin elsewhere"
+        notes.append(f"images found in {where}: {count}, as {next(iter(+elsewhere))}")
     listed = {frame_name(record["file_path"]) for record in records}
     if unknown := {frame_name(name) for name in tests} - listed:
         notes.append(f"test views that are no frame: {len(unknown)}, as {min(unknown)}")
