@@ -105,7 +105,7 @@ def _fault(depth: np.ndarray, z: np.ndarray) -> str:
     growth = np.median(depth[far]) / np.median(depth[~far])
     if spread < MOST_SPREAD and growth > np.sqrt(np.median(z[far]) / np.median(z[~far])):
         return ""
-    cure = "give z-depth, no inverse or guess, in millimetres (16-bit PNG) or metres (EXR)"
+    cure = "give z-depth aligned with the photographs, no inverse or guess, in mm (PNG) or m (EXR)"
     return f"it contradicts the distance of their points (spread {100 * spread:.0f} %); {cure}"
 
 
