@@ -36,6 +36,7 @@ from mgs.images import exif_exposure, exif_orientation
 from mgs.progress import report
 
 EXPOSURE_DIFFERS = 0.1  # stops by EXIF beyond which --exposure is recommended
+SHARP = 0.3  # error of right poses in small pictures, pixels: 0.11 measured, with a margin
 WHITE_RIM = 0.9  # share of white along the border of masks that may be inverted
 MOSTLY = 0.3  # share of empty masks beyond which a line says so
 
@@ -69,8 +70,9 @@ def import_data(
     are kept in sparse.ply for `mgs prior`. The same command continues an interrupted import.
 
     - source: A transforms.json or a folder with one, a COLMAP model (sparse/0), ROS bag, Metashape
-      XML, a folder of TUM RGB-D, Open3D, 7-Scenes, RTAB-Map, OpenSfM or ODM, Bundler, LLFF, MVSNet,
-      openMVG's benchmark or 3D Gaussian Splatting, a folder of photographs alone, or a video.
+      XML, a folder of TUM RGB-D, Open3D, 7-Scenes, 3D Scanner App, RTAB-Map, OpenSfM or ODM,
+      Bundler, LLFF, MVSNet, openMVG's benchmark or 3D Gaussian Splatting, a folder of photographs
+      alone, or a video.
     - out: Folder to write: new, empty, or left by an interrupted import.
     - images: Folder of the images (default: SOURCE/images), or topic of a bag.
     - keyframes: Of a recording or video, import frames at least this time or distance apart: 0.5s
@@ -159,7 +161,7 @@ def import_data(
     if fit and fit.problem:
         cure = "correct them, and import with --force"
         notes.print(f"mgs: the poses {fit.problem} ({_evidence(fit)}); {cure}", soft_wrap=True)
-    elif not refine_poses and _is_loose(fit, result):
+    elif not refine_poses and _is_loose(fit, shots, result):
         cure = "--refine-poses adjusts them, with --force"
         notes.print(f"mgs: the poses are a little wrong ({_evidence(fit)}); {cure}", soft_wrap=True)
     alone = shots.kind == PHOTOGRAPHS  # whose poses follow from their points, in a world of its own
@@ -199,10 +201,11 @@ def _checked(
     return result, fit, cloud
 
 
-def _is_loose(fit: Agreement | None, result: Dataset) -> bool:
+def _is_loose(fit: Agreement | None, source: Source, result: Dataset) -> bool:
     """Whether points matched in pictures of a dataset are farther from its poses than those of
-    right poses, which are found to a pixel of WIDEST."""
-    right = max(1.0, result.frames[0].camera.width / WIDEST)
+    right poses, which are found to a pixel of WIDEST of the source, or to SHARP of the dataset."""
+    whole, width = source.shots[0].camera.width, result.frames[0].camera.width
+    right = max(SHARP, max(1.0, whole / WIDEST) * width / whole)
     return bool(fit and fit.error and fit.evidence.endswith(MATCHED) and fit.error > right)
 
 
