@@ -115,3 +115,20 @@ def test_views(whole):
     assert len(diagnostics.choose_views(frames, everything, None)) == diagnostics.VIEWS
     named = "kf_9999: no such frame; the dataset has kf_0000 to kf_0011"
     fails(named, diagnostics.diagnose, whole, ["kf_9999"])
+
+
+@pytest.mark.parametrize("count", [3, 8])
+def test_gaussians_of_a_density_control_are_as_unobserved_as_the_nearest_sample(tmp_path, count):
+    """They are fewer or more than the samples, in another order."""
+    rng, here = np.random.default_rng(0), tiny.prior()
+    rows = rng.permutation(len(here.points))[:count]
+    shapes = (count, 3), (count, 4), count, (count, 1, 3)
+    means = here.points[rows].astype(np.float32)
+    gaussians = Gaussians(means, *(np.zeros(shape, np.float32) for shape in shapes))
+    surface = np.ones((len(here.points), 11))
+    surface[rows[0]] = 0
+    settings = {"dataset": tmp_path, "prior": tmp_path, "budget": 0}
+    run = Run(tmp_path, NbvSettings(**settings, train={"means": "free", "density": "split"}))
+    run.state, run.prior = Checkpoint(gaussians, np.ones((count, 14)), surface, []), here
+    run.settings.prior_std["mean"] = 1.0
+    assert diagnostics.run_scalars(run)["unobserved"].tolist() == [1] + [0] * (count - 1)

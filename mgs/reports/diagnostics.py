@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mgs.camera import Camera
 from mgs.colour import srgb_from_linear
@@ -28,7 +29,8 @@ DECADES = 4  # largest range of the logarithmic colour scales, in powers of ten
 
 def run_scalars(run: Run) -> dict[str, np.ndarray]:
     """Scalars of the model of a run (docs/evaluation.md), name -> [N]. H is about the fitted model,
-    by the run's estimator. `unobserved` is of the Gaussians before training."""
+    by the run's estimator. `unobserved` is of the Gaussians before training; a density control may
+    have changed these, and then each has that of the nearest."""
     from mgs.splat import groups
 
     H, settings, degree = run.state.H, run.settings, run.state.gaussians.sh_degree
@@ -42,7 +44,11 @@ def run_scalars(run: Run) -> dict[str, np.ndarray]:
     surface_lam = settings.regularisation(groups(degree), surface=True)
     unseen = ~criteria.observed(run.state.surface, surface_lam)
     scalars["unobserved"] = np.zeros(len(H))
-    scalars["unobserved"][: len(unseen)] = unseen
+    if settings.train.density == "fixed":
+        scalars["unobserved"][: len(unseen)] = unseen
+    else:  # they are no longer those before training
+        near = cKDTree(run.prior.points).query(run.state.gaussians.means)[1]
+        scalars["unobserved"][:] = unseen[near]
     return scalars
 
 
