@@ -14,7 +14,8 @@ from PIL import Image
 from program import change_settings, command
 from refusals import fails, refused
 
-from mgs.reports.video import _left, camera_path, path_among, write_film
+from mgs.reports.video import _left, _shown_view, camera_path, path_among, write_film
+from mgs.run.folder import open_run
 
 
 @pytest.fixture
@@ -116,3 +117,17 @@ def test_a_missing_encoder_is_one_line(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     line = refused(capsys, ["video", run, "--out", tmp_path / "a.mp4"], tmp_path)
     assert "`pip install imageio-ffmpeg`, or write a .gif" in line
+
+
+@pytest.mark.parametrize("on_demand", [False, True])
+def test_the_story_shows_a_new_view_where_one_has_an_image(run, on_demand):
+    opened = open_run(run)
+    names = [frame.name for frame in opened.taken]
+    if on_demand:  # then only views that were taken have one
+        frames = [replace(frame, on_demand=True) for frame in opened.dataset.frames]
+        gone = Path("nowhere.png")
+        frames = [f if f.name in names else replace(f, image_path=gone) for f in frames]
+        opened.dataset = replace(opened.dataset, frames=tuple(frames))
+    unknown = {"uncertainty": np.ones(len(opened.gaussians))}
+    shown = _shown_view(opened, opened.state, unknown)
+    assert (shown.name in names) == on_demand

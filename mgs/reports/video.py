@@ -196,10 +196,9 @@ def story_frames(run: Run) -> Film:
 
 
 def _shown_view(run: Run, model: State, unknown: dict[str, np.ndarray]) -> Frame:
-    tests, frames = run.dataset.test_views(), run.dataset.frames
-    new = [frame for i, frame in enumerate(frames) if i not in run.state.taken]
-    others = tests.frames if tests is not None else run.dataset.with_images({f.name for f in new})
-    choice = list(others or run.taken)
+    tests, taken = run.dataset.test_views(), run.taken
+    there = tests.frames if tests else run.dataset.with_images([frame.name for frame in taken])
+    choice = [frame for frame in there if frame not in taken] or taken
     shares = [_left(view_maps(model.gaussians, frame.camera, unknown)) for frame in choice]
     least_known = [f for f, mean in zip(choice, shares, strict=True) if mean >= np.median(shares)]
     return max(least_known, key=lambda frame: srgb_from_linear(frame.masked_rgb()).mean())
@@ -229,7 +228,8 @@ def _drawn(run: Run, model: State, maps: dict[str, np.ndarray], view: Frame) -> 
         draw_cameras(orbit, eyes, model.gaussians.means, *views, model.taken[-1])
         orbit.set_xlabel("cameras, from above")
         render.imshow(rgb[window], interpolation="nearest")
-        render.set_xlabel(f"render of a new view: {psnr(rgb, truth):.1f} dB")
+        which = "one view" if view in run.taken else "a new view"
+        render.set_xlabel(f"render of {which}: {psnr(rgb, truth):.1f} dB")
         image = show_map(map_, maps, "uncertainty", window, UNKNOWN, vmin=0, vmax=1)
         map_.set_axis_on()
         map_.set_xlabel(f"still unknown: {100 * _left(maps):.0f} %")
