@@ -339,3 +339,13 @@ def test_poses_that_are_not_allowed_are_never_taken(dataset, prior, tmp_path, ca
     positions = scene.positions(scene.frames)
     opposite = tour.legs(positions, scene.centre[:2], settings.flight.no_fly)[0, 6]
     assert 6 < opposite == pytest.approx(2 * np.sqrt(5) + 2 * (np.pi - 2 * np.arccos(2 / 3)), 0.01)
+
+
+@pytest.mark.parametrize(("name", "value"), [("seeds", 2), ("sh", 1)])
+def test_a_run_does_not_go_on_with_other_seeds_or_colours(half_done, name, value):
+    """Its next steps would have other numbers than its views, so it could not be read again."""
+    root, out = half_done
+    change_settings(out, **{name: value})
+    before = (out / "checkpoint.npz").read_bytes()
+    fails(rf"settings\.{name} has changed since", tiny.resume, out, load_dataset(root))
+    assert (out / "checkpoint.npz").read_bytes() == before

@@ -73,7 +73,7 @@ def run(
         recorder = Recorder(scene, settings, policy, stopwatch)
         state = None
         if checkpoint is not None:
-            state = resumed(scene, settings, checkpoint)
+            state = resumed(scene, checkpoint)
             check_model(out, scene, settings, state)
             before, checkpoint = checkpoint, recorder.marked(state, checkpoint)
             if before.steps != checkpoint.steps:
@@ -106,10 +106,10 @@ def asked_again(dataset: Dataset) -> Dataset:
     return replace(dataset, frames=tuple(frames))
 
 
-def resumed(scene: Scene, settings: NbvSettings, checkpoint: Checkpoint) -> State:
+def resumed(scene: Scene, checkpoint: Checkpoint) -> State:
     frames = captured(scene, scene.frames, checkpoint.taken)
-    taken, model = tuple(checkpoint.taken), checkpoint.gaussians
-    return State(frames, taken, settings.seeds, model, checkpoint.H, checkpoint.surface)
+    taken, seeds = tuple(checkpoint.taken), len(checkpoint.steps[0]["seeds"])
+    return State(frames, taken, seeds, checkpoint.gaussians, checkpoint.H, checkpoint.surface)
 
 
 def _go_on(
@@ -149,10 +149,15 @@ def _go_on(
 
 def check_model(out: Path, scene: Scene, settings: NbvSettings, state: State) -> None:
     """Raises InputError where a state does not belong to a run of these settings and this prior.
-    Its means must be those of the prior where they are frozen, and its parameters as many as the
-    run learns."""
-    if state.H.shape[1] != len(scene.lam):
-        where = f"{out / 'config.json'}: settings.train.means"
+    Its means must be those of the prior where they are frozen, its seeds and parameters as many as
+    the run has."""
+    changed = {
+        "seeds": state.seeds != settings.seeds,
+        "sh": state.gaussians.sh_degree != settings.sh,
+        "train.means": state.H.shape[1] != len(scene.lam),
+    }
+    if name := next((name for name, differs in changed.items() if differs), None):
+        where = f"{out / 'config.json'}: settings.{name}"
         raise InputError(f"{where} has changed since {out} was started; restore it")
     frozen = settings.train.means == "frozen"
     if frozen and not np.array_equal(state.gaussians.means, scene.untrained(state).means):
