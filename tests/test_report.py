@@ -225,11 +225,19 @@ def unfinished(run):
     edit("metrics.json", images=5)(run)
 
 
+def turned(run):
+    """A change of a run: its prior was built when another direction was up."""
+    (run / "prior").mkdir()
+    write_json(run / "prior/prior.json", {"up": [0, 1, 0]})
+    change_settings(run, prior=str(run / "prior"))
+
+
 UNFIT = {
     "measured before": (edit("metrics.json", images=7), "not evaluated since its last step"),
     "damaged metrics": (edit("metrics.json", views=[{}]), "is damaged (views.0.name: "),
     "view not measured": (edit("metrics.json", views=[], test_views=[]), "no view on which all"),
     "another dataset": (lambda run: change_settings(run, dataset="/"), "another dataset"),
+    "another up": (turned, "its prior has another upward direction"),
     "frames changed": (edit("config.json", frames=[]), "its frames differ"),
     "budget of words": (lambda run: change_settings(run, budget="many"), "budget = 'many': "),
     "budget raised": (lambda run: change_settings(run, budget=7), "with 8 of 10 views; go on"),

@@ -17,7 +17,7 @@ from mgs.policy.poses import path_length
 from mgs.reports import figures
 from mgs.reports.figures import Curves
 from mgs.run.ending import RunEnd
-from mgs.run.folder import STEPS, Run, holds_run, open_run, text_of
+from mgs.run.folder import STEPS, Run, holds_run, open_run, text_of, up_of_prior
 
 
 def compare_runs(runs: Sequence[str | PathLike[str]]) -> dict[str, Run]:
@@ -26,7 +26,8 @@ def compare_runs(runs: Sequence[str | PathLike[str]]) -> dict[str, Run]:
 
     runs: opened runs, their folders, or folders of these. Raises InputError as `open_run`,
     `Run.steps`, `Run.metrics` and `Run.dataset`; if steps.jsonl is not that of the run; if two runs
-    have the same policy and folder name; and if the runs are on different datasets."""
+    have the same policy and folder name; and if the runs are on different datasets, or their
+    priors have different upward directions."""
     opened = [one for run in runs for one in _opened(run)]
     if not opened:
         raise InputError("report: there are no runs; give the folder of one, or of several")
@@ -43,6 +44,10 @@ def compare_runs(runs: Sequence[str | PathLike[str]]) -> dict[str, Run]:
         if run.settings.dataset != first.settings.dataset:
             other = f"is a run on another dataset than {first.folder}"
             raise InputError(f"{run.folder}: {other}; compare runs on one dataset")
+        up = first.dataset.world.up
+        if not np.allclose(up_of_prior(run.settings.prior) or up, up):
+            other = f"its prior has another upward direction than that of {first.folder}"
+            raise InputError(f"{run.folder}: {other}; compare runs of one direction")
         run.check_frames(first.dataset)
         run.dataset = first.dataset
         _check_lines(run)
