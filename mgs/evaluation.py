@@ -97,8 +97,9 @@ def psnr_over(
     names = ("psnr", "psnr_mask", *(("psnr_corrected", "psnr_mask_corrected") if exposure else ()))
 
     def read(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        rgba, weight = as_captured(frames[index], world).target()
-        return srgb_from_linear(rgba[..., :3]), weight > 0, frames[index].mask() & (weight > 0)
+        frame = as_captured(frames[index], world)
+        rgba, weight = frame.target()
+        return srgb_from_linear(rgba[..., :3]), weight > 0, frame.mask() & (weight > 0)
 
     truth = kept_within(IMAGE_BYTES, read, lambda parts: sum(part.nbytes for part in parts))
 

@@ -198,6 +198,12 @@ class Scene:
             self.memo[key] = make()
         return self.memo[key]
 
+    def latest(self, name: str, key: Any, make: Callable[[], Value]) -> Value:
+        """Return make(), kept until another key of this name is asked for."""
+        if name not in self.memo or self.memo[name][0] != key:
+            self.memo[name] = key, make()
+        return self.memo[name][1]  # type: ignore[no-any-return]
+
     def with_seed(self, seed: int) -> "Scene":
         """The same scene with another seed of the policies' draws; computed values are kept."""
         other = copy(self)
@@ -344,8 +350,8 @@ class Scene:
 
     def surface(self, state: State) -> Visibility:
         """Visibility of the prior's surface from each pose; it depends on poses and prior alone."""
-        key = "surface", state.taken[: state.seeds], state.moved
-        return self.once(key, lambda: self._visibility(state))
+        key = state.taken[: state.seeds], state.moved
+        return self.latest("surface", key, lambda: self._visibility(state))
 
     def plan_surface(self, state: State) -> Visibility:
         """The same for directional gains. Where there are many pairs of a pose and a Gaussian, one
@@ -353,8 +359,8 @@ class Scene:
         k = one_in(len(self.prior.points), len(state.frames))
         if k == 1 or any(camera.film is not None for camera in state.cameras):
             return self.surface(state)
-        key = "plan", state.taken[: state.seeds], state.moved
-        return self.once(key, lambda: self._visibility(state, k))
+        key = state.taken[: state.seeds], state.moved
+        return self.latest("plan", key, lambda: self._visibility(state, k))
 
     def _visibility(self, state: State, k: int = 1) -> Visibility:
         start, cameras = self.untrained(state), state.cameras

@@ -1,5 +1,6 @@
 """Live capture: poses out, pictures back, by a command, a folder or a function."""
 
+import gc
 import itertools
 import json
 import math
@@ -7,25 +8,33 @@ import shutil
 import sys
 import threading
 import warnings
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import synthetic
 import tiny
-from program import command, steps, timeless
+from program import change_settings, command, steps, timeless
 from refusals import fails, refused
 from scipy.ndimage import gaussian_filter
 
 import mgs
 from mgs import load_dataset, load_prior
 from mgs.camera import look_at, opengl_from_opencv
+from mgs.data.frames import write_rock_image
 from mgs.data.world import unit_up
 from mgs.errors import InputError, Notice
-from mgs.images import read_exr, read_rgba, write_png
+from mgs.evaluation import psnr_measure
+from mgs.images import read_exr, read_mask, read_png, read_rgba, write_png
 from mgs.run import live
 from mgs.run.ending import why_ended
+from mgs.run.flight import flight_of
+from mgs.run.folder import read_checkpoint
 from mgs.run.live import check_photograph
+from mgs.run.settings import NbvSettings
+from mgs.splat import ListCache
 
 SCRIPT = """
 name=$(basename "$2" .pose.json)
@@ -388,3 +397,73 @@ def test_a_refused_picture_gets_the_next_number_whatever_lies_beside_it(tmp_path
         (tmp_path / name).touch()
     live._set_aside(tmp_path / "kf.png")
     assert (tmp_path / "kf.refused-3.png").is_file()
+
+
+def test_pictures_of_another_size_are_measured_in_the_run_that_took_them(flight, pristine):
+    """It has loaded its dataset before."""
+    small = {"w": 8, "h": 6, "fl_x": 8.0, "fl_y": 8.0, "cx": 4.0, "cy": 3.0}
+
+    def smaller(pose, out):
+        asked = json.loads(pose.read_text())
+        out.with_suffix(".flown.json").write_text(json.dumps(asked | small))
+        image, mask = read_png(out), read_mask(out.with_suffix(".mask.png"))
+        write_png(out, image[::2, ::2])
+        write_png(out.with_suffix(".mask.png"), mask[::2, ::2])
+
+    dataset = load_dataset(flight.dataset)
+    flight.fly(copying(pristine, smaller))
+    measure = psnr_measure(dataset, ListCache())
+    taken = [i for i, frame in enumerate(dataset.frames) if frame.name in flight.taken]
+    assert measure(read_checkpoint(flight.out).gaussians, taken)["psnr"] > 10
+
+
+def test_a_resumed_run_knows_as_much_of_a_batch_that_lost_a_pose(flight, other, pristine):
+    """The first picture of the batch, taken beside its pose, came before the second was lost."""
+
+    def losing(calls, interrupt):
+        def deliver(pose, out):
+            calls.append(out.stem)
+            if len(calls) == 5:
+                raise InputError("no link")
+            if len(calls) == 6 and interrupt:
+                raise KeyboardInterrupt
+            aside(pose, out)
+
+        return copying(pristine, deliver)
+
+    for one in (flight, other):
+        change_settings(one.out, batch=2)
+    with pytest.raises(KeyboardInterrupt):
+        flight.fly(losing([], True), tries=1)
+    flight.fly(copying(pristine, aside))
+    other.fly(losing([], False), tries=1)
+    assert flight.steps == other.steps
+
+
+def test_depth_in_millimetres_and_outlines_that_exist_are_kept(dataset, prior, tmp_path):
+    """The outlines are those of images of the rock alone."""
+    frame = load_dataset(dataset).frames[0]
+    depth, half = frame.depth(), frame.mask() & (np.arange(tiny.WIDTH) < tiny.WIDTH // 2)
+    write_png(dataset / "depth/0.png", np.round(1000 * depth).astype(np.uint16))
+    write_rock_image(dataset / "rock/0.png", np.dstack([frame.rgb() * half[..., None], half]))
+    files = {"depth_file_path": "depth/0.png", "rock_file_path": "rock/0.png", "mask_path": None}
+    synthetic.edit(dataset, lambda data: data["frames"][0].update(files))
+    (dataset / "images/kf_0004.png").unlink()
+    kept = load_dataset(Flight(tmp_path, dataset, prior).dataset).frames[0]
+    np.testing.assert_allclose(kept.depth(), depth, atol=5.1e-4)
+    np.testing.assert_array_equal(kept.mask(), half)
+
+
+def test_what_poses_see_is_forgotten_once_another_is_flown(loaded):
+    """Each would take memory in all steps to come."""
+    settings = NbvSettings(dataset=loaded.root, prior=loaded.root, policy="directional-i")
+    scene = tiny.scene(loaded, settings)
+    state = mgs.learn(scene, [0, 4, 8])
+    seen, legs = weakref.ref(scene.surface(state)), weakref.ref(flight_of(scene, state, settings))
+    assert (seen(), legs()) == (scene.surface(state), flight_of(scene, state, settings))
+    flown = replace(state.frames[1], camera=state.frames[2].camera, asked=state.frames[1].camera)
+    moved = replace(state, frames=(state.frames[0], flown, *state.frames[2:]))
+    scene.surface(moved)
+    flight_of(scene, moved, settings)
+    gc.collect()
+    assert (seen(), legs()) == (None, None)

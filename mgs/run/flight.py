@@ -58,9 +58,9 @@ def flight_of(scene: Scene, state: State, mission: Mission) -> "Flight":
     def legs() -> NDArray[np.float64]:
         return tour.legs(scene.positions(state.frames), scene.centre[:2], no_fly)
 
-    matrix = scene.once(("legs", state.moved, no_fly), legs)
-    key = "flight", state.moved, mission.flight, home, skipped
-    return scene.once(key, lambda: Flight(mission.flight, matrix, home, skipped))
+    matrix = scene.latest("legs", (state.moved, no_fly), legs)
+    key = state.moved, mission.flight, home, skipped
+    return scene.latest("flight", key, lambda: Flight(mission.flight, matrix, home, skipped))
 
 
 def check_seeds(scene: Scene, mission: Mission) -> None:

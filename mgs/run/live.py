@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from subprocess import DEVNULL, STDOUT, Popen, TimeoutExpired
@@ -173,9 +173,9 @@ def write_live_dataset(folder: Path, poses: Dataset, prior: Prior) -> None:
     silhouette = cache(lambda: silhouette_of(prior.mesh))
     for pose, frame in zip(poses.frames, frames, strict=True):
         if not pose.on_demand:
-            image, depth, mask = pose.image_path, pose.depth_path, pose.mask_path
-            shot = Shot(frame.name, frame.camera, None, frame.timestamp, image, depth)
-            _commit(folder, frame, replace(shot, mask=mask), silhouette, poses.world)
+            files = pose.image_path, pose.depth_path, DEPTH_UNIT, pose.mask_path, pose.rock_path
+            shot = Shot(frame.name, frame.camera, None, frame.timestamp, *files)
+            _commit(folder, frame, shot, silhouette, poses.world)
 
 
 def live_capture(dataset: Dataset, prior: Prior, live: Live | None) -> Callable[[Frame], Frame]:
@@ -308,7 +308,8 @@ def _commit(
 ) -> Frame:
     """Import a picture, check it, and write its record, which comes last."""
     remove_file(root, frame.image_path)  # of a picture that was refused or interrupted
-    result = import_shot(shot, root, None if shot.mask else silhouette(), 1, lambda: None)
+    outline = None if shot.mask or shot.rock else silhouette()
+    result = import_shot(shot, root, outline, 1, lambda: None)
     if result.mask_path is None:
         raise InputError(f"{shot.mask}: is no mask")
     check_photograph(result)

@@ -41,7 +41,10 @@ def select_views(
             return
         frames = captured(scene, state.frames, planned.taken[len(state.taken) :])
         if any(frames[i].given_up for i in planned.taken):
-            yield (state := replace(state, frames=frames))  # choose again without it
+            # Choose again without it. Others of its batch are not taken, and stay as asked for.
+            pairs = zip(state.frames, frames, strict=True)
+            lost = tuple(new if new.given_up else old for old, new in pairs)
+            yield (state := replace(state, frames=lost))
             continue
         state = learn(scene, planned.taken, state, frames, choices, planned.surface)
         yield state
