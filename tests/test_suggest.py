@@ -21,7 +21,7 @@ from mgs.data.clouds import SparseCloud, write_cloud
 from mgs.data.meshes import distances_to_mesh
 from mgs.data.world import World, unit_up
 from mgs.progress import listening
-from mgs.reports.suggestion import write_suggestion
+from mgs.reports.suggestion import numbers, write_suggestion
 from mgs.run.candidates import Site, hidden, inside, place_poses, read_poses, refusals
 from mgs.run.nbv import start_fit
 from mgs.run.suggest import coarse_prior, suggest
@@ -411,3 +411,11 @@ def test_headings_straight_down_and_up_and_in_a_world_that_stands_otherwise():
     assert heading_and_pitch(world.enter(west)) == pytest.approx((270, 0))
     north = Camera(camera.K, 8, 8, look_at([0, 0, 0], [0, 0, 1], [0, -1, 0]))
     assert heading_and_pitch(world.enter(north)) == pytest.approx((0, 0))
+
+
+@pytest.mark.parametrize("policy", [None, "random"])
+def test_a_suggestion_names_the_policy_that_made_it(run, site, policy):
+    """A fit has chosen nothing."""
+    opened, ring = open_run(run), place_poses("ring", 6, 2.6, (25, 35), site)
+    made = numbers(opened, suggest(opened, ring, 2, policy=policy))
+    assert made["policy"] == (policy or opened.settings.policy)

@@ -21,8 +21,8 @@ from mgs.run.folder import Run
 from mgs.run.suggest import Suggestion, View, taken_in_order
 
 CONVENTION = (
-    "transform_matrix: camera to world, metres, OpenGL axes (x right, y up, z backwards), as in "
-    "nerfstudio"
+    "transform_matrix: camera to world, in the dataset's unit, OpenGL axes (x right, y up, z "
+    "backwards), as in nerfstudio"
 )
 
 CHOSEN = "#d1495b"  # colour of the planned views, and of the image from which the way is told
@@ -54,7 +54,7 @@ def numbers(run: Run, suggestion: Suggestion) -> dict[str, Any]:
     world, worth = run.dataset.world, suggestion.certificate
     names = [view.name for view in suggestion.ranking]
     return {
-        "policy": run.label,
+        "policy": suggestion.policy,
         "images": len(run.taken),
         "convention": CONVENTION,
         "units": units,

@@ -78,7 +78,7 @@ class Suggestion:
     flight from the first image taken through the plan and back; seconds: its time. dropped:
     reasons for which candidates cannot be flown, with their numbers. corners: points of the way
     before each planned view and before home, where it leads around the no-fly cylinder.
-    certificate: bounds of the plan by the policy's criterion, with prices in the order of
+    policy: its name. certificate: bounds of the plan by its criterion, with prices in the order of
     `ranking`; None where the policy has none, or all candidates are planned. refined: gain of the
     plan by Eq. 7 before and after its poses moved; None without `refine`."""
 
@@ -88,6 +88,7 @@ class Suggestion:
     seconds: float
     dropped: dict[str, int]
     corners: list[NDArray[np.float64]]
+    policy: str
     certificate: Certificate | None = None
     refined: tuple[float, float] | None = None
 
@@ -168,7 +169,7 @@ def suggest(
     corners = [tour.leg_corners(a, b, axis, radius) for a, b in pairwise(ends)]
     metres = tour.tour_length(flight_of(scene, state, mission).legs, way)
     seconds = metres / mission.flight.speed + mission.flight.hover * len(plan)
-    return Suggestion(ranking, plan, metres, seconds, dropped, corners, worth, gains)
+    return Suggestion(ranking, plan, metres, seconds, dropped, corners, rule.name, worth, gains)
 
 
 def site_of(run: Run) -> Site:
