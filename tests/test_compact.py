@@ -549,3 +549,12 @@ def test_the_start_hides_the_last_bits(prior):
     np.testing.assert_array_equal(one.means, other.means)
     np.testing.assert_array_equal(one.quats, other.quats)
     assert exact.world.up == PLUS_Z
+
+
+def test_no_more_gaussians_are_read_than_the_header_says(tmp_path, monkeypatch):
+    """Each of the tiles has fewer; room is checked for the number of the header."""
+    monkeypatch.setattr("mgs.compact.encode.TILE", 100)
+    file, path = small().file(0.02), tmp_path / "x.mgs"
+    assert file.header.tiles == 3
+    path.write_bytes(bytes(replace(file, header=replace(file.header, n=299))))
+    fails("more Gaussians than its header says", load_gaussians, path)

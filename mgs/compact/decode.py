@@ -106,7 +106,7 @@ def _positions(
     above = None if among is None else np.unique(among >> cut)
     top = code_descendants(decoder(data), root, DEPTH - cut, _most(header, data), among=above)
     tile = 1 + np.arange(len(top)) * tiles // len(top)
-    codes, lone = [], []
+    codes, lone, left = [], [], header.n
     for number in range(1, tiles + 1):
         nodes = top[tile == number]
         data = packets.get((number, "position", 0), b"")
@@ -114,6 +114,8 @@ def _positions(
             part = code_descendants(decoder(data), nodes, cut, _most(header, data), among=among)
         else:
             part = lone_cells(nodes, cut, among)
+        if (left := left - len(part)) < 0:
+            raise ValueError("it has more Gaussians than its header says")
         codes.append(part)
         lone.append(np.full(len(part), not data))
     # Sizes grow by the fourth root of the cells of a node, n / M, in steps of 1/64. With the root,
