@@ -28,6 +28,7 @@ from mgs.errors import InputError, Notice
 from mgs.evaluation import render_view
 from mgs.reports import compacting
 from mgs.rotation import rotmat_from_quat
+from mgs.run.folder import write_checkpoint
 from mgs.run.nbv import start_fit
 from mgs.splat_files import load_gaussians, upward
 from mgs.splat_places import from_source
@@ -558,3 +559,19 @@ def test_no_more_gaussians_are_read_than_the_header_says(tmp_path, monkeypatch):
     assert file.header.tiles == 3
     path.write_bytes(bytes(replace(file, header=replace(file.header, n=299))))
     fails("more Gaussians than its header says", load_gaussians, path)
+
+
+def test_a_scene_is_coded_without_what_no_view_shows(dataset, prior, tmp_path, monkeypatch):
+    """Pruning alone leaves some of it, since it takes no neighbours at once."""
+    run = small_run(dataset, prior, tmp_path / "run")
+    model, unseen = run.gaussians[[*range(len(run.gaussians)), *[0] * 60]], slice(-60, None)
+    model.means[unseen] = np.random.default_rng(0).normal((0, 0, 60), 0.5, (60, 3))
+    H = sum(mgs.fisher(model, frame.camera) for frame in run.taken)
+    write_checkpoint(run.folder, replace(run.state, gaussians=model, H=H))
+    mgs.write_ply(run.folder / "gaussians.ply", model)
+    monkeypatch.setattr(mgs.Run, "of_scene", True)
+    run = open_run(run.folder)
+    assert not run.shown[unseen].any()
+    for some, kept in islice(compacting.thinned(run, whole=False), 2):
+        assert len(some) == len(kept) > 0
+        assert run.shown[kept].all()

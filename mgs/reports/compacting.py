@@ -224,15 +224,18 @@ def thin_run(run: Run, kind: str, size: int | None = None, psnr: float | None = 
 
 
 def thinned(run: Run, whole: bool) -> Iterator[tuple[Gaussians, np.ndarray]]:
-    """The run's model, whole or pruned, then with a half to a sixteenth of its Gaussians, fitted
-    once more if the prior's folder exists; each with the indices of its Gaussians."""
+    """The run's model whole, or what it shows (`Run.shown`) pruned, then with a half to a sixteenth
+    of these Gaussians, fitted once more if the prior's folder exists; each with their indices."""
     from mgs.fit.pruning import fewest, prune
 
     g, cameras = run.state.gaussians, [frame.camera for frame in run.taken]
-    kept = np.arange(len(g))
+    kept = rest = np.arange(len(g))
     report("removing Gaussians")
-    rest = kept if whole else prune(g, cameras, PRUNE_NOISE).kept
-    yield g[rest], rest
+    if not whole:
+        kept = np.flatnonzero(run.shown)
+        g = g[kept]
+        rest = prune(g, cameras, PRUNE_NOISE).kept
+    yield g[rest], kept[rest]
     again = refitting(run) if run.settings.prior.is_dir() else None
     for _ in range(THINNINGS):
         count = max(1, len(g) // 2)
