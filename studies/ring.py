@@ -137,7 +137,7 @@ def write(work: Work) -> list[Path]:
         gains = [None, *row["score"]] if row["variant"] != GREEDY else [None] * (CHOICES + 1)
         for k, (gain, seen) in enumerate(zip(gains, row["observed"], strict=True)):
             shown = {"choice": k, "seen": 100 * seen} | ({} if gain is None else {"gain": gain})
-            steps.append({"variant": row["variant"]} | shown)
+            steps.append({"variant": row["variant"].replace("`", "")} | shown)
     panels = [
         Panel("choice", "gain", "choice", "gain of the view taken (Eq. 7)", "variant"),
         Panel("choice", "seen", "choice", "Gaussians observed (%)", "variant"),
