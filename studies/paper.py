@@ -27,8 +27,7 @@ from studies.setups import SETUPS, SIZES, SetupSize, case_of, shared_scene, size
 SEEDS, CHOICES = 4, 8
 
 LETTER, OURS, DEFAULT = "to the letter", "`paper` of mgs", "default of mgs"
-EXACT = "`d-optimal` of mgs"
-OF_MGS = OURS, DEFAULT, EXACT
+OF_MGS = OURS, DEFAULT
 
 FREE = 1e3
 """Factor on the standard deviations of the prior, with which it has no effect on a fit."""
@@ -102,6 +101,9 @@ def scene_of(whole: mgs.Scene, variant: str) -> mgs.Scene:
     scene = kind(whole.dataset, whole.prior, settings)
     if variant != INSET:
         scene.__dict__["pixel"] = 0.0  # the unit of the depth below the surface
+    scene.__dict__["surface_lam"] = (
+        whole.surface_lam
+    )  # without a prior all that is seen is observed
     return scene
 
 

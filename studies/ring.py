@@ -1,8 +1,8 @@
 """The paper's figures 2 and 3: gain and coverage over fifty choices of the 100 views of a ring.
 
-Four even seeds, then one view at a time, by Eq. 7 or by coverage-greedy choice; and one seed, by
-which Eq. 13 is tested. To the letter is as in `studies.paper`, but what counts as observed (Eq. 9)
-is as in mgs.
+Four even seeds, then one view at a time, by Eq. 7 or by coverage-greedy choice; and one seed, to
+test Eq. 13. "To the letter" is as in `studies.paper`, except that a Gaussian is observed (Eq. 9)
+with the lambda of mgs.
 """
 
 from collections.abc import Sequence
@@ -14,14 +14,22 @@ from typing import Any
 import numpy as np
 
 import mgs
-from mgs.policy.criteria import coverage
-from mgs.run.policies import Policy
+from mgs.policy.criteria import coverage, d_optimal
+from mgs.run.policies import Policy, each
 from studies.frame.case import ROCKS
-from studies.frame.output import Panel, draw_panels, grouped, scene_mean, table, write_table
+from studies.frame.output import (
+    Panel,
+    draw_panels,
+    grouped,
+    scene_mean,
+    table,
+    text_of,
+    write_table,
+)
 from studies.frame.program import WORKERS, Study, Work, study_of
 from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
-from studies.paper import DEFAULT, EXACT, LETTER, OF_MGS, OURS, Letter, follow, scene_of
+from studies.paper import DEFAULT, LETTER, OF_MGS, OURS, Letter, follow, scene_of
 from studies.setups import RING, Setup, SetupSize, case_of, shared_scene, sized
 
 VIEWS, CHOICES = 100, 50
@@ -30,10 +38,21 @@ SIZES = {"quick": SetupSize(96, 72), "paper": SetupSize(320, 240, 24, 16)}
 
 GREEDY = "coverage-greedy, to the letter"
 
+EXACT = "exact information, else to the letter"
+
+
+def exact_letter(scene: mgs.Scene, state: mgs.State, views: list[int]) -> np.ndarray:
+    """Eq. 7 by the exact diagonal of J^T J [C]; lambda is its mean for one view taken, as in
+    `mgs.Paper`."""
+    H = np.stack([scene.information(state, i) for i in state.taken]).sum(axis=0, dtype=np.float64)
+    lam = np.full_like(scene.lam, H.mean() / len(state.taken))
+    return each(views, lambda i: d_optimal(scene.information(state, i), H, lam))
+
+
 POLICIES: dict[str, Policy] = {LETTER: Letter(), OURS: mgs.Paper(), GREEDY: mgs.Coverage()}
 
-POLICIES_FROM_ONE: dict[str, Policy] = {
-    LETTER: Letter(), OURS: mgs.Paper(), EXACT: mgs.DOptimal(), DEFAULT: mgs.Directional(),
+POLICIES_FROM_ONE: dict[str, Any] = {
+    LETTER: Letter(), OURS: mgs.Paper(), EXACT: exact_letter, DEFAULT: mgs.Directional(),
 }  # fmt: skip
 
 
@@ -58,7 +77,6 @@ def run(root: Path, out: Path, dataset: str, prior: str, variant: str) -> dict[s
     views taken observe (Eq. 9), after the seeds and after each choice."""
     whole, tests, pool = shared_scene(root / dataset, root / prior, None)
     scene, scores, observed = scene_of(whole, variant), [], []
-    scene.__dict__["surface_lam"] = whole.surface_lam
     for state, score in follow(scene, POLICIES[variant], CHOICES):
         scores.append(score)
         observed.append(coverage(state.surface, scene.surface_lam))
@@ -77,7 +95,6 @@ def run_from_one(root: Path, out: Path, dataset: str, prior: str, variant: str) 
     choice; and "seen" as `rows_of`, of these four views."""
     whole = shared_scene(root / dataset, root / prior, None)[0]
     scene, policy = scene_of(whole, variant), POLICIES_FROM_ONE[variant]
-    scene.__dict__["surface_lam"] = whole.surface_lam
     states = [state for state, _ in follow(scene, policy, 3, seeds=1)]
     seed, first = states[-1].taken[:2]
     opposite, *beside = policy(scene, states[0], [(seed + k) % VIEWS for k in (VIEWS // 2, 1, -1)])
@@ -93,8 +110,11 @@ def rows_of(work: Work) -> list[Row]:
     """A row for each rock, policy and number of seeds. From four: "first" and "last" gain, "rises"
     and "largest_rise" between neighbouring choices, all None for coverage-greedy choice; shares
     "seen" after the seeds and "seen_last" at the end, in %; "useful", choices after which more is
-    observed."""
+    observed; "pool_change", "pool" over that of the letter, dB."""
     rows = work.rows()
+    letter = {
+        row["rock"]: row["pool"] for row in rows if (row["variant"], row["seeds"]) == (LETTER, 4)
+    }
     for row in rows:
         if row["seeds"] == 1:
             continue
@@ -109,6 +129,7 @@ def rows_of(work: Work) -> list[Row]:
         row |= by_gain if row["variant"] != GREEDY else dict.fromkeys(by_gain)
         row |= {"seen": 100 * observed[0], "seen_last": 100 * observed[-1]}
         row["useful"] = sum(b > a for a, b in pairwise(observed))
+        row["pool_change"] = row["pool"] - letter[row["rock"]]
     return rows
 
 
@@ -116,10 +137,11 @@ def tables(rows: Sequence[Row]) -> str:
     """Tables of the policies from four seeds and from one, means over scenes with intervals."""
     columns: dict[str, Any] = {"4 + 50 of 100 views": "variant"}
     columns |= {"all views (dB)": scene_mean("pool", ".2f")}
+    columns |= {"change": scene_mean("pool_change", "+.2f")}
     columns |= {"observed by the seeds (%)": scene_mean("seen", ".1f")}
     columns |= {"choices that observe more": scene_mean("useful", ".1f")}
-    columns |= {"first gain": scene_mean("first", ".3f")}
-    columns |= {"last": scene_mean("last", ".4f")}
+    first, last = scene_mean("first", ".3f", ends=False), scene_mean("last", ".4f", ends=False)
+    columns |= {"first and last gain": lambda row: f"{text_of(first, row)}, {text_of(last, row)}"}
     columns |= {"rises of 49": scene_mean("rises", ".1f")}
     one: dict[str, Any] = {"1 + 3 of 100 views": "variant"}
     one |= {"opposite view's score over a neighbour's": scene_mean("opposite", ".1f")}

@@ -214,18 +214,28 @@ def test_the_papers_h_squares_the_gradient_of_the_training_loss(linear):
 
 
 def test_rows_of_the_ring_count_rises_and_choices_that_observe_more():
-    result = {"score": [0.3, 0.1, 0.2, 0.1], "observed": [0.5, 0.6, 0.6, 0.6, 0.7]}
-    about = {"rock": "boulder-11", "scene": "boulder", "seeds": 4}
-    cells = [Cell(name, "", about=about | {"variant": name}) for name in (LETTER, ring.GREEDY)]
-    work = Work(SimpleNamespace(), "", None, cells, {cell.name: result for cell in cells})
-    letter, greedy = ring.rows_of(work)
-    assert {key: letter[key] for key in ("first", "last", "rises", "useful")} == {
-        "first": 0.3, "last": 0.1, "rises": 1, "useful": 2,
-    }  # fmt: skip
+    scores, observed = [0.3, 0.1, 0.2, 0.1], [0.5, 0.6, 0.6, 0.6, 0.7]
+    about, names = {"rock": "boulder-11", "scene": "boulder", "seeds": 4}, (LETTER, ring.GREEDY)
+    cells = [Cell(name, "", about=about | {"variant": name}) for name in names]
+    results = {
+        name: {"pool": pool, "score": scores, "observed": observed}
+        for name, pool in zip(names, (30.0, 30.5), strict=True)
+    }
+    letter, greedy = ring.rows_of(Work(SimpleNamespace(), "", None, cells, results))
+    assert [letter[key] for key in ("first", "last", "rises", "useful")] == [0.3, 0.1, 1, 2]
     assert letter["largest_rise"] == pytest.approx(0.1)
     assert [letter["seen"], letter["seen_last"]] == pytest.approx([50, 70])
     assert greedy["rises"] is None
     assert greedy["useful"] == 2
+    assert [letter["pool_change"], greedy["pool_change"]] == [0, 0.5]
+
+
+def test_exact_information_to_the_letter_is_eq_7():
+    """Two Gaussians of one parameter: a view of the unseen one gains more."""
+    F = {0: [[1.0], [0.0]], 1: [[1.0], [0.0]], 2: [[0.0], [1.0]]}
+    scene = SimpleNamespace(lam=np.ones(1), information=lambda state, i: np.array(F[i]))
+    found = ring.exact_letter(scene, SimpleNamespace(taken=(0,)), [1, 2])
+    assert found == pytest.approx([np.log(1 + 1 / 1.5) / 2, np.log(1 + 1 / 0.5) / 2])
 
 
 def test_visibility_baselines_prefer_the_other_side():

@@ -37,10 +37,10 @@ Vector = list[Any]  # of each array of `mgs.gaussians.learned`, a TensorXf of it
 class Target:
     """Target of a fit as the kernels take it."""
 
-    values: Any  # mi.Float [H*W*S], channels as in `mgs.fit.fitting.fit_gaussians`; or mi.UInt8
+    values: Any  # mi.Float [H*W*S], channels as in `mgs.fit.fitting.fit_gaussians`; of 8 bits UInt8
     alpha_factor: Any  # of the differences in alpha, mi.Float [1]; None: not compared
     stored: int  # S, 3 to 5
-    levels: Any = None  # of `values` of 8 bits, mi.Float [512]: colours, then weights and alpha
+    levels: Any = None  # what 8 bits stand for, mi.Float [512]: colours, then weights and alpha
 
     @property
     def channels(self) -> int:
@@ -49,7 +49,7 @@ class Target:
 
     @property
     def recorded(self) -> tuple[int, ...]:
-        """What a recording holds as constants (`mgs.splat.recording.frozen`)."""
+        """Number of channels, and whether they are floats: constants of a recording."""
         return self.stored, self.levels is None
 
     def __len__(self) -> int:
@@ -84,6 +84,7 @@ class Target:
         return index // self.channels, index % self.channels
 
     def _at(self, pixel: Any, channel: Any) -> Any:
+        """Values of channels of pixels, mi.Float."""
         value = dr.gather(type(self.values), self.values, pixel * self.stored + channel)
         if self.levels is None:
             return value
