@@ -38,8 +38,8 @@ LOADED = re.compile(
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the changelog, which lies outside docs/."""
-    text = CHANGELOG.read_text(encoding="utf-8")
+    """Add the changelog, which lies outside docs/ and whose links lead there from the root."""
+    text = CHANGELOG.read_text(encoding="utf-8").replace("](docs/", "](")
     files.append(File.generated(config, "changelog.md", content=text))
     return files
 
