@@ -12,7 +12,7 @@ import time
 from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -53,7 +53,8 @@ from studies.setups import before_any_fit, choose_views
 
 NAME = "blender"
 
-RANDOM = "random"
+FARTHEST = "farthest"
+"""Policy over which others lead: the default from random points."""
 
 TEST_EVERY = 5
 """Photographs for each test view, which is the middle one of so many by name."""
@@ -64,7 +65,7 @@ ALPHA_WEIGHT = 1.0
 ONCE = ("popgs-block",)
 """Policies that are run with the first draw alone, since they take minutes."""
 
-OURS = (RANDOM, "farthest", "directional-i", "directional-d", "cover", "uniform", "d-optimal")
+OURS = ("random", FARTHEST, "directional-i", "directional-d", "cover", "uniform", "d-optimal")
 """Policies of mgs by their names."""
 
 COMPARED: dict[str, Any] = {
@@ -124,7 +125,7 @@ SIZES = {
         passes=15,
         draws=5,
         policies=(
-            *("random", "farthest", "directional-i", "d-optimal", "cover"),
+            *("random", FARTHEST, "directional-i", "d-optimal", "cover"),
             *("paper, no means", "fisherrf, code"),
         ),
     ),
@@ -307,29 +308,40 @@ def on_white(frame: mgs.Frame) -> np.ndarray:
 
 
 def means_of(rows: Sequence[Row]) -> list[Row]:
-    """A row for each number of views and policy, best first: means over scenes and draws. PSNR and
-    lead over `random` have 95 % intervals over the scenes, each a mean over the draws; where there
-    are only two, over the draws of the random start."""
-    unit = "scene" if len({row["scene"] for row in rows}) > 2 else "draw"
+    """A row for each number of views and policy, by lead: means over scenes and draws. "lead" is
+    over `FARTHEST` from the same start; where there are only two scenes, also "lead SCENE". PSNR
+    and lead have 95 % intervals over the scenes, each a mean over the draws; where there are only
+    two, over the draws of the random start."""
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    unit = "scene" if len(scenes) > 2 else "draw"
+    start = ("views", "scene", "draw")
     base = {
-        (row["views"], row["scene"], row["draw"]): row["psnr"]
-        for row in rows
-        if row["policy"] == RANDOM
+        tuple(row[key] for key in start): row["psnr"] for row in rows if row["policy"] == FARTHEST
     }
     means = []
     for group in grouped(rows, "views", "policy"):
         of = group.pop("of")
         for row in of:
-            against = base.get((row["views"], row["scene"], row["draw"]))
+            against = base.get(tuple(row[key] for key in start))
             row["lead"] = None if against is None else row["psnr"] - against
-        for key in ("psnr", "lead") if all(row["lead"] is not None for row in of) else ("psnr",):
-            values = [_mean(one["of"], key) for one in grouped(of, unit)]
-            low, high = interval(values) or (None, None)
-            group |= {key: _mean(of, key), f"{key}_low": low, f"{key}_high": high}
-        group |= {f"psnr {one['scene']}": _mean(one["of"], "psnr") for one in grouped(of, "scene")}
+        group |= _with_bounds(of, "psnr", "psnr", unit) | _with_bounds(of, "lead", "lead", unit)
+        for scene in scenes if unit == "draw" else ():
+            some = [row for row in of if row["scene"] == scene]
+            group |= {f"psnr {scene}": _mean(some, "psnr")} if some else {}
+            group |= _with_bounds(some, "lead", f"lead {scene}", unit)
         group |= {key: _mean(of, key) for key in ("choice", "fits", "fit")}
         means.append(group | {"runs": len(of)})
-    return sorted(means, key=lambda row: (str(row["views"]), -row["psnr"]))
+    by = "lead" if all("lead" in row for row in means) else "psnr"
+    return sorted(means, key=lambda row: (str(row["views"]), -row[by]))
+
+
+def _with_bounds(rows: Sequence[Row], key: str, name: str, unit: str) -> Row:
+    """Mean of a key of the rows as `name`, and its interval over the values of `unit`; empty where
+    a row has none."""
+    if not rows or any(row[key] is None for row in rows):
+        return {}
+    low, high = interval([_mean(one["of"], key) for one in grouped(rows, unit)]) or (None, None)
+    return {name: _mean(rows, key), f"{name}_low": low, f"{name}_high": high}
 
 
 def _mean(rows: Sequence[Row], key: str) -> float:
@@ -337,14 +349,15 @@ def _mean(rows: Sequence[Row], key: str) -> float:
 
 
 def tables(rows: Sequence[Row]) -> str:
-    """Table of policies, with a column for each scene if these are two, and that of PUBLISHED."""
+    """Table of policies, with columns for each scene if these are two, and that of PUBLISHED."""
     columns: dict[str, Content] = {"views": "views", "policy": "policy"}
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    if len(scenes) <= 2:
-        columns |= {f"{scene} (dB)": f"psnr {scene}:.2f" for scene in scenes}
+    for scene in scenes if len(scenes) <= 2 else ():
+        columns[f"{scene} (dB)"] = f"psnr {scene}:.2f"
+        columns[f"{scene}, over {FARTHEST}"] = partial(with_interval, key=f"lead {scene}")
     columns |= {
         "mean (dB)": "psnr:.2f",
-        "over random (dB)": lambda row: with_interval(row, "lead"),
+        f"over {FARTHEST}": partial(with_interval, key="lead"),
         "CPU s a choice": "choice:.2f",
         "CPU s of fits between": "fits:.0f",
     }

@@ -58,7 +58,11 @@ def test_every_policy_runs_and_no_candidate_is_read(scenes, tmp_path, monkeypatc
     training = {name for name in read if name.startswith("train")}
     names = [f"train_r_{i}" for i in range(12)]
     assert training == {names[i] for views in taken for i in views}
-    assert "POp-GS D" in (out / "blender.md").read_text()
+    far, other = (next(row for row in rows if row["policy"] == p) for p in ("farthest", "uniform"))
+    assert (far["lead"], other["lead"]) == (0, other["psnr"] - far["psnr"])
+    text = (out / "blender.md").read_text()
+    assert "POp-GS D" in text
+    assert f"| {other['psnr']:.2f} | {other['lead']:+.2f} |" in text
     assert (out / "blender.png").is_file()
 
 
