@@ -237,9 +237,10 @@ def curve(criterion: Criterion, plan: Sequence[int], even: Sequence[int]) -> lis
     `criterion.coarse`."""
     count, coarse, rng = criterion.candidates, criterion.coarse, np.random.default_rng(0)
     every, about = (one.gain(range(count)) for one in (criterion, coarse))
-    order, draws = greedy(coarse, 1.0), [rng.permutation(count) for _ in range(5)]
+    sizes = sorted(k for k in {*CURVE, len(plan)} if k < count)
+    order, draws = greedy(coarse, 1.0, sizes[-1]), [rng.permutation(count) for _ in range(5)]
     rows = []
-    for k in sorted(k for k in {*CURVE, len(plan)} if k < count):
+    for k in sizes:
         taken = plan if k == len(plan) else order[:k]
         shares = {
             "bound": min(least_bound(criterion, k, CLOSE / 4) / every, 1.0),

@@ -19,7 +19,7 @@ from mgs.run.settings import ENOUGH, Mission
 from mgs.scene import Scene, State
 
 SEARCH_NODES, SEARCH_PAIRS = 40, 2_000_000  # most nodes, and nodes times pairs: about a second
-CURVE_PAIRS = 3_000_000  # most pairs of a candidate and a Gaussian for the curve of a certificate
+CURVE_PAIRS = 1_000_000  # most pairs of a candidate and a Gaussian for the curve of a certificate
 
 
 def certificate(
