@@ -37,15 +37,7 @@ from studies.frame.program import WORKERS, Study, Work, study_of
 from studies.frame.statistics import Row
 from studies.frame.sweep import Cell
 from studies.policies import angle
-from studies.setups import (
-    SETUPS,
-    Results,
-    SetupSize,
-    before_any_fit,
-    case_of,
-    shared_scene,
-    sized,
-)
+from studies.setups import SETUPS, Results, SetupSize, before_any_fit, case_of, shared_scene, sized
 
 SIZES = {
     "quick": SetupSize(gaussians=6000, passes=10),

@@ -345,13 +345,7 @@ STUDY = Study(
     write,
     SIZES,
     lambda size: [cell for run in table_runs(size).values() for cell in run.cells()],
-    {
-        "--batch": {
-            "type": at_least(1),
-            "default": 1,
-            "help": "Views chosen before the next fit.",
-        }
-    },
+    {"--batch": {"type": at_least(1), "default": 1, "help": "Views chosen before the next fit."}},
     lambda size, options: replace(size, batch=options.batch),
     growing=True,
 )

@@ -8,13 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from studies.frame.output import grouped, scene_mean, table, with_interval
-from studies.frame.statistics import (
-    MOST_ROCKS,
-    holm,
-    interval,
-    pareto_front,
-    permutation_p,
-)
+from studies.frame.statistics import MOST_ROCKS, holm, interval, pareto_front, permutation_p
 
 numbers = st.floats(-10, 10, allow_nan=False).map(lambda x: round(x, 3))
 

@@ -251,10 +251,7 @@ def _changed(
 
 
 def _counted(
-    goal: Objective,
-    state: FitState,
-    most: int,
-    on_image: Callable[[int, int], None],
+    goal: Objective, state: FitState, most: int, on_image: Callable[[int, int], None]
 ) -> Objective:
     """The objective with `on_image` called, and `state.images` counted, at each use of an image."""
     photos = goal.photos

@@ -23,13 +23,7 @@ from mgs.run import inputs
 from mgs.run.checks import Checks
 from mgs.run.ending import RunEnd, diverged, run_end
 from mgs.run.flight import flight_of, free, reachable
-from mgs.run.folder import (
-    Checkpoint,
-    read_checkpoint,
-    read_config,
-    write_checkpoint,
-    write_steps,
-)
+from mgs.run.folder import Checkpoint, read_checkpoint, read_config, write_checkpoint, write_steps
 from mgs.run.loop import mean_uncertainty, select_views
 from mgs.run.policies import Policy
 from mgs.run.policy_file import policy_of

@@ -8,14 +8,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from mgs.errors import InputError, row_named
 from mgs.files import read_json, read_toml
-from mgs.fit.settings import (
-    MEAN_RATE,
-    Frozen,
-    ModelSettings,
-    PoseNoise,
-    Positive,
-    Scale,
-)
+from mgs.fit.settings import MEAN_RATE, Frozen, ModelSettings, PoseNoise, Positive, Scale
 from mgs.policy.criteria import MEAN_STD, PRIOR_STD
 from mgs.run.policy_file import check_policy
 
