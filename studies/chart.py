@@ -24,7 +24,7 @@ from mgs.fit.settings import PASSES, WARM_PASSES, WARM_RATE
 from studies.chart_points import draw, points_over_rocks, tables
 from studies.frame.case import ROCKS, Case, Rock, Size, judge, rocks_of, test_views_of
 from studies.frame.output import write_table
-from studies.frame.program import Study, Work, at_least, names_of, study_of
+from studies.frame.program import Study, Work, at_least, study_of
 from studies.frame.statistics import Row
 from studies.frame.sweep import Cell, Results
 from studies.frame.timing import REFERENCE, timed
@@ -253,8 +253,8 @@ def check_dataset(dataset: Path) -> None:
 
 
 def sized(size: ChartSize, options: Namespace) -> ChartSize:
-    """Size with the options. Raises InputError as `rocks_of`, `check_dataset` and `names_of`, and
-    for rocks beside a dataset."""
+    """Size with the options. Raises InputError as `rocks_of` and `check_dataset`, and for rocks
+    beside a dataset."""
     given: Path | None = options.dataset and options.dataset.resolve()
     rocks = rocks_of(options, ROCK_COUNT)
     if given:
@@ -262,7 +262,8 @@ def sized(size: ChartSize, options: Namespace) -> ChartSize:
         if options.rocks or options.training or options.mesh or options.scene:
             raise mgs.InputError("--dataset: takes the place of rocks; leave out one of the two")
         rocks = (Rock(given.name),)
-    kinds, repeats = tuple(names_of(options.only, KINDS)), options.repeats or size.repeats
+    kinds = (options.only,) if options.only else KINDS
+    repeats = options.repeats or size.repeats
     return replace(size, rocks=rocks, given=given, kinds=kinds, repeats=repeats)
 
 
@@ -285,11 +286,8 @@ STUDY = Study(
     cells_of,
     {
         **ROCKS,
-        "--dataset": {
-            "type": Path,
-            "help": "A dataset with test views, in place of rocks.",
-        },
-        "--only": {"help": "fit or run. Default: both."},
+        "--dataset": {"type": Path, "help": "A dataset with test views, in place of rocks."},
+        "--only": {"choices": KINDS, "help": "Default: both."},
         "--repeats": {
             "type": at_least(1),
             "help": "Timings of each point; the median counts. Default: quick 1, full 3.",

@@ -17,7 +17,6 @@ from distributed import LocalCluster
 from refusals import fails
 
 from studies.frame import program, sweep
-from studies.frame.program import names_of
 from studies.frame.sweep import Cell, cell_folder, result_of, run_cells
 
 CALLS = []
@@ -82,13 +81,6 @@ def test_cells_of_a_study_have_one_name_each_and_all_they_need():
             assert json.loads(json.dumps(one.arguments)) == one.arguments, study
             assert one.alone or study != "chart" or "repeats" not in one.arguments
     assert {"setups", "oracle", "survey", "flights", "certificate", "table1", "stress"} < seen
-
-
-def test_names_come_in_the_order_of_those_known():
-    assert names_of(None, [*"abc"]) == ["a", "b", "c"]
-    assert names_of("c, a,c", [*"abc"]) == ["a", "c"]
-    for only in ("", "a,", "d"):
-        fails(r"^--only", names_of, only, [*"abc"])
 
 
 def add_slowly(root, out, x):

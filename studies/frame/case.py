@@ -274,11 +274,8 @@ def make_survey(root: Path, out: Path, dataset: str, seed: int) -> dict[str, Any
     metres and degrees."""
     from mgs.survey.flight import SurveySettings, fly, save_survey
 
-    folder, data, settings = (
-        out / "survey",
-        mgs.load_dataset(root / dataset),
-        SurveySettings(seed=seed),
-    )
+    folder, data = out / "survey", mgs.load_dataset(root / dataset)
+    settings = SurveySettings(seed=seed)
     shutil.rmtree(folder, ignore_errors=True)  # of a process that was killed
     with atomic_folder(folder) as unfinished:
         numbers = save_survey(unfinished, data, fly(data, settings), settings)

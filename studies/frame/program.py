@@ -190,18 +190,6 @@ def study_of(name: str) -> Study:
     return study
 
 
-def names_of(only: str | None, names: Sequence[str]) -> list[str]:
-    """Names in a comma-separated option --only, in the order of `names`; all if None.
-
-    Raises InputError for an unknown or missing name.
-    """
-    asked = names if only is None else [name.strip() for name in only.split(",")]
-    for name in asked:
-        if name not in names:
-            raise InputError(f"--only {name!r}: unknown; choose some of {','.join(names)}")
-    return [name for name in names if name in asked]
-
-
 @contextmanager
 def _begun(out: Path, scale: str) -> "Iterator[None]":
     """Lock the folder of a study and record its scale.
