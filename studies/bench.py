@@ -7,7 +7,6 @@ Ratios of times are about the same on other machines; times are not.
 
 import time
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,60 +14,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mgs import Camera, Gaussians, ListCache, as_drjit, fisher, look_at, render, runtime
+from mgs import Camera, Gaussians, ListCache, as_drjit, fisher, render, runtime
 from mgs.files import check_new_file, write_json
-from mgs.gaussians import LEARNED, sh_from_rgb
 from mgs.memory import padded
 from mgs.provenance import versions
 from mgs.reports.tables import markdown
-from mgs.rotation import quat_from_normals
-from mgs.seeds import derive_seed, generator
 from studies.frame.program import Study, Work, at_least, study_of
-from studies.frame.timing import peak_megabytes
+from studies.frame.timing import gradient, peak_megabytes, surface_camera, surface_gaussians
 
 WARM_UP = 2
 """Untimed calls before the timed ones: they compile kernels and allocate memory."""
-
-
-def surface_gaussians(n: int, seed: int = 0) -> Gaussians:
-    """Sample n flat Gaussians on the surface of the default rock, the scene of the timings.
-
-    Their standard deviations are 0.8, 0.8 and 0.2 spacings (the square root of area / n). Their
-    opacity is 0.73 (logit 1), their colours are random.
-    """
-    import trimesh
-
-    mesh = _rock(seed)
-    points, faces = trimesh.sample.sample_surface(mesh, n, seed=derive_seed(seed, "bench/points"))
-    spacing = np.sqrt(mesh.area / n)
-    return Gaussians(
-        means=np.asarray(points, np.float32),
-        log_scales=np.tile(np.log(spacing * np.array([0.8, 0.8, 0.2])), (n, 1)).astype(np.float32),
-        quats=quat_from_normals(mesh.face_normals[faces]).astype(np.float32),
-        logit_opacities=np.full(n, 1.0, np.float32),
-        sh=sh_from_rgb(generator(seed, "bench/colours").uniform(0.1, 0.6, (n, 3))),
-    )
-
-
-@cache
-def _rock(seed: int) -> Any:
-    """Mesh of the default rock. It takes seconds, and tests use it often."""
-    from mgs.synth.rock import Noise, rock_shape
-    from mgs.synth.scene_file import load_scene_file
-
-    return rock_shape(load_scene_file("boulder").rock, Noise(generator(seed, "bench/rock")))[0]
-
-
-def surface_camera(gaussians: Gaussians, width: int, height: int) -> Camera:
-    """Camera 25 degrees above the horizon and three radii away, whose image the Gaussians fill."""
-    low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
-    centre, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
-    pose = look_at(centre + 3 * radius * np.array([np.cos(0.44), 0.0, np.sin(0.44)]), centre)
-    x, y, z = (gaussians.means @ pose[:3, :3].T + pose[:3, 3]).T
-    focal = 0.49 * min(width / np.abs(x / z).max(), height / np.abs(y / z).max())
-    return Camera(
-        np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), width, height, pose
-    )
 
 
 def median_seconds(call: Callable[[], Any], repeats: int) -> float:
@@ -84,21 +39,6 @@ def median_seconds(call: Callable[[], Any], repeats: int) -> float:
         if i >= WARM_UP:
             seconds.append(time.perf_counter() - start)
     return float(np.median(seconds))
-
-
-def gradient(
-    gaussians: Gaussians, camera: Camera, weights: Any, cache: ListCache | None
-) -> list[Any]:
-    """Gradients of sum(image * weights) with respect to each of LEARNED.
-
-    weights: TensorXf [H,W,3]. cache: as in `mgs.splat.render`.
-    """
-    dr.enable_grad([getattr(gaussians, name) for name in LEARNED])
-    loss = dr.sum(render(gaussians, camera, cache=cache).rgb * weights, axis=None)
-    dr.backward(loss)
-    gradients = [dr.grad(getattr(gaussians, name)) for name in LEARNED]
-    dr.disable_grad([getattr(gaussians, name) for name in LEARNED])
-    return gradients
 
 
 def time_core(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:

@@ -18,7 +18,7 @@ from mgs.provenance import source_digest
 from mgs.rotation import rotmat_from_quat
 from mgs.scene import _key_of_fit
 from mgs.splat import reference, render
-from studies.bench import surface_camera, surface_gaussians
+from studies.frame.timing import surface_camera, surface_gaussians
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from mgs.gaussians import Gaussians, learned
 from mgs.memory import padded
 from mgs.metrics import _similarity
 from mgs.splat import MEANS, as_drjit, reference, render
-from studies.bench import surface_camera, surface_gaussians
+from studies.frame.timing import surface_camera, surface_gaussians
 
 N = 60
 LAM = {"colour": 0.02, "scale": 0.05, "rotation": 0.1, "opacity": 0.01, "mean": 30.0}

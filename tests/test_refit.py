@@ -24,7 +24,7 @@ from mgs.gaussians import LEARNED
 from mgs.policy.criteria import LEARN_LOSS, PIXEL_NOISE, PRIOR_STD
 from mgs.reports.simplify import REFITTED, refit_run
 from mgs.run.settings import NbvSettings
-from studies.bench import surface_gaussians
+from studies.frame.timing import surface_gaussians
 
 VIEWS = 8
 SETTINGS = NbvSettings(dataset="data", prior="prior", train={"loss": "squared"})

@@ -13,7 +13,7 @@ from mgs.fit.fitting import COLOUR_MIN, fit_gaussians
 from mgs.fit.optimisers import ADAM_EPSILON
 from mgs.fit.stopping import LOSS_FLOOR, StopReason, stop_reason
 from mgs.gaussians import LEARNED, Gaussians
-from studies.bench import surface_gaussians
+from studies.frame.timing import surface_gaussians
 
 
 @pytest.fixture(scope="module")

@@ -4,16 +4,21 @@ Each timed call follows a fixed piece of work, the *reference*. What slows the m
 Charts show seconds: the median ratio times the reference's median seconds over the whole study.
 """
 
-import functools
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from mgs import runtime
+from mgs import Camera, Gaussians, ListCache, as_drjit, look_at, render, runtime
+from mgs.gaussians import LEARNED, sh_from_rgb
 from mgs.memory import padded
+from mgs.rotation import quat_from_normals
+from mgs.seeds import derive_seed, generator
 
 REFERENCE = 10_000, 320, 240
 """Gaussians, width and height of the reference, which renders REFERENCE_CALLS times with gradients.
@@ -27,22 +32,73 @@ LEAST_SECONDS, MOST_REPEATS = 0.8, 15
 Result = TypeVar("Result")
 
 
-@functools.cache
+def surface_gaussians(n: int) -> Gaussians:
+    """Sample n flat Gaussians on the surface of the default rock, the scene of the timings.
+
+    Their standard deviations are 0.8, 0.8 and 0.2 spacings (the square root of area / n). Their
+    opacity is 0.73 (logit 1), their colours are random.
+    """
+    import trimesh
+
+    mesh = _rock()
+    points, faces = trimesh.sample.sample_surface(mesh, n, seed=derive_seed(0, "bench/points"))
+    spacing = np.sqrt(mesh.area / n)
+    return Gaussians(
+        means=np.asarray(points, np.float32),
+        log_scales=np.tile(np.log(spacing * np.array([0.8, 0.8, 0.2])), (n, 1)).astype(np.float32),
+        quats=quat_from_normals(mesh.face_normals[faces]).astype(np.float32),
+        logit_opacities=np.full(n, 1.0, np.float32),
+        sh=sh_from_rgb(generator(0, "bench/colours").uniform(0.1, 0.6, (n, 3))),
+    )
+
+
+@cache
+def _rock() -> Any:
+    """Mesh of the default rock. It takes seconds, and tests use it often."""
+    from mgs.synth.rock import Noise, rock_shape
+    from mgs.synth.scene_file import load_scene_file
+
+    return rock_shape(load_scene_file("boulder").rock, Noise(generator(0, "bench/rock")))[0]
+
+
+def surface_camera(gaussians: Gaussians, width: int, height: int) -> Camera:
+    """Camera 25 degrees above the horizon and three radii away, whose image the Gaussians fill."""
+    low, high = gaussians.means.min(axis=0), gaussians.means.max(axis=0)
+    centre, radius = (low + high) / 2, np.linalg.norm(high - low) / 2
+    pose = look_at(centre + 3 * radius * np.array([np.cos(0.44), 0.0, np.sin(0.44)]), centre)
+    x, y, z = (gaussians.means @ pose[:3, :3].T + pose[:3, 3]).T
+    focal = 0.49 * min(width / np.abs(x / z).max(), height / np.abs(y / z).max())
+    return Camera(
+        np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), width, height, pose
+    )
+
+
+def gradient(
+    gaussians: Gaussians, camera: Camera, weights: Any, cache: ListCache | None
+) -> list[Any]:
+    """Gradients of sum(image * weights) with respect to each of LEARNED.
+
+    weights: TensorXf [H,W,3]. cache: as in `mgs.splat.render`.
+    """
+    dr.enable_grad([getattr(gaussians, name) for name in LEARNED])
+    loss = dr.sum(render(gaussians, camera, cache=cache).rgb * weights, axis=None)
+    dr.backward(loss)
+    gradients = [dr.grad(getattr(gaussians, name)) for name in LEARNED]
+    dr.disable_grad([getattr(gaussians, name) for name in LEARNED])
+    return gradients
+
+
+@cache
 def reference_of(count: int, width: int, height: int) -> Callable[[], Any]:
     """The reference of this size, with its kernels compiled."""
     runtime.start()
-    import mitsuba as mi
-
-    from mgs.splat import ListCache, as_drjit
-    from studies.bench import gradient, surface_camera, surface_gaussians
-
-    gaussians, cache = surface_gaussians(count), ListCache()
+    gaussians, lists = surface_gaussians(count), ListCache()
     camera, device = surface_camera(gaussians, width, height), as_drjit(gaussians)
     weights = mi.TensorXf(padded(np.ones((camera.height, camera.width, 3))))
 
     def call() -> None:
         for _ in range(REFERENCE_CALLS):
-            for part in gradient(device, camera, weights, cache):
+            for part in gradient(device, camera, weights, lists):
                 np.asarray(part)
 
     call()

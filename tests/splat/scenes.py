@@ -31,7 +31,7 @@ def make_camera(
 
 def cameras_around(gaussians: Gaussians, angles, width=40, height=32) -> list[Camera]:
     """Cameras at these azimuths, radians, that see all of a surface of `studies.bench`."""
-    from studies.bench import surface_camera
+    from studies.frame.timing import surface_camera
 
     first = surface_camera(gaussians, width, height)
     distance = np.linalg.norm(first.position)
