@@ -102,7 +102,7 @@ def is_tum(folder: Path) -> bool:
     return (folder / "rgb.txt").is_file() and (folder / "groundtruth.txt").is_file()
 
 
-def read_tum(folder: Path, spacing: Spacing) -> Source:
+def read_tum(folder: Path, _: object, spacing: Spacing, *__: object) -> Source:
     """Keyframes of rgb.txt, depth.txt and groundtruth.txt, whose poses are interpolated."""
     files: dict[str, list[tuple[float, Path]]] = {}
     for kind in ("rgb", "depth"):
@@ -135,7 +135,7 @@ def is_open3d(folder: Path) -> bool:
     return (folder / "trajectory.log").is_file() and (folder / "color").is_dir()
 
 
-def read_open3d(folder: Path, spacing: Spacing) -> Source:
+def read_open3d(folder: Path, _: object, spacing: Spacing, *__: object) -> Source:
     """Keyframes of color/, depth/ (mm) and trajectory.log (camera-to-world), in the order of the
     numbers in their names."""
     path = folder / "trajectory.log"
@@ -164,7 +164,7 @@ def is_seven_scenes(folder: Path) -> bool:
     return any(folder.glob(f"*{POSE}"))
 
 
-def read_seven_scenes(folder: Path, spacing: Spacing) -> Source:
+def read_seven_scenes(folder: Path, _: object, spacing: Spacing, *__: object) -> Source:
     """Keyframes of NAME.color.png (or .jpg), NAME.depth.png (mm) and NAME.pose.txt, a matrix
     camera-to-world, in the order of the numbers in their names."""
     left_out, poses, images = Counter[str](), list[np.ndarray](), list[Path]()
@@ -209,7 +209,7 @@ def is_scanner(folder: Path) -> bool:
     return first is not None and ARKIT in read_text(first)
 
 
-def read_scanner(folder: Path, spacing: Spacing) -> Source:
+def read_scanner(folder: Path, _: object, spacing: Spacing, *__: object) -> Source:
     """Keyframes of the frame_N.json that have a frame_N.jpg, with depth_N.png (mm). Matrices are
     row-major; a pose is camera-to-world of ARKit: camera axes of OpenGL, +Y up."""
     there, lenses, images = list[tuple[float, np.ndarray]](), list[np.ndarray](), list[Path]()
@@ -242,7 +242,7 @@ def is_rtabmap(folder: Path) -> bool:
     return bool([*folder.glob("*_camera_poses.txt")]) and bool([*folder.glob("*_calib")])
 
 
-def read_rtabmap(folder: Path, spacing: Spacing) -> Source:
+def read_rtabmap(folder: Path, _: object, spacing: Spacing, *__: object) -> Source:
     """Keyframes of NAME_rgb, NAME_depth (mm), NAME_calib and NAME_camera_poses.txt, by id."""
     path = min(folder.glob("*_camera_poses.txt"))
     name = path.name.removesuffix("_camera_poses.txt")
@@ -261,6 +261,16 @@ def read_rtabmap(folder: Path, spacing: Spacing) -> Source:
         depth = folder / f"{name}_depth" / f"{number}.png"
         shots.append(_shot(f"{number:06d}", K, lens, pose, time - there[0][0], image, depth))
     return Source("RTAB-Map", shots, +left_out, unit="m")
+
+
+FOLDERS = {
+    "TUM RGB-D": (is_tum, read_tum),
+    "Open3D": (is_open3d, read_open3d),
+    "7-Scenes": (is_seven_scenes, read_seven_scenes),
+    "3D Scanner App": (is_scanner, read_scanner),
+    "RTAB-Map": (is_rtabmap, read_rtabmap),
+}
+"""Kind -> (whether a folder is of it, its reader as of `mgs.data.sources.Reader`)."""
 
 
 def _opencv_yaml(path: Path) -> tuple[np.ndarray, Lens | None]:

@@ -30,18 +30,7 @@ from mgs.data.photographs import (
     read_photographs,
     sharpest_frames,
 )
-from mgs.data.rgbd_folders import (
-    is_open3d,
-    is_rtabmap,
-    is_scanner,
-    is_seven_scenes,
-    is_tum,
-    read_open3d,
-    read_rtabmap,
-    read_scanner,
-    read_seven_scenes,
-    read_tum,
-)
+from mgs.data.rgbd_folders import FOLDERS
 from mgs.data.shots import (
     PICTURE_SUFFIXES,
     ROUNDED,
@@ -74,14 +63,7 @@ folder of the images, or of a bag their topic."""
 # Recordings of robots and cameras of other programs: kind -> (whether a path is one, its reader).
 RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
     "ROS bag": (is_bag, read_bag),
-    "TUM RGB-D": (is_tum, lambda path, _, spacing, *__: read_tum(path, spacing)),
-    "Open3D": (is_open3d, lambda path, _, spacing, *__: read_open3d(path, spacing)),
-    "7-Scenes": (is_seven_scenes, lambda path, _, spacing, *__: read_seven_scenes(path, spacing)),
-    "3D Scanner App": (
-        is_scanner,
-        lambda path, _, spacing, *__: read_scanner(path, spacing),
-    ),
-    "RTAB-Map": (is_rtabmap, lambda path, _, spacing, *__: read_rtabmap(path, spacing)),
+    **FOLDERS,
     **{kind: (partial(is_peer, kind), partial(read_peer, kind)) for kind in PEERS},
 }
 
