@@ -176,7 +176,8 @@ def recording(kind: str, file: str) -> Callable[[Path], None]:
 def of_recording(path: Path) -> None:
     """Read the recording of which a file is one, as far as the sizes of its images."""
     deep = path.parent.name in ("rtabmap_calib", "bundle", "cams")
-    root = path if path.suffix in (".bag", ".xml") else path.parents[deep]
+    deep += 2 * (path.parent.name == "cameras")
+    root = path if path.suffix in (".bag", ".xml", ".r3d") else path.parents[deep]
     pose = "/slam/pose" if path.suffix == ".mcap" else None
     for shot in read_source(root, unpack=root.parent / "unpacked", pose=pose).shots:
         image_size(shot.image)
@@ -329,6 +330,9 @@ ROBOTS = (
     ("7-Scenes", "seq-01/frame-000001.pose.txt"),
     ("7-Scenes", "camera-intrinsics.txt"),
     ("3D Scanner App", "scan/frame_00006.json"),
+    ("Polycam", "polycam/keyframes/cameras/2350515175632.json"),
+    ("Record3D", "record3d/metadata.json"),
+    ("Record3D r3d", "scan.r3d"),
     ("RTAB-Map", "rtabmap/rtabmap_camera_poses.txt"),
     ("RTAB-Map", "rtabmap/rtabmap_calib/1.yaml"),
     ("Metashape", "metashape/cameras.xml"),

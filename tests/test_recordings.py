@@ -3,6 +3,7 @@
 import json
 import shutil
 import struct
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -246,13 +247,19 @@ def write_seven_scenes(root: Path, dataset) -> Path:
     return root
 
 
+TO_ARKIT = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+
+def opengl(frame) -> np.ndarray:
+    """Camera-to-world of a frame, with the camera axes of OpenGL."""
+    return frame.camera.camera_to_world @ np.diag([1, -1, -1, 1])
+
+
 def write_scanner(root: Path, dataset) -> Path:
     """Export "All Data" of 3D Scanner App: ARKit's world is +Y up, and most poses have no image."""
     copy_images(dataset, root / "colour", root / "depth")
-    to_arkit = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     for k, frame in enumerate(dataset.frames):
-        camera, number = frame.camera, f"{6 * k:05d}"
-        pose = to_arkit @ camera.camera_to_world @ np.diag([1, -1, -1, 1])
+        camera, number, pose = frame.camera, f"{6 * k:05d}", TO_ARKIT @ opengl(frame)
         record = {"cameraPoseARFrame": pose.ravel().tolist(), "time": 90 + frame.timestamp}
         (root / f"frame_{number}.json").write_text(
             json.dumps(record | {"intrinsics": camera.K.ravel().tolist()})
@@ -264,6 +271,48 @@ def write_scanner(root: Path, dataset) -> Path:
         Image.new("L", (8, 6), 2).save(root / f"conf_{number}.png")
         Image.new("RGB", (8, 6)).save(root / f"thumb_{number}.jpg")
     return root
+
+
+def write_polycam(root: Path, dataset, corrected: str = "") -> Path:
+    """Raw data of Polycam. corrected: beginning of the names of the folders of its pictures."""
+    folder = root / "keyframes"
+    copy_images(dataset, folder / f"{corrected}images", folder / "depth")
+    for name in (f"{corrected}cameras", "confidence"):
+        (folder / name).mkdir()
+    for k, frame in enumerate(dataset.frames):
+        camera, name = frame.camera, f"{2_350_514_675_632 + round(1e6 * frame.timestamp)}"
+        numbers = zip(("fx", "cx", "fy", "cy"), camera.K[[0, 0, 1, 1], [0, 2, 1, 2]], strict=True)
+        pose = (TO_ARKIT @ opengl(frame))[:3]
+        record = dict(numbers) | {f"t_{i}{j}": value for (i, j), value in np.ndenumerate(pose)}
+        if not corrected:  # as newer versions
+            record |= {"width": camera.width, "height": camera.height}
+        (folder / f"{corrected}cameras/{name}.json").write_text(json.dumps(record))
+        image = folder / f"{corrected}images"
+        (image / f"{k}.png").rename(image / f"{name}.jpg")
+        (folder / f"depth/{k}.png").rename(folder / f"depth/{name}.png")
+        Image.new("L", (16, 12), 255).save(folder / f"confidence/{name}.png")
+    return root
+
+
+def write_record3d(root: Path, dataset, exported: bool) -> Path:
+    """What Record3D exports as EXR + RGB, or as .r3d with depth that cannot be read."""
+    camera = dataset.frames[0].camera
+    poses = [[*quaternion(opengl(f)), *f.camera.position.tolist()] for f in dataset.frames]
+    about = {"K": camera.K.T.ravel().tolist(), "w": camera.width, "h": camera.height}
+    metadata = json.dumps(about | {"fps": 2, "poses": poses})
+    if exported:
+        copy_images(dataset, root / "rgb", root / "depth")
+        (root / "metadata.json").write_text(metadata)
+        for k, frame in enumerate(dataset.frames):
+            (root / f"rgb/{k}.png").rename(root / f"rgb/{k}.jpg")
+            shutil.copy(frame.depth_path, root / f"depth/{k}.exr")
+        return root
+    with zipfile.ZipFile(root / "scan.r3d", "w") as archive:
+        archive.writestr("metadata", metadata)
+        for k, frame in enumerate(dataset.frames):
+            archive.write(frame.image_path, f"rgbd/{k}.jpg", zipfile.ZIP_DEFLATED)
+            archive.writestr(f"rgbd/{k}.depth", b"bvx2")
+    return root / "scan.r3d"
 
 
 def write_rtabmap(root: Path, dataset) -> Path:
@@ -390,7 +439,10 @@ WRITERS = {
     "7-Scenes": lambda root, data: write_seven_scenes(root / "seq-01", data),
     "3D Scanner App": lambda root, data: write_scanner(root / "scan", data),
     "RTAB-Map": lambda root, data: write_rtabmap(root / "rtabmap", data),
+    "Polycam": lambda root, data: write_polycam(root / "polycam", data),
+    "Record3D": lambda root, data: write_record3d(root / "record3d", data, exported=True),
     "Metashape": lambda root, data: write_metashape(root / "metashape", data),
+    "Record3D r3d": lambda root, data: write_record3d(root, data, exported=False),
     "OpenSfM": lambda root, data: write_opensfm(root / "opensfm", data),
     "Bundler": lambda root, data: write_bundler(root / "bundler", data),
     "LLFF": lambda root, data: write_llff(root / "llff", data),
@@ -400,6 +452,7 @@ WRITERS = {
 }
 OPTIONS = {
     "ROS bag MCAP": ("--pose", "/slam/pose"),
+    **dict.fromkeys(("Record3D", "Record3D r3d"), ("--up", "0,0,1")),
     **dict.fromkeys([*WRITERS][-5:], ("--unit", 1, "--up", "0,0,1")),
 }
 """Options for facts that the files of these programs lack."""
@@ -414,7 +467,7 @@ def test_cameras_pixels_and_depth_are_those_recorded(dataset, tmp_path, capsys, 
     assert not (tmp_path / "out.unpacked").exists()
     made = load_dataset(out)
     assert len(made) == len(dataset)
-    upward = (0, 1, 0) if kind == "3D Scanner App" else (0, 0, 1)
+    upward = (0, 1, 0) if kind in ("3D Scanner App", "Polycam") else (0, 0, 1)
     assert np.allclose(made.world.up, upward, atol=1e-9)
     for one, other in zip(dataset.frames, made.frames, strict=True):
         assert np.allclose(one.camera.world_to_camera, other.camera.world_to_camera, atol=1e-6)
@@ -422,6 +475,48 @@ def test_cameras_pixels_and_depth_are_those_recorded(dataset, tmp_path, capsys, 
         assert np.array_equal(one.rgb(), other.rgb())
         if [*WRITERS].index(kind) < [*WRITERS].index("Metashape"):
             assert np.abs(one.depth() - other.depth()).max() < 6e-4
+
+
+@pytest.mark.parametrize("kind", ["3D Scanner App", "Polycam"])
+def test_depth_of_the_lowest_confidence_is_none(dataset, tmp_path, kind):
+    source = WRITERS[kind](tmp_path, dataset)
+    path = min((*source.glob("conf_*"), *source.glob("keyframes/confidence/*")))
+    levels = np.array([[0, 1], [2, 0]], np.uint8).repeat(3, 0).repeat(4, 1)
+    Image.fromarray(levels).save(path)
+    command("import", source, "--out", tmp_path / "out")
+    low = (levels == 0).repeat(8, 0).repeat(8, 1)
+    one, other = dataset.frames[0].depth(), load_dataset(tmp_path / "out").frames[0].depth()
+    assert np.abs(np.where(low, 0, one) - other).max() < 6e-4
+
+
+def test_corrected_pictures_of_polycam_lose_their_rim(dataset, tmp_path):
+    """They are taken where there are others, which are distorted."""
+    source = write_polycam(tmp_path / "polycam", dataset, "corrected_")
+    for name in ("images", "cameras"):
+        (source / "keyframes" / name).mkdir()
+    command("import", source, "--out", tmp_path / "out")
+    made = load_dataset(tmp_path / "out").frames
+    assert len(made) == len(dataset)
+    for one, frame in zip(dataset.frames, made, strict=True):
+        assert (frame.camera.width, frame.camera.height) == (62, 46)
+        assert np.allclose(frame.camera.K, one.camera.K - [[0, 0, 1], [0, 0, 1], [0, 0, 0]])
+        assert np.allclose(frame.camera.world_to_camera, one.camera.world_to_camera, atol=1e-6)
+        assert np.array_equal(frame.rgb(), one.rgb()[1:-1, 1:-1])
+        assert np.abs(frame.depth() - one.depth()[1:-1, 1:-1]).max() < 6e-4
+
+
+def test_an_unzipped_r3d_is_read_as_the_zip(dataset, tmp_path):
+    source = write_record3d(tmp_path, dataset, exported=False)
+    shutil.unpack_archive(source, tmp_path / "folder", "zip")
+    one, other = (
+        read_source(path, unpack=tmp_path / "u") for path in (source, tmp_path / "folder")
+    )
+    assert [shot.camera for shot in one.shots] == [shot.camera for shot in other.shots]
+    assert [shot.image.read_bytes() for shot in one.shots] == [
+        shot.image.read_bytes() for shot in other.shots
+    ]
+    assert one.notes == other.notes == (one.notes[0],)
+    assert "LZFSE" in one.notes[0]
 
 
 @pytest.mark.parametrize("size", [(16, 12), (13, 10)])
@@ -596,7 +691,56 @@ def halved(path: Path) -> None:
 
 
 def unmeasured(path: Path) -> None:
-    path.write_text(path.read_text().replace("intrinsics", "lens"))
+    text = path.read_text()
+    for name in ("intrinsics", "fx", "K"):
+        text = text.replace(f'"{name}"', '"lens"')
+    path.write_text(text)
+
+
+def untimed(path: Path) -> None:
+    image = path.parents[1] / "images" / path.stem
+    image.with_suffix(".jpg").rename(image.with_name("a.jpg"))
+    path.rename(path.with_name("a.json"))
+
+
+def wide(path: Path) -> None:
+    path.write_text(path.read_text().replace(": 64,", ": 641,"))
+
+
+def with_poses(path: Path, change) -> None:
+    about = json.loads(path.read_text())
+    change(about["poses"])
+    path.write_text(json.dumps(about))
+
+
+def unturned(path: Path) -> None:
+    with_poses(path, lambda poses: poses[3].__setitem__(slice(4), [0, 0, 0, 0]))
+
+
+def still(path: Path) -> None:
+    with_poses(path, lambda poses: poses.__setitem__(slice(None), poses[:1] * len(poses)))
+
+
+def emptied(path: Path) -> None:
+    shutil.rmtree(path)
+    path.mkdir()
+
+
+def bomb(path: Path, size: int = (1 << 25) + 1) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("metadata", b" " * size)
+
+
+def lying_bomb(path: Path) -> None:
+    """A member larger than the directory of its zip says."""
+    bomb(path)
+    data = bytearray(path.read_bytes())
+    data[(at := data.rindex(b"PK\1\2") + 24) : at + 4] = struct.pack("<I", 99)
+    path.write_bytes(data)
+
+
+def no_members(path: Path) -> None:
+    zipfile.ZipFile(path, "w").close()
 
 
 def b2(path: Path) -> None:
@@ -627,6 +771,22 @@ def pickled(path: Path) -> None:
         ("7-Scenes", "camera-intrinsics.txt", Path.unlink, "no calibration; write fx fy cx cy"),
         ("3D Scanner App", "frame_00006.json", halved, "not valid JSON"),
         ("3D Scanner App", "frame_00006.json", unmeasured, "has no cameraPoseARFrame of 16"),
+        ("Polycam", "2350515175632.json", halved, "not valid JSON"),
+        ("Polycam", "2350514675632.json", unmeasured, "has no fx, fy, cx, cy and t_00"),
+        ("Polycam", "2350514675632.json", untimed, "or no time as its name"),
+        ("Polycam", "2350514675632.json", wide, "is 64x48, but its camera is 641x48"),
+        ("Polycam", "images", shutil.rmtree, "has no picture of a camera"),
+        ("Polycam", "2350514675632.png", halved, "not a readable image"),
+        ("Record3D", "metadata.json", halved, "not valid JSON"),
+        ("Record3D", "metadata.json", unmeasured, "poses of 7 numbers with a quaternion"),
+        ("Record3D", "metadata.json", unturned, "with a quaternion of length 1; export it again"),
+        ("Record3D", "metadata.json", wide, "is 64x48, but its camera is 641x48"),
+        ("Record3D", "metadata.json", still, "no poses that move, as of the front camera"),
+        ("Record3D", "rgb", emptied, "none of its pictures is there, as rgb/0.jpg"),
+        ("Record3D r3d", "scan.r3d", halved, "scan.r3d: not a readable zip"),
+        ("Record3D r3d", "scan.r3d", bomb, "metadata has 33,554,433 bytes"),
+        ("Record3D r3d", "scan.r3d", lying_bomb, "not a readable zip (Bad CRC-32"),
+        ("Record3D r3d", "scan.r3d", no_members, "metadata: no such file"),
         ("RTAB-Map", "3.yaml", halved, "camera_matrix"),
         ("OpenSfM", "reconstruction.json", halved, "not valid JSON"),
         ("Bundler", "bundle.out", halved, "9 cameras and 1 points of 9 listed images"),

@@ -70,9 +70,9 @@ def import_data(
     are kept in sparse.ply for `mgs prior`. The same command continues an interrupted import.
 
     - source: A transforms.json or a folder with one, a COLMAP model (sparse/0), ROS bag, Metashape
-      XML, a folder of TUM RGB-D, Open3D, 7-Scenes, 3D Scanner App, RTAB-Map, OpenSfM or ODM,
-      Bundler, LLFF, MVSNet, openMVG's benchmark or 3D Gaussian Splatting, a folder of photographs
-      alone, or a video.
+      XML, a folder of TUM RGB-D, Open3D, 7-Scenes, 3D Scanner App, Polycam, Record3D (or .r3d),
+      RTAB-Map, OpenSfM or ODM, Bundler, LLFF, MVSNet, openMVG's benchmark or 3D Gaussian Splatting,
+      a folder of photographs alone, or a video.
     - out: Folder to write: new, empty, or left by an interrupted import.
     - images: Folder of the images (default: SOURCE/images), or topic of a bag.
     - keyframes: Of a recording or video, import frames at least this time or distance apart: 0.5s

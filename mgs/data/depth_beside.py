@@ -13,7 +13,7 @@ from mgs.data.agreement import DepthScale
 from mgs.data.lens import read_fitting
 from mgs.data.shots import Shot, Source
 from mgs.errors import InputError
-from mgs.images import exif_orientation, read_depth
+from mgs.images import exif_orientation, read_depth, read_rgba
 from mgs.progress import report
 
 FOLDER = "depth"  # of the depth images, named as the photographs
@@ -58,12 +58,16 @@ def depth_beside(root: Path, paths: Sequence[Path], places: Sequence[Path]) -> d
 
 
 def depth_of(shot: Shot) -> np.ndarray:
-    """Depth of a shot that has a file of it, metres, [H,W] of its camera before undistortion."""
+    """Depth of a shot that has a file of it, metres, [H,W] of its camera before undistortion. It is
+    0 where its confidence is."""
     assert shot.depth is not None
     reader = partial(read_depth, unit=shot.depth_unit, float_unit=shot.float_unit)
     stored = exif_orientation(shot.image) if shot.turned else 1
-    about = shot.depth, shot.camera, shot.turned
-    return shot.depth_factor * read_fitting(reader, *about, resized=True, stored=stored)
+    how: Any = {"turned": shot.turned, "resized": True, "stored": stored}
+    depth = shot.depth_factor * read_fitting(reader, shot.depth, shot.camera, **how)
+    if shot.confidence is not None and shot.confidence.is_file():
+        depth[read_fitting(read_rgba, shot.confidence, shot.camera, **how)[..., 0] == 0] = 0
+    return depth
 
 
 def with_depth(

@@ -15,7 +15,7 @@ from mgs.data.clouds import write_cloud
 from mgs.data.dataset import TEST_FOLDER, Dataset, load_dataset, resumes, write_transforms
 from mgs.data.depth_beside import depth_of
 from mgs.data.frames import Frame, premultiplied, write_rock_image
-from mgs.data.lens import Undo, read_fitting, shrunk, undistorter
+from mgs.data.lens import Undo, cut, read_fitting, shrunk, undistorter
 from mgs.data.meshes import Mesh, read_mesh
 from mgs.data.shots import Shot, Source, find_image
 from mgs.data.world import PLUS_Z, Vector, World
@@ -171,6 +171,7 @@ def _digest(shots: list[Shot]) -> str:
                 path and str(path.resolve())
                 for path in (shot.image, shot.depth, shot.mask, shot.rock)
             ],
+            *([shot.rim, str(shot.confidence)] if shot.rim or shot.confidence else ()),
         )
         for shot in shots
     ]
@@ -183,7 +184,7 @@ def import_shot(
     """Write the files of a frame, the image last, unless the image exists and is no older than its
     sources. silhouette: mask of a camera by `silhouette_of`. begin: makes the output folder, called
     between reading and writing, so that a source that cannot be read leaves no folder behind."""
-    camera, undo = undistorter(shot.camera, shot.lens)
+    camera, undo = cut(*undistorter(shot.camera, shot.lens), shot.rim)
     camera, undo = shrunk(camera, downscale, undo)
     image, mask_path, rock_path = (
         out / folder / f"{shot.name}.png" for folder in ("images", "masks", "rock")

@@ -216,6 +216,19 @@ def shrunk(
     return Camera(K, width, height, camera.world_to_camera), smaller
 
 
+def cut(camera: Camera, undo: Undo, rim: int) -> tuple[Camera, Undo]:
+    """Camera without `rim` pixels on each side, and the resampling to it after `undo`."""
+    if rim == 0:
+        return camera, undo
+
+    def inner(pixels: np.ndarray, smooth: bool) -> np.ndarray:
+        return np.ascontiguousarray(undo(pixels, smooth)[rim:-rim, rim:-rim])
+
+    K = camera.K - rim * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
+    size = camera.width - 2 * rim, camera.height - 2 * rim
+    return Camera(K, *size, camera.world_to_camera), inner
+
+
 def shrunk_to(camera: Camera, most: float) -> tuple[Camera, Undo]:
     """`shrunk` by the least factor that leaves at most `most` pixels."""
     return shrunk(camera, int(np.ceil(np.sqrt(camera.width * camera.height / most))))

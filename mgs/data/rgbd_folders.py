@@ -1,5 +1,5 @@
 """Folders of robots and scanners with a pose for each image: TUM RGB-D, Open3D, 7-Scenes, RTAB-Map
-exports, 3D Scanner App; each reader returns keyframes, in metres."""
+exports; each reader returns keyframes, in metres."""
 
 import re
 from collections import Counter
@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from mgs.camera import Camera
-from mgs.data.agreement import FLIP
 from mgs.data.lens import Lens
 from mgs.data.shots import Shot, Source, Spacing, Track, natural, orthonormal, posed, rigid
 from mgs.errors import InputError
@@ -23,7 +22,6 @@ LARGEST_NUMBER = 1e15  # numbers beyond it are mistakes, also of times
 SYNCHRONOUS = 0.02  # most seconds between a colour and its depth image (TUM's associate.py)
 INTERVAL = 0.5  # seconds between images of folders without times: by default all are taken
 COLOUR, POSE = ".color", ".pose.txt"  # ends of names of 7-Scenes
-ARKIT = "cameraPoseARFrame"  # key of a pose of 3D Scanner App
 
 
 def rows(path: Path, least: int) -> list[list[str]]:
@@ -126,7 +124,7 @@ def read_tum(folder: Path, _: object, spacing: Spacing, *__: object) -> Source:
         if depth is not None and abs(times[near] - time) > SYNCHRONOUS:
             depth = None
         name, unit = f"kf_{len(shots):04d}", TUM_DEPTH_UNIT
-        shots.append(_shot(name, K, lens, pose, time - there[0][0], images[time], depth, unit))
+        shots.append(keyframe(name, K, lens, pose, time - there[0][0], images[time], depth, unit))
     return Source("TUM RGB-D", shots, left_out, unit="m")
 
 
@@ -198,43 +196,9 @@ def _untimed(
     shots: list[Shot] = []
     for k in spacing.choose(list(zip(times, poses, strict=True))):
         name, depth = images[k].stem.removesuffix(COLOUR), depths[k] if depths else None
-        shot = _shot(name, K, lens, poses[k], times[k], images[k], depth)
+        shot = keyframe(name, K, lens, poses[k], times[k], images[k], depth)
         shots.append(replace(shot, mended=mended[k]))
     return shots
-
-
-def is_scanner(folder: Path) -> bool:
-    """Whether a folder is "All Data" of the iOS program 3D Scanner App."""
-    first = min(folder.glob("frame_*.json"), default=None)
-    return first is not None and ARKIT in read_text(first)
-
-
-def read_scanner(folder: Path, _: object, spacing: Spacing, *__: object) -> Source:
-    """Keyframes of the frame_N.json that have a frame_N.jpg, with depth_N.png (mm). Matrices are
-    row-major; a pose is camera-to-world of ARKit: camera axes of OpenGL, +Y up."""
-    there, lenses, images = list[tuple[float, np.ndarray]](), list[np.ndarray](), list[Path]()
-    for path in sorted(folder.glob("frame_*.json"), key=natural):
-        if (image := path.with_suffix(".jpg")).is_file():  # most frames have none
-            record: Any = read_json(path)
-            try:
-                K, pose = (np.array(record[key], np.float64) for key in ("intrinsics", ARKIT))
-                time = float(record.get("time", INTERVAL * len(images)))
-                if not abs(time) < LARGEST_NUMBER:
-                    raise ValueError
-                there.append((time, orthonormal(pose.reshape(4, 4) @ FLIP)[0]))
-                lenses.append(K.reshape(3, 3))
-            except (TypeError, KeyError, ValueError, OverflowError):
-                why = f"has no {ARKIT} of 16 numbers, intrinsics of 9 and time"
-                raise InputError(f"{path}: {why}; export it again") from None
-            images.append(image)
-    if not images:
-        raise InputError(f"{folder}: has no frame_N.jpg beside frame_N.json; export All Data")
-    shots: list[Shot] = []
-    for k in spacing.choose(there):
-        depth = images[k].with_name(f"{images[k].stem.replace('frame', 'depth', 1)}.png")
-        (time, pose), name = there[k], images[k].stem
-        shots.append(_shot(name, lenses[k], None, pose, time - there[0][0], images[k], depth))
-    return Source("3D Scanner App", shots, up=(0.0, 1.0, 0.0), unit="m")
 
 
 def is_rtabmap(folder: Path) -> bool:
@@ -259,7 +223,7 @@ def read_rtabmap(folder: Path, _: object, spacing: Spacing, *__: object) -> Sour
         image = next((path for path in pictures if path.is_file()), pictures[0])
         K, lens = _opencv_yaml(folder / f"{name}_calib" / f"{number}.yaml")
         depth = folder / f"{name}_depth" / f"{number}.png"
-        shots.append(_shot(f"{number:06d}", K, lens, pose, time - there[0][0], image, depth))
+        shots.append(keyframe(f"{number:06d}", K, lens, pose, time - there[0][0], image, depth))
     return Source("RTAB-Map", shots, +left_out, unit="m")
 
 
@@ -267,7 +231,6 @@ FOLDERS = {
     "TUM RGB-D": (is_tum, read_tum),
     "Open3D": (is_open3d, read_open3d),
     "7-Scenes": (is_seven_scenes, read_seven_scenes),
-    "3D Scanner App": (is_scanner, read_scanner),
     "RTAB-Map": (is_rtabmap, read_rtabmap),
 }
 """Kind -> (whether a folder is of it, its reader as of `mgs.data.sources.Reader`)."""
@@ -313,7 +276,7 @@ def _pose(path: Path, row: list[float]) -> np.ndarray:
         raise InputError(f"{path}: has a quaternion whose length is not 1; {cure}") from None
 
 
-def _shot(
+def keyframe(
     name: str,
     K: np.ndarray,
     lens: Lens | None,
@@ -322,9 +285,12 @@ def _shot(
     image: Path,
     depth: Path | None,
     unit: float = 1e-3,
+    size: tuple[int, int] | None = None,
 ) -> Shot:
+    """Frame at a pose camera-to-world. depth: may be missing; of `unit` metres a step. size: of the
+    images that K is for, by default that of the image. Raises InputError for a singular pose."""
     try:
-        camera = Camera(K, *image_size(image), np.linalg.inv(pose))
+        camera = Camera(K, *(size or image_size(image)), np.linalg.inv(pose))
     except np.linalg.LinAlgError:
         raise InputError(f"{image}: its pose is singular; correct it") from None
     there = depth if depth is not None and depth.is_file() else None

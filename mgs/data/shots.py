@@ -53,11 +53,14 @@ class Shot:
     turned: bool = False  # its files are turned by their EXIF orientation
     mended: bool = False  # its rotation was NEARLY_RIGID
     depth_factor: float = 1.0  # by which its depth is multiplied, to fit its camera
+    confidence: Path | None = None  # image, 0 where depth is none
+    rim: int = 0  # pixels cut off on each side
 
     @property
     def files(self) -> list[Path]:
         """Files that an import of it reads."""
-        return [path for path in (self.image, self.depth, self.mask, self.rock) if path]
+        paths = self.image, self.depth, self.mask, self.rock, self.confidence
+        return [path for path in paths if path]
 
 
 @dataclass(frozen=True)

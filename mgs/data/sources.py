@@ -19,6 +19,7 @@ from mgs.data.dataset import finite_number, posed_camera, read_records, timestam
 from mgs.data.depth_beside import with_scale_of_depth
 from mgs.data.lens import Lens
 from mgs.data.peers import PEERS, is_peer, read_peer
+from mgs.data.phones import PHONES
 from mgs.data.photographs import KIND as PHOTOGRAPHS
 from mgs.data.photographs import (
     UNREAD,
@@ -64,6 +65,7 @@ folder of the images, or of a bag their topic."""
 RECORDINGS: dict[str, tuple[Callable[[Path], bool], Reader]] = {
     "ROS bag": (is_bag, read_bag),
     **FOLDERS,
+    **PHONES,
     **{kind: (partial(is_peer, kind), partial(read_peer, kind)) for kind in PEERS},
 }
 
