@@ -217,9 +217,10 @@ def test_images_of_eight_bits_take_a_quarter_of_the_memory_for_the_same_fit(
     channels = 5 if alpha_weight else 4
     pixels = [rng.integers(0, 256, (20, 24, channels), np.uint8) for _ in cameras]
     shares = [image[..., 3:] / np.float32(255) for image in pixels]
+    alphas = [share[..., 1:] if alpha_weight else np.float32(1) for share in shares]
     targets = [
-        np.dstack([linear_from_pixels(image[..., :3]), share])
-        for image, share in zip(pixels, shares, strict=True)
+        np.dstack([linear_from_pixels(image[..., :3]) * alpha, share])
+        for image, alpha, share in zip(pixels, alphas, shares, strict=True)
     ]
     settings = TrainSettings(passes=2, alpha_weight=alpha_weight)
     coded = fit_gaussians(model, cameras, targets, settings).gaussians
@@ -228,7 +229,7 @@ def test_images_of_eight_bits_take_a_quarter_of_the_memory_for_the_same_fit(
     nearly = targets[0].copy()
     nearly[3, 4, 0] += 1e-5 + nearly[3, 4, 0] * 1e-5
     assert as_target(nearly, linear, alpha_weight).nbytes == 4 * held
-    monkeypatch.setattr(module, "_levels", lambda linear: np.full((2, 256), -1, np.float32))
+    monkeypatch.setattr(module, "_levels", lambda linear: np.full((257, 256), -1, np.float32))
     plain = fit_gaussians(model, cameras, targets, settings).gaussians
     for name in ("sh", "log_scales", "quats", "logit_opacities"):
         assert np.array_equal(getattr(coded, name), getattr(plain, name)), name

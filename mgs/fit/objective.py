@@ -40,7 +40,7 @@ class Target:
     values: Any  # mi.Float [H*W*S], channels as in `mgs.fit.fitting.fit_gaussians`; of 8 bits UInt8
     alpha_factor: Any  # of the differences in alpha, mi.Float [1]; None: not compared
     stored: int  # S, 3 to 5
-    levels: Any = None  # what 8 bits stand for, mi.Float [512]: colours, then weights and alpha
+    levels: Any = None  # what 8 bits stand for, mi.Float (`_levels`)
 
     @property
     def channels(self) -> int:
@@ -88,8 +88,11 @@ class Target:
         value = dr.gather(type(self.values), self.values, pixel * self.stored + channel)
         if self.levels is None:
             return value
-        first = dr.select(channel < 3, mi.UInt32(0), LEVELS)
-        return dr.gather(mi.Float, self.levels, mi.UInt32(value) + first)
+        row = mi.UInt32(LEVELS - 1)
+        if self.stored == 5:
+            row = mi.UInt32(dr.gather(mi.UInt8, self.values, pixel * 5 + 4))
+        row = dr.select(channel < 3, row, LEVELS)
+        return dr.gather(mi.Float, self.levels, mi.UInt32(value) + row * LEVELS)
 
 
 @dataclass(frozen=True)
@@ -319,8 +322,8 @@ def _photo(
 
 def as_target(target: np.ndarray, linear: bool, alpha_weight: float) -> Target:
     """A target of a fit [H,W,3 to 5] for Gaussians that are blended as linear RGB, or as sRGB. An
-    image of 8 bits is kept as that, with the same values in a quarter of the memory. Raises
-    InputError if alpha has a weight and is missing."""
+    image of 8 bits, with alpha or without, is kept as that, with the same values in a quarter of
+    the memory. Raises InputError if alpha has a weight and is missing."""
     runtime.start()
     factor, channels = None, target.shape[-1]
     if alpha_weight:
@@ -330,24 +333,32 @@ def as_target(target: np.ndarray, linear: bool, alpha_weight: float) -> Target:
                 "alpha as the last"
             )
         factor = dr.opaque(mi.Float, float(np.sqrt(alpha_weight)))
-    encoded = np.dstack([srgb_from_linear(target[..., :3]), target[..., 3:]])
-    values, levels = target if linear else padded(encoded), _levels(linear)
-    bits = np.rint(np.clip(encoded, 0, 1) * (LEVELS - 1)).astype(np.uint8)
+    colour, others = target[..., :3], target[..., 3:]
+    values = target if linear else padded(np.dstack([srgb_from_linear(colour), others]))
+    alpha = others[..., 1:] if channels == 5 else np.ones_like(target[..., :1])
+    straight = np.divide(colour, alpha, out=np.zeros_like(colour), where=alpha > 0)
+    bits = _bits(np.dstack([srgb_from_linear(straight), others]))
+    levels, rows = _levels(linear), [_bits(alpha)[..., 0]] * 3 + [LEVELS] * 2
     if all(
-        np.array_equal(some[bits[..., k]], values[..., k])
-        for k, some in enumerate(levels[[0, 0, 0, 1, 1][:channels]])
+        np.array_equal(levels[row, bits[..., k]], values[..., k])
+        for k, row in enumerate(rows[:channels])
     ):
         of_bits = mi.UInt8(padded(bits, np.uint8).ravel())
         return Target(of_bits, factor, channels, mi.Float(padded(levels).ravel()))
     return Target(mi.Float(adopted(values).ravel()), factor, channels)
 
 
+def _bits(values: np.ndarray) -> np.ndarray:
+    return np.rint(np.clip(values, 0, 1) * (LEVELS - 1)).astype(np.uint8)
+
+
 @lru_cache(2)
 def _levels(linear: bool) -> np.ndarray:
-    """Values of the 256 levels of a colour, linear RGB or sRGB, and of a weight [2,256]."""
-    colours = linear_from_pixels(np.arange(LEVELS, dtype=np.uint8))
+    """Values of the 256 levels of a colour, linear RGB or sRGB, in front of black at each of 256
+    alphas, then of a weight or alpha [257,256]."""
     weights = np.arange(LEVELS, dtype=np.float32) / (LEVELS - 1)
-    return np.array([colours if linear else srgb_from_linear(colours), weights], np.float32)
+    colours = linear_from_pixels(np.arange(LEVELS, dtype=np.uint8)) * weights[:, None]
+    return np.vstack([colours if linear else srgb_from_linear(colours), weights])
 
 
 @one_at_a_time
