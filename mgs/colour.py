@@ -25,3 +25,42 @@ def linear_from_pixels(pixels: np.ndarray) -> NDArray[np.float32]:
     """Convert sRGB pixels of 8 or 16 bits (uint8, uint16) to linear RGB, by a table."""
     most = np.iinfo(pixels.dtype).max
     return linear_from_srgb(np.arange(most + 1, dtype=np.float32) / most)[pixels]
+
+
+def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
+    """Real spherical harmonics of unit directions [N,3] -> [N,(degree+1)^2], in the order and signs
+    of 3DGS files."""
+    x, y, z = directions.T
+    xx, yy, zz = x * x, y * y, z * z
+    basis = [np.full(len(x), SH_C0)]
+    if degree > 0:
+        c = 0.4886025119029199
+        basis += [-c * y, c * z, -c * x]
+    if degree > 1:
+        # Degree 2, then degree 3.
+        basis += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ]
+    if degree > 2:
+        basis += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    return np.stack(basis, 1)
+
+
+def even_directions() -> NDArray[np.float64]:
+    """Unit directions [64,3] of a Fibonacci lattice, at which functions of colour are compared."""
+    k = np.arange(64) + 0.5
+    z, turn = 1 - k / 32, np.pi * (1 + 5**0.5) * k
+    across = np.sqrt(1 - z * z)
+    return np.column_stack([across * np.cos(turn), across * np.sin(turn), z])

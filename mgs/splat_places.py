@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mgs.colour import even_directions, sh_basis
 from mgs.data.world import PLUS_Z, World
 from mgs.errors import InputError
 from mgs.gaussians import Gaussians
 from mgs.rotation import rotmat_from_quat
-from mgs.splat.reference import sh_basis
 
 # Coordinates in which each colour coefficient's basis function is odd.
 PARITY = (*("", "y", "z", "x", "xy", "yz", "", "xz"), *("", "y", "xyz", "y", "z", "x", "z", "x"))
@@ -58,9 +58,7 @@ def moved(g: Gaussians, matrix: np.ndarray, where: object) -> Gaussians:
         quats = np.roll(Rotation.from_matrix(U).as_quat(), 1, axis=1)
         with np.errstate(divide="ignore"):
             log_scales = np.log(S)
-    k = np.arange(64) + 0.5
-    across, angle = np.sqrt(1 - (1 - k / 32) ** 2), np.pi * (1 + 5**0.5) * k
-    d = np.column_stack([across * np.cos(angle), across * np.sin(angle), 1 - k / 32])
+    d = even_directions()
     sh_turn = np.linalg.pinv(sh_basis(d, g.sh_degree)) @ sh_basis(d @ Q, g.sh_degree)
     sh = np.einsum("kl,nlc->nkc", sh_turn, g.sh)
     quats, log_scales, sh = (np.asarray(array, np.float32) for array in (quats, log_scales, sh))

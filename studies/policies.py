@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 import mgs
-from mgs.colour import SH_C0
+from mgs.colour import SH_C0, sh_basis
 from mgs.data.frames import in_image
 from mgs.evaluation import psnr_measure
 from mgs.gaussians import sh_from_rgb
@@ -16,7 +16,6 @@ from mgs.policy.criteria import Array
 from mgs.policy.poses import angles
 from mgs.run.policies import Cover, Directional, Information, Paper, each
 from mgs.splat import fisher, groups, render
-from mgs.splat.reference import sh_basis
 
 LAMBDA = 1e-6
 """Lambda of FisherRF's code for every parameter. POp-GS states none."""

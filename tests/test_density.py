@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from refusals import fails
+from splat import reference
 
 from mgs import fit_gaussians
 from mgs.data.frames import Frame
@@ -17,7 +18,7 @@ from mgs.fit.settings import RATES, TrainSettings
 from mgs.provenance import source_digest
 from mgs.rotation import rotmat_from_quat
 from mgs.scene import _key_of_fit
-from mgs.splat import reference, render
+from mgs.splat import render
 from studies.frame.timing import surface_camera, surface_gaussians
 
 

@@ -11,9 +11,10 @@ import tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from program import steps
+from splat import reference
 
 from mgs import Scene, choose, learn, load_prior
-from mgs.colour import SH_C0
+from mgs.colour import SH_C0, sh_basis
 from mgs.policy import criteria, directional, relaxation, visibility
 from mgs.policy.directional import Views
 from mgs.policy.pool_gains import PoolGains
@@ -21,7 +22,6 @@ from mgs.policy.visibility import Visibility, planned_path, planned_views
 from mgs.run import flight
 from mgs.run import folder as run_folder
 from mgs.run.policies import POLICIES
-from mgs.splat import reference
 
 LAM = (0.02 / 1.0) ** 2
 
@@ -57,7 +57,7 @@ def squares(points, views, degree):
     made = np.zeros((*views.seen.shape, size, size))
     for v, j in np.ndindex(views.seen.shape):
         direction = points[j] - views.positions[v]
-        y = reference.sh_basis((direction / np.linalg.norm(direction))[None], degree)[0]
+        y = sh_basis((direction / np.linalg.norm(direction))[None], degree)[0]
         made[v, j] = views.seen[v, j] * np.outer(y, y)
     return made
 

@@ -13,20 +13,20 @@ import numpy as np
 import pytest
 from program import command, output
 from refusals import fails, refused
+from splat import reference
 from test_meshes import glb, parts_of
 from test_render_command import CAMERAS, assert_close, gaussians
 
 import mgs
 from mgs import Gaussians, load_cameras, load_dataset, read_ply, write_ply
-from mgs.colour import srgb_from_linear
+from mgs.colour import sh_basis, srgb_from_linear
 from mgs.errors import InputError, Notice
 from mgs.images import read_mask
 from mgs.reports.evaluation import compare_models, evaluate
 from mgs.reports.exporting import in_srgb, to_y_up
 from mgs.rotation import rotmat_from_quat
 from mgs.run.folder import Run, open_run, write_checkpoint
-from mgs.splat import reference, render
-from mgs.splat.reference import sh_basis
+from mgs.splat import render
 from mgs.splat_files import FORMATS, load_gaussians, upward, write_gaussians
 from mgs.splat_places import mirrored
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from refusals import fails
 from scipy.ndimage import correlate1d
+from splat import reference
 from splat.scenes import cameras_around
 
 from mgs import TrainSettings, fit_gaussians
@@ -18,7 +19,7 @@ from mgs.fit.objective import as_target, objective
 from mgs.gaussians import Gaussians, learned
 from mgs.memory import padded
 from mgs.metrics import _similarity
-from mgs.splat import MEANS, as_drjit, reference, render
+from mgs.splat import MEANS, as_drjit, render
 from studies.frame.timing import surface_camera, surface_gaussians
 
 N = 60

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from refusals import fails
+from splat import reference
 from splat.scenes import make_camera, make_gaussians
 from synthetic import sphere
 
@@ -18,7 +19,7 @@ from mgs.colour import SH_C0, srgb_from_linear
 from mgs.policy import criteria
 from mgs.policy import poses as pose_policies
 from mgs.run.policies import POLICIES
-from mgs.splat import groups, reference
+from mgs.splat import groups
 from mgs.synth.orbit import orbit_positions
 from mgs.synth.scene_file import Orbit
 from studies import policies as studied

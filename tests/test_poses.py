@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import synthetic
 from program import command, said
+from splat import reference
 from splat.scenes import calm, make_camera, make_clamped, relative_error
 
 from mgs import read_ply
@@ -15,7 +16,7 @@ from mgs.data.structure import write_refined
 from mgs.fit import poses
 from mgs.fit.objective import objective
 from mgs.run.folder import open_run
-from mgs.splat import as_drjit, reference, render
+from mgs.splat import as_drjit, render
 
 EYES = [(2.0, 0.4, 1.1), (-0.5, 2.1, 0.9), (-1.8, -1.1, 1.0), (0.6, -2.0, 1.3)]
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mgs.camera import Camera, look_at
-from mgs.colour import SH_C0
+from mgs.colour import SH_C0, sh_basis
 from mgs.policy.criteria import Array
 from mgs.synth.orbit import orbit_positions
 from mgs.synth.scene_file import Orbit
@@ -67,8 +67,6 @@ def vectors(points: Array, views: Views, degree: int) -> NDArray[np.float64]:
     """sqrt(W) y of each view and point [N,V,K]. points: [N,3], metres.
 
     Only pairs that see each other are computed: most do not."""
-    from mgs.splat.reference import sh_basis  # imported here because mgs.splat loads Dr.Jit
-
     point, view = np.nonzero(views.seen.T)
     offset = np.asarray(points, np.float64)[point] - np.asarray(views.positions, np.float64)[view]
     z = np.zeros((len(points), len(views.positions), (degree + 1) ** 2))

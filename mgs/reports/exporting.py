@@ -9,7 +9,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
-from mgs.colour import srgb_from_linear
+from mgs.colour import even_directions, sh_basis, srgb_from_linear
 from mgs.data.dataset import target_of, write_transforms
 from mgs.data.frames import Frame
 from mgs.data.world import Vector, World, levelled
@@ -22,11 +22,8 @@ from mgs.memory import Deferred
 from mgs.prior.exposure import exposure_of, without_gain
 from mgs.progress import report
 from mgs.run.folder import Run, open_run
-from mgs.splat.reference import sh_basis
 from mgs.splat_files import load_gaussians, upward
 from mgs.splat_places import to_source
-
-DIRECTIONS = 64  # directions to which the coefficients of a converted colour are fitted
 
 REFIT = TrainSettings(
     optimiser="adam", tolerance=0, rates=dict.fromkeys(RATES, 0.0) | {"colour": RATES["colour"]}
@@ -59,16 +56,13 @@ def in_srgb(g: Gaussians) -> Gaussians:
     """Convert linear colours to sRGB, which most viewers blend as it is; the rest is unchanged.
 
     The colour of each Gaussian is exact at SH degree 0. At higher degrees its coefficients are a
-    least-squares fit over DIRECTIONS. Blending differs in any case: mixtures are a little darker.
+    least-squares fit over `even_directions`. Blending differs in any case: mixtures are a little
+    darker.
     """
     if not g.linear:
         return g
-    k = np.arange(DIRECTIONS) + 0.5
-    z, turn = 1 - 2 * k / DIRECTIONS, np.pi * (1 + 5**0.5) * k
-    across = np.sqrt(1 - z * z)
-    directions = np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
-    directions = directions if g.sh_degree else directions[:1]
-    basis = sh_basis(directions, g.sh_degree)
+    directions = even_directions()
+    basis = sh_basis(directions if g.sh_degree else directions[:1], g.sh_degree)
     inverse, sh = np.linalg.pinv(basis), np.empty_like(g.sh)
     for first in range(0, len(g), PART):
         part = slice(first, first + PART)

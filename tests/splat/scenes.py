@@ -11,8 +11,10 @@ import numpy as np
 
 from mgs.camera import Camera, look_at
 from mgs.gaussians import ARRAYS, Gaussians
-from mgs.splat import as_drjit, reference
-from mgs.splat.reference import margins
+from mgs.splat import as_drjit
+
+from . import reference
+from .reference import margins
 
 SIZE = (45, 27)
 """Width and height of most scenes, pixels: no multiple of the 8x4 block in either direction."""

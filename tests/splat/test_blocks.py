@@ -18,7 +18,6 @@ from mgs.splat import (
     fisher,
     kernels,
     moved,
-    reference,
     render,
     rendering,
     walking,
@@ -27,6 +26,7 @@ from mgs.splat.blocks import BLOCK_X, BLOCK_Y, build, depth_order
 from mgs.splat.projection import camera_array, project
 from mgs.splat.walking import PIXELS, packet_count
 
+from . import reference
 from .scenes import changed, gradients_of, make_camera, make_gaussians, place, with_gradients
 
 

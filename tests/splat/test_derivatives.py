@@ -15,9 +15,9 @@ from refusals import fails
 
 from mgs import splat
 from mgs.gaussians import ARRAYS, LEARNED
-from mgs.splat import as_drjit, fisher, fisher_derivatives, groups, jvp, moved, reference, render
+from mgs.splat import as_drjit, fisher, fisher_derivatives, groups, jvp, moved, render
 
-from . import scenes
+from . import reference, scenes
 from .scenes import calm, make_camera, make_clamped, make_gaussians, relative_error, with_gradients
 
 BACKGROUND = (0.3, 0.6, 0.1)

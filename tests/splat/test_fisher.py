@@ -13,9 +13,9 @@ from refusals import fails
 from scipy.linalg import block_diag
 
 from mgs.gaussians import LEARNED
-from mgs.splat import MEANS, Information, fisher, groups, information, jvp, reference, render, vjp
+from mgs.splat import MEANS, Information, fisher, groups, information, jvp, render, vjp
 
-from . import scenes
+from . import reference, scenes
 from .scenes import (
     calm,
     changed,

@@ -4,11 +4,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mgs.splat import ListCache, as_drjit, fisher, kernels, reference, render, walking
+from mgs.splat import ListCache, as_drjit, fisher, kernels, render, walking
 from mgs.splat.blocks import on_cpu
 from mgs.splat.projection import camera_array, project
 from mgs.splat.walking import exp2
 
+from . import reference
 from .scenes import in_own_process, make_camera, make_gaussians, place
 
 

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from refusals import fails
 
 from mgs.fit.pruning import NEIGHBOURS, fewest, prune, removal_cost
-from mgs.splat import reference, render
+from mgs.splat import render
 
+from . import reference
 from .scenes import calm, make_camera, make_gaussians
 
 BACKGROUND = (0.3, 0.6, 0.1)

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from mgs.colour import SH_C0
 from mgs.gaussians import Gaussians
-from mgs.splat import fisher, reference, render
+from mgs.splat import fisher, render
 from mgs.splat.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 
+from . import reference
 from .scenes import SIZE, changed, make_camera, make_gaussians, margins, place
 
 TOLERANCE = 2e-5

@@ -14,11 +14,11 @@ from refusals import fails
 import mgs.splat
 from mgs import Camera
 from mgs.gaussians import ARRAYS, SH_MAX, Gaussians
-from mgs.splat import ESTIMATORS, ListCache, fisher, jvp, reference, render
+from mgs.splat import ESTIMATORS, ListCache, fisher, jvp, render
 from mgs.splat.constants import NEAR
 from mgs.splat.recording import frozen
 
-from . import scenes
+from . import reference, scenes
 from .scenes import SIZE, changed, gradients_of, make_camera, make_gaussians, place, with_gradients
 from .test_render import errors
 

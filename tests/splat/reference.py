@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import expit
 
 from mgs.camera import Camera
+from mgs.colour import sh_basis
 from mgs.gaussians import Gaussians
 from mgs.rotation import rotmat_from_quat
 from mgs.splat.constants import (
@@ -34,37 +35,6 @@ class Projected:
     compensations: np.ndarray  # [N] factor of antialiased Gaussians, else 1
     colours: np.ndarray  # [N,3] linear RGB
     visible: np.ndarray  # [N] bool, in front of the near plane
-
-
-def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """Real spherical harmonics of unit directions [N,3] -> [N,(degree+1)^2], in the order and signs
-    of 3DGS files."""
-    x, y, z = directions.T
-    xx, yy, zz = x * x, y * y, z * z
-    basis = [np.full(len(x), 0.28209479177387814)]
-    if degree > 0:
-        c = 0.4886025119029199
-        basis += [-c * y, c * z, -c * x]
-    if degree > 1:
-        # Degree 2, then degree 3.
-        basis += [
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2 * zz - xx - yy),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (xx - yy),
-        ]
-    if degree > 2:
-        basis += [
-            -0.5900435899266435 * y * (3 * xx - yy),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * zz - xx - yy),
-            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-            -0.4570457994644658 * x * (4 * zz - xx - yy),
-            1.445305721320277 * z * (xx - yy),
-            -0.5900435899266435 * x * (xx - 3 * yy),
-        ]
-    return np.stack(basis, 1)
 
 
 def project(gaussians: Gaussians, camera: Camera) -> Projected:
