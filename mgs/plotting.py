@@ -92,15 +92,14 @@ def painted(values: np.ndarray, colours: str, low: float = 0.0, high: float = 1.
     return np.ascontiguousarray(matplotlib.colormaps[colours](share, bytes=True)[..., :3])
 
 
-def crop(mask: np.ndarray, margin: float = 0.06) -> tuple[slice, slice]:
-    """Rows and columns of an image that hold its mask [H,W] and a margin; all if the mask is empty.
-
-    margin: share of the image's height and width."""
+def crop(mask: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns of an image that hold its mask [H,W] and a margin of 6 % of the image's
+    sides; all if the mask is empty."""
     if not mask.any():
         return slice(None), slice(None)
 
     def span(indices: np.ndarray, size: int) -> slice:
-        more = round(margin * size)
+        more = round(0.06 * size)
         return slice(max(0, int(indices.min()) - more), min(size, int(indices.max()) + more + 1))
 
     rows, columns = map(span, np.nonzero(mask), mask.shape)

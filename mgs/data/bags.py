@@ -48,14 +48,10 @@ def is_bag(path: Path) -> bool:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """Context manager: the reader of a bag. Raises InputError where rosbags is not installed, and
-    where the bag is damaged."""
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        why = "a ROS bag needs rosbags, which is not installed"
-        raise InputError(f"{path}: {why}; `pip install mgs[ros]`") from None
+    """Context manager: the reader of a bag. Raises InputError where the bag is damaged."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
     if path.suffix in STORAGE and (path.parent / "metadata.yaml").is_file():
         path = path.parent
     for file in path.iterdir() if path.is_dir() else [path]:

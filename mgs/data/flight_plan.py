@@ -42,10 +42,8 @@ class Origin:
         ellipsoid's radii of curvature at the origin: exact to a centimetre within 500 m."""
         x, y, z = (float(value) for value in position)
         turn, lat = math.radians(self.bearing), math.radians(self.latitude)
-        east, north = (
-            x * math.cos(turn) + y * math.sin(turn),
-            y * math.cos(turn) - x * math.sin(turn),
-        )
+        east = x * math.cos(turn) + y * math.sin(turn)
+        north = y * math.cos(turn) - x * math.sin(turn)
         eccentricity = FLATTENING * (2 - FLATTENING)
         root = 1 - eccentricity * math.sin(lat) ** 2
         across = EQUATOR / math.sqrt(root)

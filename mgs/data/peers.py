@@ -252,10 +252,8 @@ def _splatting(path: Path, folders: list[Path]) -> Contents:
     views = []
     for one in read_json(path):
         pose = np.linalg.inv(_matrix(one["rotation"], one["position"]))
-        focal, size = (
-            (float(one["fx"]), float(one["fy"])),
-            (float(one["width"]), float(one["height"])),
-        )
+        focal = float(one["fx"]), float(one["fy"])
+        size = float(one["width"]), float(one["height"])
         views.append(View(str(one["img_name"]), pose, focal, size))
     return Contents(views)
 
@@ -296,7 +294,6 @@ def _is_object(path: Path) -> bool:
 
 
 def is_peer(kind: str, source: Path) -> bool:
-    """Whether a path is a source of this kind of PEERS."""
     return _file_of(kind, source) is not None
 
 
