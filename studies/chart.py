@@ -130,7 +130,6 @@ class Point:
 
     @property
     def name(self) -> str:
-        """Name of its cell."""
         parts = [f"d{1 / self.density:g}", f"i{self.images}", f"p{self.passes}"]
         later = f"{self.warm_passes}x{self.warm_rate:g}"
         parts += [later, self.policy, self.estimator] if self.policy else []
@@ -187,7 +186,6 @@ def preset_points(size: ChartSize) -> dict[str, Point]:
 
 
 def name_of(rock: Rock, point: Point) -> str:
-    """Name of the cell of a point on a rock."""
     return f"{point.name}/{rock.name}"
 
 

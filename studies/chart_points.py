@@ -58,7 +58,6 @@ def points_over_rocks(rows: Sequence[Row]) -> list[Row]:
 
 
 def base_of(points: Sequence[Row]) -> Row:
-    """The base among points of one kind."""
     return next(point for point in points if point["of"][0]["base"])
 
 
@@ -144,7 +143,6 @@ def _label(point: Row) -> str:
 
 
 def _draw_kind(axes: "Axes", points: Sequence[Row]) -> None:
-    """Draw one panel."""
     most, rate = (base_of(points)[key] for key in ("images", "warm_rate"))
     points = [p for p in points if (p["images"], p["warm_rate"]) == (most, rate)]
     points = [point | {"label": _label(point)} for point in points]

@@ -187,7 +187,6 @@ def write(work: Work) -> list[Path]:
 
 
 def sized(size: FitsSize, options: Namespace) -> Any:
-    """Size with the options."""
     changed: Any = setups.sized(size, options)
     return replace(changed, variants=tuple(options.variant or ()))
 

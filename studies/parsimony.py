@@ -148,7 +148,6 @@ def rows_of(work: Work) -> list[Row]:
 
 
 def name_of(row: Row) -> str:
-    """Name of a choice in tables."""
     words: dict[str, str] = {
         NUMBER: f"{row.get('asked') or 0:,} Gaussians",
         KINDS: f"learns {(row.get('learned') or '').replace('+', 'up to')}",

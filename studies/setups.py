@@ -191,7 +191,6 @@ def spiral_of(rock: Rock, size: SetupSize) -> Case:
 
 
 def shown_as(policy: str) -> str:
-    """Name of a policy in tables."""
     label = policy_file.label(policy)
     return label.partition(":")[2] if policy in BASELINES else label
 

@@ -165,7 +165,6 @@ class Lab:
         gc.collect()  # a scene and its caches refer to each other
 
     def rng(self, fault: str, size: float) -> np.random.Generator:
-        """Random generator of a fault of this rock."""
         return generator(0, f"stress/{self.name}/{fault}/{size}")
 
     def with_fault(self, change: Any, size: float, views: Sequence[int], fault: str) -> list[Any]:
@@ -273,7 +272,6 @@ def sizes(group: Row) -> str:
 
 
 def count_of_warnings(group: Row) -> str:
-    """Number of runs with a warning."""
     return str(sum(bool(row["warnings"]) for row in group["of"]))
 
 

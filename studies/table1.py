@@ -130,7 +130,6 @@ class TableRun:
 
     @property
     def name(self) -> str:
-        """Name of its cell."""
         images, settings = self.size.images, self.settings()
         shape = f"{images.frames}x{images.width}x{images.height}-{self.size.gaussians}"
         views = f"{self.seeds}+{settings['budget']}-{settings['seed']}"

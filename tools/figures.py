@@ -15,7 +15,6 @@ RESULTS = Path(__file__).parent.parent / "docs/results"
 
 
 def draw_chart(path: Path, rows: list[Row]) -> None:
-    """Draw the chart of speed and accuracy."""
     chart.draw(path, chart.points_over_rocks(rows))
 
 

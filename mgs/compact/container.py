@@ -104,13 +104,11 @@ def _with_sum(data: bytes) -> bytes:
 
 
 def packet(key: Key, payload: bytes) -> bytes:
-    """Bytes of a packet."""
     tile, group, layer = key
     return _with_sum(MARK + PACKET.pack(tile, GROUPS.index(group), layer, len(payload)) + payload)
 
 
 def join(header: Header, packets: Iterable[bytes]) -> bytes:
-    """Bytes of a file."""
     return bytes(header) + b"".join(packets)
 
 

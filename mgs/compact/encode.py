@@ -217,7 +217,6 @@ class Plan:
         return steps * allocate.rounded(values, steps, 1)[0]
 
     def file(self, values: np.ndarray) -> Compact:
-        """File of coefficients."""
         header, tree, h = self.header, self.tree, self.h[self.tree.band]
         payloads, worth = dict(self.payloads), dict(self.worth)
         steps = header.last_steps[tree.band]

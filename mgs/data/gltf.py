@@ -60,7 +60,6 @@ class Gltf:
         return self.resolve(unquote(uri))
 
     def bytes_of(self, view: int) -> bytes:
-        """Bytes of a buffer view."""
         entry = self.json["bufferViews"][view]
         index, start = entry["buffer"], entry.get("byteOffset", 0)
         if index not in self._buffers:

@@ -84,7 +84,6 @@ class Matcher:
 
     @classmethod
     def of_frames(cls, frames: Sequence[Frame], folder: Path) -> "Matcher":
-        """Matcher of the images of a dataset."""
         return cls.of_lenses([(frame.image_path, frame.camera, None) for frame in frames], folder)
 
     @classmethod

@@ -307,7 +307,6 @@ def filled(values: float | np.ndarray, shape: tuple[int, ...]) -> Any:
 def _photo(
     gaussians: Gaussians, camera: Camera, target: np.ndarray | Target, alpha_weight: float
 ) -> Photo:
-    """A `Photo` from a target of a fit."""
     if not isinstance(target, Target):
         target = np.asarray(target)
         if target.ndim != 3 or target.shape[:2] != (camera.height, camera.width):

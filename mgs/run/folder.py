@@ -156,7 +156,6 @@ class Run:
 
     @cached_property
     def prior(self) -> Prior:
-        """The prior of the settings."""
         path = self.settings.prior
         if not path.is_dir():
             where = f"{self.folder / 'config.json'}: prior {path}"

@@ -175,17 +175,14 @@ class Case:
 
     @property
     def dataset(self) -> str:
-        """Folder of the dataset."""
         return str(self.given) if self.given else f"{CELLS}/dataset/{self.name}/dataset"
 
     @property
     def prior(self) -> str:
-        """Folder of the prior."""
         return f"{CELLS}/{self.prior_name}/prior"
 
     @property
     def prior_name(self) -> str:
-        """Name of the prior's cell."""
         values = (f"{v:g}" if isinstance(v, float) else str(v) for v in self.settings.values())
         return "-".join([f"prior/{self.name}", *values])
 

@@ -110,7 +110,6 @@ class Study:
     growing: bool = False
 
     def parser(self) -> Parser:
-        """Parser of the command line."""
         prog = f"python -m studies.{self.name}"
         parser = Parser(prog, description=self.about, allow_abbrev=False)
         out: Options = {

@@ -58,7 +58,6 @@ class Cell:
 
 
 def cell_folder(root: Path, name: str) -> Path:
-    """Folder of a cell."""
     return root / CELLS / name
 
 
