@@ -40,7 +40,8 @@ mgs nbv {data} --prior {prior} --seeds 3 --budget 1 --out {out}: --set estimator
     --set stop_uncertainty=1; --policy best; --seeds 13; --set train.means=loose;
     --set train.means=free --set estimator=loss-gradient; --set train.means=free --policy paper;
     --set flight.length=9; --set flight.no_fly=4; --set flight.clearance=30;
-    --set flight.length=30 --set travel=2; --set refine_poses=true
+    --set flight.length=30 --set travel=2; --set refine_poses=true; --set enough=0.5
+mgs suggest {run}: --set enough=0.5
 mgs synth-orbit {out}: --scene moon; --scene nowhere/x.toml; --preset huge; --orbit figure-eight;
     --distances 1,far; --distances 1e-300; --size 320; --size 99999999x99999999; --size 3²x24;
     --size 100000x1; --mesh nowhere.glb; --mesh-up y; --spp 100000000000; --pose-noise 1e300

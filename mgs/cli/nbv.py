@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from pydantic import Field
 
-from mgs.cli.options import Settings, merged, not_none, parse_gaussians, parse_settings, with_keys
+from mgs.cli.options import (
+    Settings,
+    merged,
+    not_none,
+    parse_gaussians,
+    parse_settings,
+    refuse_unused,
+    with_keys,
+)
 from mgs.cli.terminal import Terminal, progress_bar
 from mgs.errors import InputError
 from mgs.files import check_writable
@@ -84,6 +92,8 @@ def nbv(
     - capture_folder: Folder to which poses are written; pictures are awaited there."""
     console = Terminal()
     values = parse_settings(settings, nbv)
+    if budget != "auto":
+        refuse_unused("without --budget auto", **{"set enough": values.get("enough")})
     live = live_from(capture_command, capture_folder, values.pop("capture", {}))
     own = not_none(budget=budget, seeds=seeds, batch=batch, seed=seed)
     if resume is not None:

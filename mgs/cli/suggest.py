@@ -10,7 +10,15 @@ from pydantic import Field, field_validator
 from rich.table import Table
 
 from mgs import runtime
-from mgs.cli.options import Count, Settings, not_none, parse_gaussians, parse_settings, with_keys
+from mgs.cli.options import (
+    Count,
+    Settings,
+    not_none,
+    parse_gaussians,
+    parse_settings,
+    refuse_unused,
+    with_keys,
+)
 from mgs.cli.terminal import Terminal, progress_bar
 from mgs.data.dataset import load_dataset, read_records
 from mgs.data.flight_plan import Stop, check_plan_path, parse_origin, write_flight_plan
@@ -112,6 +120,8 @@ def suggest(
         check_plan_path(path)
         check_new_file(path, force)
     values = parse_settings(settings, suggest)
+    if views != "auto":
+        refuse_unused("without --views auto", **{"set enough": values.get("enough")})
     asked = validated(Candidates, values)
     shape = _shape(poses, dome, asked)
     own = ("flight", "enough", "certificate")
