@@ -349,7 +349,7 @@ def check_new_folder(path: str | Path, ours: Ours | None = None) -> Path:
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file, not a folder; choose another output folder")
     if path.is_dir() and any(there.name != LOCK for there in path.iterdir()):
-        _check_unlocked(path / LOCK)
+        check_unlocked(path)
         if ours is None:
             raise InputError(f"{path}: {THERE}")
         ours.check(path)
@@ -556,9 +556,10 @@ def _flock(path: Path, file: TextIO) -> None:
         raise InputError(f"{path.parent}: {by}; wait until it has ended") from None
 
 
-def _check_unlocked(path: Path) -> None:
-    """Raise InputError if another process holds a lock, which is not taken."""
-    if Path(os.path.abspath(path.parent)) in _held or not _is_lock(path):
+def check_unlocked(folder: Path) -> None:
+    """Raise InputError if another process works in a folder. Its lock is not taken."""
+    path = folder / LOCK
+    if Path(os.path.abspath(folder)) in _held or not _is_lock(path):
         return
     with suppress(OSError), open(path, encoding="ascii") as file:
         _flock(path, file)

@@ -1,5 +1,6 @@
 """The program as a whole: how it starts and ends, what it repairs; settings of `mgs nbv`."""
 
+import fcntl
 import json
 import shutil
 from dataclasses import replace
@@ -62,6 +63,18 @@ def test_a_damaged_model_is_restored_from_the_checkpoint(dataset, prior, tmp_pat
     assert read_ply(model) == read_checkpoint(run).gaussians
     command("eval", run, "--no-pictures")
     assert "restored" not in capsys.readouterr().err
+
+
+def test_the_model_of_a_run_at_work_is_left_to_it(dataset, prior, tmp_path, capsys):
+    """Between its last checkpoint and the model that it writes next."""
+    run = tiny.write_run(tmp_path / "run", dataset, prior)
+    (run / "gaussians.ply").unlink()
+    with open(run / ".lock", "w") as lock:
+        print("mgs 1", file=lock, flush=True)
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        command("report", run, "--html", tmp_path / "page.html")
+        assert "restored" not in capsys.readouterr().err
+        assert not (run / "gaussians.ply").exists()
 
 
 def test_the_hint_knows_options_with_an_equals_sign(tmp_path):

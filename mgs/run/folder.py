@@ -21,6 +21,7 @@ from mgs.data.world import PLUS_Z, Vector, unit_up
 from mgs.errors import InputError, Notice
 from mgs.files import (
     atomic_path,
+    check_unlocked,
     parsing,
     read_json,
     reading,
@@ -189,6 +190,10 @@ class Run:
 
     def _repair(self, state: Checkpoint) -> None:
         path, model = self.folder / "gaussians.ply", to_source(state.gaussians, self.dataset.world)
+        try:
+            check_unlocked(self.folder)
+        except InputError:
+            return  # the process at work there writes the file next
         try:
             intact = read_ply(path) == model
         except InputError:
