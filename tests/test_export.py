@@ -447,4 +447,4 @@ def test_every_format_is_measured(chosen, tmp_path, kind):
     right = evaluate(model, chosen.dataset)["all"]["psnr"]
     path = written(tmp_path, kind, model)
     assert evaluate(path, chosen.dataset)["all"]["psnr"] == pytest.approx(right, abs=0.1)
-    assert path.with_suffix(".metrics.json").is_file()
+    assert path.with_name(f"{path.name}.metrics.json").is_file()  # others may differ in the end

@@ -65,7 +65,7 @@ def evaluate(
                 metrics = measured(path, dataset, prior=prior)
                 name = path.name if path == subject else f"  {path.stem.partition('_')[2]}"
                 rows.append(metrics_row(name, metrics))
-                lines.append(f"wrote {path.with_suffix('.metrics.json')}")
+                lines.append(f"wrote {path}.metrics.json")
     print_quality(Terminal(), rows)
     echo("\n".join(lines))
 

@@ -137,7 +137,7 @@ def evaluate(
     """Measure PSNR and SSIM of a run or a model; return the contents of metrics.json.
 
     - subject: a run or its folder, measured by `evaluate_run` with its options; or Gaussians, or a
-      file of them, whose metrics are written beside it as NAME.metrics.json.
+      file of them, whose metrics are written beside it, as a.ply.metrics.json.
     - dataset: of Gaussians or a file. Default for a file in a run folder: the run's.
     - trained: names of the frames that the model was trained on. Default for a file in a run
       folder, on the run's dataset: the views taken.
@@ -174,5 +174,5 @@ def evaluate(
     frames, test_frames = views.with_images(names), tests.frames if tests else ()
     metrics = evaluate_model(subject, frames, names, test_frames=test_frames)
     if path is not None:
-        write_json(path.with_suffix(".metrics.json"), metrics)
+        write_json(path.with_name(f"{path.name}.metrics.json"), metrics)
     return metrics
