@@ -26,6 +26,7 @@ from mgs.policy.pool_gains import PoolGains
 from mgs.run import folder as run_folder
 from mgs.run.choosing import planned_flight
 from mgs.run.ending import run_end
+from mgs.run.flight import Flight
 from mgs.run.policies import Directional
 from mgs.run.settings import FlightLimits, NbvSettings
 
@@ -339,6 +340,18 @@ def test_poses_that_are_not_allowed_are_never_taken(dataset, prior, tmp_path, ca
     positions = scene.positions(scene.frames)
     opposite = tour.legs(positions, scene.centre[:2], settings.flight.no_fly)[0, 6]
     assert 6 < opposite == pytest.approx(2 * np.sqrt(5) + 2 * (np.pi - 2 * np.arccos(2 / 3)), 0.01)
+
+
+def test_a_view_in_reach_is_one_that_a_plan_can_take():
+    """Around a cylinder a way with a stop can be shorter: its corners lie nearer to the arc."""
+    angles = np.radians([0, 14.9, 7.45])
+    legs = tour.legs(np.column_stack([np.cos(angles), np.sin(angles), [0, 0, 0]]), np.zeros(2), 1.0)
+    assert legs[1, 2] + legs[2, 0] < legs[1, 0] - 1e-3
+    for time in (9.522, 9.5225, 9.524):
+        flight = Flight(FlightLimits(time=time, speed=1.0, no_fly=1.0), legs, home=0)
+        share = flight.share_from([0, 1], 9)
+        way, _ = tour.grown(legs, [1, 0], [2], lambda stops, cost: (2, 1.0), share, 1.0)
+        assert flight.in_reach([0, 1], [2]) == way[1:-1]
 
 
 @pytest.mark.parametrize(("name", "value"), [("seeds", 2), ("sh", 1)])

@@ -129,5 +129,6 @@ class Flight:
     def in_reach(self, taken: Sequence[int], stops: Sequence[int]) -> list[int]:
         """The stops that leave enough of the limits to come home."""
         metres = self.flown(taken) + self.legs[taken[-1], stops] + self.legs[stops, self.home]
+        metres = np.maximum(metres, self.metres(taken))  # as `tour.insertions`: no stop is a gain
         fits = self.share(metres, len(taken) - self.skipped + 1) <= 1
         return [stop for stop, fit in zip(stops, fits, strict=True) if fit]
