@@ -24,6 +24,7 @@ from mgs.progress import listening
 from mgs.reports.suggestion import numbers, write_suggestion
 from mgs.run.candidates import Site, hidden, inside, place_poses, read_poses, refusals
 from mgs.run.nbv import start_fit
+from mgs.run.settings import FlightLimits
 from mgs.run.suggest import coarse_prior, suggest
 
 
@@ -63,9 +64,11 @@ def test_views_are_planned_together_and_flown_in_a_short_order(run, site):
     assert all(view.information_gain < alone[view.name] for view in chosen[1:])
     azimuths = [view.azimuth for view in found.plan]
     assert azimuths in (sorted(azimuths), sorted(azimuths, reverse=True))
-    short = suggest(opened, ring, 12, flight={"length": 0.8 * found.metres})
+    limits = {"length": 0.8 * found.metres}
+    short = suggest(opened, ring, 12, flight=limits)
     assert 0 < len(short.plan) < 12
     assert short.metres <= 0.8 * found.metres
+    assert suggest(opened, ring, 12, flight=FlightLimits(**limits)).metres == short.metres
 
 
 def test_refined_poses_gain_within_the_limits(run, site, tmp_path, monkeypatch):

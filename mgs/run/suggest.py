@@ -196,7 +196,7 @@ def _settings(run: Run, taken: int, views: int, given: dict[str, Any]) -> NbvSet
     free = dict.fromkeys(["travel", "nearest", "stop_gain", "stop_uncertainty", "stop_psnr"])
     own = run.settings.model_dump()
     own["train"]["density"] = "fixed"  # nothing is fitted
-    limits = {"flight": own["flight"] | given.get("flight", {})}
+    limits = {"flight": own["flight"] | dict(given.get("flight", {}))}
     settings = validated(NbvSettings, own | free | given | limits | fixed)
     check_settings(settings, taken + views)
     return settings
