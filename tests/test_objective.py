@@ -87,6 +87,17 @@ def test_value_gradient_and_diagonals_are_those_of_the_reference(case):
         assert np.allclose(flat(found(model)), expected, **close)
 
 
+def test_images_of_different_sizes_count_by_their_pixels():
+    model = surface_gaussians(50)
+    cameras = [surface_camera(model, *size) for size in ((24, 20), (48, 40))]
+    targets = [np.full((20, 24, 3), 0.9, np.float32), np.zeros((40, 48, 3), np.float32)]
+    whole, *alone = (
+        objective(model, cameras[some], targets[some]).phi(as_drjit(model))
+        for some in (slice(2), slice(1), slice(1, 2))
+    )
+    assert whole == pytest.approx(sum(alone), rel=1e-6)
+
+
 UNSEEN = np.zeros((20, 24, 4), np.float32)
 """A target of weight 0, so that the prior alone acts."""
 

@@ -173,7 +173,16 @@ class Objective:
     error: str = "squared"  # as of `loss_named`
 
     def loss(self, model: Gaussians) -> float:
-        """2 Phi over the number of pixel values: mean loss plus the prior's part."""
+        """Mean over the images of their mean loss plus the prior's part; 2 Phi over the number of
+        pixel values where all are of one size."""
+        return float(np.mean([loss for loss, _ in self._losses(model)]))
+
+    def phi(self, model: Gaussians) -> float:
+        """Phi, squared pixel values."""
+        return 0.5 * sum(loss * size for loss, size in self._losses(model))
+
+    def _losses(self, model: Gaussians) -> list[tuple[float, int]]:
+        """Mean loss of each image plus the prior's part, and its number of values."""
         penalty = sum(
             weighted_squares(lam * self.prior.share, d.array) for d, lam in self.offsets(model)
         )
@@ -181,13 +190,9 @@ class Objective:
         for photo in self.photos:
             image, target = _rendered(model, photo, self.cache), photo.target
             values = _errors(self.error, image, target, photo.size, model.linear)
-            errors.append(dr.mean(values) + penalty / len(target))
+            errors.append((dr.mean(values) + penalty / len(target), len(target)))
             dr.eval(errors[-1])  # frees the rendered image
-        return float(np.mean([float(error[0]) for error in errors]))
-
-    def phi(self, model: Gaussians) -> float:
-        """Phi, squared pixel values."""
-        return 0.5 * sum(len(photo.target) for photo in self.photos) * self.loss(model)
+        return [(float(error[0]), size) for error, size in errors]
 
     def gradient(self, model: Gaussians) -> Vector:
         """Derivative of Phi by the learned parameters."""
