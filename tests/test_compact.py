@@ -213,6 +213,15 @@ def test_a_file_comes_back_as_its_encoder_says(tmp_path):
     fails("needs no prior", load_gaussians, tmp_path / "x.ply", tmp_path)
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_gaussians_at_one_place_come_back(count):
+    some = gaussians(1, 300)[np.repeat(7, count)]
+    file = Encoder(some, signs).file(0.001)
+    size = float(np.exp(some.log_scales).mean())
+    np.testing.assert_allclose(file.model.means, some.means, atol=size * count / 16)
+    np.testing.assert_allclose(file.model.opacities, some.opacities, atol=1e-3)
+
+
 def test_more_bytes_are_better_and_each_packet_improves(tmp_path):
     encoder = small()
     errors = [change(encoder.file(scale).model, encoder.g) for scale in (0.2, 0.05, 0.01)]

@@ -100,9 +100,9 @@ class Encoder:
             start = Start(g.means.astype(np.float64), quats, layer, bytes(16), 0.0)
         self.places = start
         near = cKDTree(start.means).query(start.means, min(2, len(start.means)))[0].max(axis=-1)
-        self.spacing = float(np.median(near)) or 1.0
+        self.spacing = float(np.median(near)) or float(np.exp(g.log_scales).mean())
         self.low = placed.low if placed else start.means.min(0)
-        self.extent = float(np.ptp(start.means, 0).max())
+        self.extent = float(np.ptp(start.means, 0).max()) or self.spacing
         self.axes = fixed(colour_axes(g.sh[self._codes(self.extent / 1e6)[0]]), AXES)
         quats = start.quats[self.kept]
         columns = columns_of(g, quats, self.axes)
