@@ -648,6 +648,13 @@ def test_a_room_with_depth_starts_whole_from_its_walls(tmp_path, capsys):
     assert "beyond what the images show" in words
     assert 0 < max(away) < WALL - 1  # half of the least distance of an image from the wall
     assert any(view["elevation"] < 0 for view in left)
+    poses, plan = tmp_path / "poses.csv", tmp_path / "next.waypoints"
+    poses.write_text("x,y,z,target_x,target_y,target_z\n-1,0,0,-3,0,0\n1,0,0,3,0,0\n")
+    asked = ["--poses", poses, "--views", 2, "--plan", plan, "--origin", "47,8,400"]
+    asked += ["--set", "flight.clearance=2"]
+    assert "crosses" not in output(capsys, "suggest", tmp_path / "run", *asked)
+    home = float(plan.read_text().splitlines()[1].split()[10])
+    assert home == pytest.approx(400 - WALL, abs=0.1)
     synthetic.edit(data.root, lambda d: [f.pop("depth_file_path") for f in d["frames"]])
     line = refused(capsys, ["fit", data.root, "--out", tmp_path / "bare"], tmp_path / "bare")
     assert "a whole scene needs points, which `mgs import` triangulates" in line

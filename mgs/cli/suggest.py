@@ -229,7 +229,9 @@ def _candidates(
 
 
 def _crossed(run: Run, result: Suggestion) -> str:
-    """Say which leg crosses the object, if one does."""
+    """Say which leg crosses the object, if one does; a whole scene has none."""
+    if site_of(run).whole:
+        return ""
     home = taken_in_order(run)[0].camera.position
     ends = [*(view.camera.position for view in result.plan), home]
     names = [*(view.name for view in result.plan), "the first image"]
@@ -245,8 +247,7 @@ def _crossed(run: Run, result: Suggestion) -> str:
 def _write_plan(path: Path, run: Run, result: Suggestion, place: Any, limits: FlightLimits) -> None:
     """Write a flight plan; home is on the ground under the first image."""
     home = taken_in_order(run)[0].camera.position
-    ground = float(run.prior.mesh.vertices[:, 2].min())
-    stops = [Stop(np.array([*home[:2], ground]))]
+    stops = [Stop(np.array([*home[:2], site_of(run).ground]))]
     for corners, view in zip(result.corners, [*result.plan, None], strict=True):
         stops += [Stop(corner) for corner in corners]
         if view is not None:

@@ -63,6 +63,14 @@ class Site:
         """Middle of the object [3]."""
         return np.asarray(self.prior.points.mean(axis=0), np.float64)
 
+    @property
+    def ground(self) -> float:
+        """Height of the object's lowest point; of a whole scene, that which 99 % of the points are
+        above."""
+        if self.whole and self.points is not None:
+            return float(np.quantile(self.points[:, 2], 0.01))
+        return float(self.prior.mesh.vertices[:, 2].min())
+
     def clearance(self, eyes: np.ndarray) -> NDArray[np.float64]:
         """Distance of places [M,3] from the prior's mesh, or from the points of a whole scene."""
         if self.whole:

@@ -128,6 +128,7 @@ def suggest(
     rule = policy_of(policy or mission.policy)
     with listening(progress):
         scene, state = _coarse_scene(run, images, flyable, mission)
+        scene.__dict__["ground"] = site.ground  # the mesh of a whole scene is a ball
         weights = _weights(scene, state, len(taken))
         may = allowed(scene, mission)
         blind = [i for i, seen in weights.items() if not seen.any()]
