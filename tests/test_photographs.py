@@ -594,12 +594,15 @@ def test_photographs_without_masks_are_fitted_whole_from_their_points(
     assert "has no surface on which to compare" in refused(capsys, arguments, tmp_path / "run")
 
 
-def test_depth_beside_photographs_without_masks_leaves_the_fit_whole(colmap, tmp_path):
+def test_depth_beside_photographs_without_masks_leaves_the_fit_whole(
+    colmap, tmp_path, monkeypatch
+):
     """The surface of the object in their middle gave 7 dB of a scene with its ground."""
     data = import_source(read_source(colmap), tmp_path / "d")
     assert start_of_fit(data, None, None, {}).source == "random"
     deep = replace(data, frames=tuple(replace(f, depth_path=f.image_path) for f in data.frames))
     assert start_of_fit(deep, None, None, {}) == start_of_fit(data, None, None, {})
+    monkeypatch.setattr(Frame, "depth", lambda frame: np.zeros(frame.rgb().shape[:2]))
     (tmp_path / "d/sparse.ply").unlink()
     assert start_of_fit(deep, None, None, {}).source is None
 
@@ -608,11 +611,12 @@ WALL = 3.0
 """Radius of the round room, metres, about the origin."""
 
 
-def write_room(root):
-    """RGB-D images without masks from near the middle of a room, outwards."""
+def write_room(root, away=0.3):
+    """RGB-D images without masks from so far from the middle of a room, outwards, or inwards where
+    that is negative."""
     frames = []
     for i, towards in enumerate(synthetic.sphere(14)):
-        camera = synthetic.pinhole(30, 48, 36, 0.3 * towards, towards)
+        camera = synthetic.pinhole(30, 48, 36, away * towards, towards)
         rays = camera.unproject(np.ones((36, 48))) - camera.position
         along = rays @ camera.position
         beyond = WALL**2 - camera.position @ camera.position
@@ -658,6 +662,15 @@ def test_a_room_with_depth_starts_whole_from_its_walls(tmp_path, capsys):
     synthetic.edit(data.root, lambda d: [f.pop("depth_file_path") for f in d["frames"]])
     line = refused(capsys, ["fit", data.root, "--out", tmp_path / "bare"], tmp_path / "bare")
     assert "a whole scene needs points, which `mgs import` triangulates" in line
+
+
+def test_a_room_is_fitted_whole_if_its_cameras_look_inwards(tmp_path):
+    """It was refused, as no ground or object is near what they look at."""
+    data = write_room(tmp_path / "room", -2.5)
+    assert start_of_fit(data, None, None, {}).source == "random"
+    _, points, *_ = scattered(data, PriorSettings(gaussians=400))
+    assert (np.abs(np.linalg.norm(points, axis=1) - WALL) < 0.02 * WALL).sum() >= 364
+    command("fit", data.root, "--passes", 1, "--out", tmp_path / "run")
 
 
 def test_an_object_in_masks_starts_with_few_gaussians_that_are_split(

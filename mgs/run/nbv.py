@@ -266,8 +266,8 @@ def start_of_fit(data: Dataset, prior: Any, gaussians: Any, train: dict[str, Any
         kind = str(numbers.get("from", "")) if isinstance(numbers, dict) else ""
     else:
         kind = existing.kind if existing else choose_source(data.survey())
-    points = kind in ("points", "depth") and has_points(data)
-    whole = prior is None and points and not has_masks(data.frames)
+    bare = prior is None and kind in ("points", "depth") and not has_masks(data.frames)
+    whole = bare and has_points(data)
     source = "random" if whole and train.get("means", "free") == "free" else None
     kind = source or kind
     if train.get("density") == "adaptive":
