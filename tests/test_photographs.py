@@ -594,9 +594,7 @@ def test_photographs_without_masks_are_fitted_whole_from_their_points(
     assert "has no surface on which to compare" in refused(capsys, arguments, tmp_path / "run")
 
 
-def test_depth_beside_photographs_without_masks_leaves_the_fit_whole(
-    colmap, tmp_path, monkeypatch
-):
+def test_depth_beside_photographs_without_masks_leaves_the_fit_whole(colmap, tmp_path, monkeypatch):
     """The surface of the object in their middle gave 7 dB of a scene with its ground."""
     data = import_source(read_source(colmap), tmp_path / "d")
     assert start_of_fit(data, None, None, {}).source == "random"
@@ -664,13 +662,15 @@ def test_a_room_with_depth_starts_whole_from_its_walls(tmp_path, capsys):
     assert "a whole scene needs points, which `mgs import` triangulates" in line
 
 
-def test_a_room_is_fitted_whole_if_its_cameras_look_inwards(tmp_path):
+def test_a_room_is_fitted_whole_if_its_cameras_look_inwards(tmp_path, capsys):
     """It was refused, as no ground or object is near what they look at."""
     data = write_room(tmp_path / "room", -2.5)
     assert start_of_fit(data, None, None, {}).source == "random"
     _, points, *_ = scattered(data, PriorSettings(gaussians=400))
     assert (np.abs(np.linalg.norm(points, axis=1) - WALL) < 0.02 * WALL).sum() >= 364
     command("fit", data.root, "--passes", 1, "--out", tmp_path / "run")
+    below = ["--dome", 9, "--set", "elevations=-60,-20", "--set", "radius=1"]
+    assert "-60" not in output(capsys, "suggest", tmp_path / "run", *below)
 
 
 def test_an_object_in_masks_starts_with_few_gaussians_that_are_split(

@@ -174,7 +174,8 @@ def place_poses(
     else:
         band = elevations if shape == "dome" else ((low + high) / 2,) * 2
         kind = "hemisphere" if shape == "dome" else "rings"
-        orbit = Orbit(kind=kind, radius=radius, elevations=band, turns=1)  # type: ignore[arg-type]
+        # Not validated: those of a scene are above its ground.
+        orbit = Orbit.model_construct(kind=kind, radius=radius, elevations=band, turns=1)
         offsets = orbit_positions(orbit, count, np.zeros(3))
     digits = len(str(len(offsets) - 1))
     eyes = site.centre + offsets
