@@ -133,6 +133,17 @@ def test_candidates_of_one_pose_are_one_and_those_that_see_nothing_none(run, sit
     assert result.dropped == {"sees nothing of the object": 1, "the same as one before": 1}
 
 
+def test_views_that_the_policy_excludes_are_left_out(run, site, tmp_path):
+    def half(candidates):
+        return np.where(candidates[:, 0] > 0, candidates[:, 1], -np.inf)
+
+    opened = open_run(run)
+    found = suggest(opened, place_poses("ring", 12, 2.6, (25, 35), site), 2, policy=half)
+    assert found.dropped["excluded by the policy"] == 12 - len(found.ranking)
+    assert all(view.camera.position[0] > 0 for view in (*found.ranking, *found.plan))
+    write_suggestion(tmp_path, opened, found)
+
+
 def test_a_model_of_split_gaussians_is_rated_by_all_of_them(run, site, tmp_path):
     train = {"means": "free", "density": "split", "passes": 3}
     data = open_run(run).dataset.root

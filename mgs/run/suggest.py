@@ -145,7 +145,10 @@ def suggest(
             mission = mission.model_copy(update={"budget": most, "batch": max(most, 2)})
         in_words = partial(way_to, images=images, site=site, unit=run.dataset.unit)
         describe = _describer(scene, state, flyable, weights, in_words)
-        rated_views = rated(scene, state, rule, stops)
+        every = rated(scene, state, rule, stops)
+        rated_views = [(view, score) for view, score in every if score > -np.inf]
+        if excluded := len(every) - len(rated_views):
+            dropped["excluded by the policy"] = excluded
         ranking = [describe(appraised(scene, state, view, score)[0]) for view, score in rated_views]
         choices, way = _plan(scene, state, rule, mission)
         order = [view for view, _ in rated_views]
