@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import synthetic
+from matplotlib.figure import Figure
 from program import command, output, said
 from pymavlink import mavutil, mavwp
 from refusals import refused
@@ -21,7 +22,7 @@ from mgs.data.clouds import SparseCloud, write_cloud
 from mgs.data.meshes import distances_to_mesh
 from mgs.data.world import World, unit_up
 from mgs.progress import listening
-from mgs.reports.suggestion import numbers, write_suggestion
+from mgs.reports.suggestion import _from_above, numbers, write_suggestion
 from mgs.run.candidates import Site, hidden, inside, place_poses, read_poses, refusals
 from mgs.run.nbv import start_fit
 from mgs.run.settings import FlightLimits
@@ -338,6 +339,22 @@ def test_poses_leave_and_come_in_the_coordinates_of_the_data(run, site, tmp_path
     for k in (0, 1):
         ((_, back),) = read_poses(tmp_path / f"{k}/transforms.json", site)
         np.testing.assert_allclose(back.world_to_camera, camera.world_to_camera, atol=1e-6)
+
+
+def test_the_figure_marks_the_images_that_are_named_and_no_random_points(run, site, monkeypatch):
+    opened = open_run(run)
+    found = suggest(opened, place_poses("ring", 3, 2.6, (25, 35), site))
+    named = replace(found, plan=[replace(found.plan[0], way="from 11 towards 111: 1° round")])
+    frames = [replace(one, name="1" * k) for k, one in enumerate(opened.dataset.frames, 1)]
+    points, prior = opened.prior.points.copy(), opened.prior
+    points[-50:] *= 100
+    numbers = prior.numbers | {"triangulated": len(points) - 50}
+    monkeypatch.setattr(opened, "dataset", replace(opened.dataset, frames=tuple(frames)))
+    monkeypatch.setattr(opened, "prior", replace(prior, points=points, numbers=numbers))
+    axis = Figure().add_subplot()
+    _from_above(axis, opened, named)
+    assert sorted(text.get_text() for text in axis.texts) == ["1", "11", "111"]  # 1: of the stop
+    assert np.ptp(axis.get_xlim()) < 10
 
 
 def test_points_inside_a_mesh_with_a_hole(site):

@@ -124,8 +124,10 @@ def _from_above(axis: Any, run: Run, suggestion: Suggestion) -> None:
     frames = taken_in_order(run)
     images = level([frame.camera.position for frame in frames])
     stops = [level(view.camera.position) for view in suggestion.plan]
+    ways = [view.way.partition(":")[0] for view in suggestion.plan[:MOST_PICTURES]]
+    named = {name for way in ways for name in way.removeprefix("from ").split(" towards ")}
     for frame, place in zip(frames, images, strict=True):
-        if any(frame.name in view.way for view in suggestion.plan[:MOST_PICTURES]):
+        if frame.name in named:
             x, y = place - min(np.concatenate(stops), key=lambda stop: np.linalg.norm(stop - place))
             side = {"ha": "left" if x > 0 else "right", "va": "bottom" if y > 0 else "top"}
             apart = (7 if x > 0 else -7, 5 if y > 0 else -5)  # from its mark and the nearest stop
@@ -137,7 +139,8 @@ def _from_above(axis: Any, run: Run, suggestion: Suggestion) -> None:
     if suggestion.certificate:
         gains = [100 * price for price in suggestion.certificate.prices]
         label = "what a picture there adds (% of the bound)"
-    axis.scatter(*level(run.prior.points[::7]).T, s=0.5, color="#b0a898", rasterized=True)
+    surface = run.prior.points[: run.prior.numbers.get("triangulated") or None]  # no random ones
+    axis.scatter(*level(surface[::7]).T, s=0.5, color="#b0a898", rasterized=True)
     axis.scatter(*images.T, marker="^", s=26, color="black", label="images so far")
     dots = axis.scatter(*ranked.T, c=gains, s=18, cmap="viridis", label="candidates")
     way = [images[:1]]
