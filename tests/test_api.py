@@ -105,6 +105,17 @@ def test_a_function_is_a_policy_that_a_resumed_run_asks_for(dataset, prior, tmp_
     fails("policy highest: is not as", mgs.resume_nbv, out, policy=highest)
 
 
+class Lowest:
+    def __call__(self, candidates):
+        return -candidates[:, 2]
+
+
+def test_a_run_goes_on_with_an_equal_object(dataset, prior, tmp_path):
+    one, other = Lowest(), Lowest()
+    mgs.start_run(dataset, tmp_path / "run", prior=prior, seeds=3, budget=1, policy=one)
+    assert len(mgs.resume_nbv(tmp_path / "run", policy=other).state.taken) == 4
+
+
 def test_objects_are_short_in_text_and_have_pictures_in_notebooks(dataset, prior, tmp_path):
     loaded, known = mgs.load_dataset(dataset), mgs.load_prior(prior)
     begun = mgs.start_run(loaded, tmp_path / "begun", prior=known, seeds=3)

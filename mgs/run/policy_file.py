@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator
@@ -79,7 +80,8 @@ def code_of(policy: Callable[..., Any]) -> str:
         source = inspect.getsource(policy if plain else type(policy))
     except (OSError, TypeError):
         return ""
-    return source if plain else f"{source}\n# {policy!r}\n"
+    text = re.sub(" at 0x[0-9a-f]+", "", repr(policy))  # of this process alone
+    return source if plain else f"{source}\n# {text}\n"
 
 
 def in_file(name: str) -> bool:
