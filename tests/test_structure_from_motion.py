@@ -601,6 +601,8 @@ def test_photographs_alone_are_one_command_to_the_next_picture(
         capsys, ["suggest", root, *few], site
     )
     shutil.copy(frames[7].image_path, root)
+    there = ["suggest", root, *few, "--out", frames[0].image_path.parent]
+    assert "is there already" in refused(capsys, there, site), "before pictures are placed"
     extract = pycolmap.extract_features
 
     def watched(*files, image_names, **options):

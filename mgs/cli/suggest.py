@@ -129,6 +129,8 @@ def suggest(
     count = parse_gaussians(views, "views") or 1
     fit: dict[str, Any] = {"prior": prior, "gaussians": parse_gaussians(gaussians)}
     fit["policy"] = policy
+    if out is not None and not force:
+        check_new_folder(out)
     if holds_photographs(source):
         site = Path(f"{source.resolve()}{SITE}")
         source = _placed(source, site, console)
