@@ -669,6 +669,8 @@ def test_a_room_is_fitted_whole_if_its_cameras_look_inwards(tmp_path, capsys):
     _, points, *_ = scattered(data, PriorSettings(gaussians=400))
     assert (np.abs(np.linalg.norm(points, axis=1) - WALL) < 0.02 * WALL).sum() >= 364
     command("fit", data.root, "--passes", 1, "--out", tmp_path / "run")
+    words = output(capsys, "suggest", data.root, "--gaussians", 400, "--dome", 8)
+    assert "1: from kf_00" in words, "a folder was refused"
     below = ["--dome", 9, "--set", "elevations=-60,-20", "--set", "radius=1"]
     assert "-60" not in output(capsys, "suggest", tmp_path / "run", *below)
 

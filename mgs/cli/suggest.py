@@ -29,11 +29,11 @@ from mgs.errors import InputError
 from mgs.files import Ours, atomic_folder, check_new_file, check_new_folder
 from mgs.fit.settings import Frozen
 from mgs.policy.criteria import GAIN_UNIT
-from mgs.prior.photographs import check_enough
+from mgs.prior.photographs import check_enough, choose_source
 from mgs.reports.suggestion import write_suggestion
 from mgs.run.candidates import MOST_POSES, Named, inside, place_poses, read_poses
 from mgs.run.folder import Run, holds_run, open_run
-from mgs.run.nbv import resume_nbv, start_run
+from mgs.run.nbv import resume_nbv, start_fit, start_of_fit, start_run
 from mgs.run.settings import FlightLimits, Positive, SearchLimits, validated
 from mgs.run.suggest import Suggestion, View, site_of, taken_in_order
 from mgs.run.suggest import suggest as suggested
@@ -43,7 +43,7 @@ Degrees = Annotated[float, Field(ge=-90, le=90)]
 DOME = 100  # candidates where none are given
 SHOWN = 10  # rows of the table of one view to take; suggestions.json has all
 SITE, NEXT = ".site", "next"  # beside photographs alone: end of a folder's name, and --out in it
-PASSES = 2  # passes of the fit to photographs alone: enough to choose a view by, too few to show
+PASSES = 2  # passes of its own fit to a whole scene: enough to choose a view by, too few to show
 FILES = ("suggestions.json", "suggestions.png", "transforms.json")  # names in the folder --out
 
 
@@ -185,15 +185,19 @@ def _place(source: Path) -> Any:
 
 
 def _run(source: Path, scratch: Path, settings: dict[str, Any]) -> Run:
-    """The run itself, or a new one in `scratch`, fitted to all images of a dataset."""
+    """The run itself, or a new one in `scratch`, fitted to all images of a dataset, of a room with
+    depth as `mgs fit` does it: no surface is in its middle."""
     if holds_run(source):
         for name in ("prior", "gaussians"):
             if settings[name] is not None:
                 raise InputError(f"suggest: {source} is a run with its model; leave out `{name}`")
         return open_run(source)
-    data = load_dataset(source)
-    run = start_run(data, scratch, seeds=len(data), budget=0, **not_none(**settings))
-    return resume_nbv(run)
+    data, given = load_dataset(source), not_none(**settings)
+    deep = settings["prior"] is None and choose_source(data.survey()) == "depth"
+    if deep and start_of_fit(data, None, None, {}).source:
+        quick = {"train": {"passes": PASSES}}
+        return resume_nbv(start_fit(source, scratch, **quick | given))
+    return resume_nbv(start_run(data, scratch, seeds=len(data), budget=0, **given))
 
 
 def _shape(poses: Path | None, dome: int | None, asked: Candidates) -> tuple[str, int] | None:
