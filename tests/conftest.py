@@ -41,9 +41,10 @@ import tiny  # noqa: E402
 from mgs.data.dataset import load_dataset  # noqa: E402
 
 LONGEST = """
-docs page view photographs structure_from_motion synth capture prior setups end_to_end import api
-scene poses agreement suggest chart nbv hostile borders_data sweep refit evaluate world options
-directional survey bad_input compact detectors exposure stress fisher derivatives kernels
+structure_from_motion photographs docs setups import suggest prior page view capture api agreement
+sweep nbv chart refit end_to_end synth borders_data recordings poses hostile blender scene evaluate
+world options directional survey bad_input compact detectors exposure stress fisher derivatives
+kernels
 """
 
 

@@ -251,6 +251,7 @@ def test_the_notebooks_are_their_pages(pages):
 
 
 SMALLER = {
+    "--dome 40 --set": "--prior demo/prior --dome 12 --set", "flight.length=30": "flight.length=18",
     "--dome 40": "--dome 12", "120x90": "48x36", "width=120, height=90": "width=48, height=36",
     "images=8": "images=2", "(1, 16, 256)": "(1, 4, 64)", "frames=2, spp=4": "frames=2, spp=1",
     "errors[256] < errors[16]": "errors[64] < errors[4]", "tolerance=0.1": "tolerance=0.5",

@@ -119,9 +119,9 @@ def test_flights_keep_their_length_and_are_compared_with_even_spacing(tmp_path, 
 
 
 def test_models_of_chosen_views_are_sent_over_a_link(tmp_path, capsys, monkeypatch, short_fits):
-    for name, value in (("HALVINGS", 4), ("THINNINGS", 1), ("ROUNDS", 1), ("HOLDS", 2)):
+    for name, value in (("HALVINGS", 2), ("THINNINGS", 1), ("ROUNDS", 1), ("HOLDS", 2)):
         monkeypatch.setattr(f"mgs.reports.compacting.{name}", value)
-    size = link.LinkSize(**vars(FEW) | {"views": (5,), "sent": (500, 4000)})
+    size = link.LinkSize(**vars(FEW) | {"views": (5,), "sent": (500, 4000), "gaussians": 100})
     done(capsys, "link", tmp_path, "--rocks", 1, sizes={"quick": size})
     rows = read_rows(tmp_path / "link.csv")
     assert [(row["views"], row["by"], row["seconds"]) for row in rows] == [

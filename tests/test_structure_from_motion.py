@@ -593,6 +593,7 @@ def test_photographs_alone_are_one_command_to_the_next_picture(
 ):
     """Photographs of one side ask for another; one more, first by name, joins the same model."""
     root, site, found = tmp_path / "photos", tmp_path / "photos.site", []
+    monkeypatch.setattr("mgs.data.importers.MOST_PIXELS", WIDTH * HEIGHT // 9)
     few = ("--dome", 12, "--gaussians", 500)
     root.mkdir()
     for frame in frames[:7]:
