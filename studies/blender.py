@@ -348,19 +348,21 @@ def _mean(rows: Sequence[Row], key: str) -> float:
     return float(np.mean([row[key] for row in rows]))
 
 
+def _with_lead(row: Row, name: str) -> str:
+    """PSNR and lead of a row, of a scene by " SCENE"; – where the policy did not run there."""
+    if f"psnr{name}" not in row:
+        return "–"
+    return f"{row[f'psnr{name}']:.2f}, {with_interval(row, f'lead{name}')}"
+
+
 def tables(rows: Sequence[Row]) -> str:
     """Table of policies, with columns for each scene if these are two, and that of PUBLISHED."""
     columns: dict[str, Content] = {"views": "views", "policy": "policy"}
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    for scene in scenes if len(scenes) <= 2 else ():
-        columns[f"{scene} (dB)"] = f"psnr {scene}:.2f"
-        columns[f"{scene}, over {FARTHEST}"] = partial(with_interval, key=f"lead {scene}")
-    columns |= {
-        "mean (dB)": "psnr:.2f",
-        f"over {FARTHEST}": partial(with_interval, key="lead"),
-        "CPU s a choice": "choice:.2f",
-        "CPU s of fits between": "fits:.0f",
-    }
+    for name in [*(f" {scene}" for scene in scenes if len(scenes) <= 2), ""]:
+        title = f"{name.strip() or 'mean'}: PSNR, over {FARTHEST} (dB)"
+        columns[title] = partial(_with_lead, name=name)
+    columns |= {"CPU s a choice": "choice:.2f", "CPU s of fits between": "fits:.0f"}
     published: dict[str, Content] = {
         "published": "policy", "mean of 8 scenes (dB)": "psnr:.2f", "GPU s a choice": "seconds:.3g",
     }  # fmt: skip

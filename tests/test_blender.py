@@ -62,7 +62,7 @@ def test_every_policy_runs_and_no_candidate_is_read(scenes, tmp_path, monkeypatc
     assert (far["lead"], other["lead"]) == (0, other["psnr"] - far["psnr"])
     text = (out / "blender.md").read_text()
     assert "POp-GS D" in text
-    assert f"| {other['psnr']:.2f} | {other['lead']:+.2f} |" in text
+    assert f"| {other['psnr']:.2f}, {other['lead']:+.2f} |" in text
     assert (out / "blender.png").is_file()
 
 
